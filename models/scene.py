@@ -1,0 +1,254 @@
+"""The Scene: one 64 x 64 m semantic layout as arrays in metres (paper, Sec. 3.1).
+
+Everything in this project either makes Scenes, stores Scenes or scores Scenes. Real and generated scenes are
+the same struct, in the same frame:
+
+    origin at the ego vehicle, **x forward, y left, z up**, gravity-aligned.
+
+Differs from the paper, whose frame keeps the IMU's pitch and roll: blocks would not join.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+# Paper, supplement Tab. "object categories"; the order is the order of the slots.
+CATEGORIES = (
+    "vegetation_cuboid",
+    "vegetation_ellipsoid",
+    "vehicle_big",
+    "vehicle_small",
+    "two_wheelers",
+    "human",
+    "construction_big",
+    "construction_small",
+    "pole",
+    "traffic_control",
+    "object",
+)
+CATEGORY_INDEX = {name: index for index, name in enumerate(CATEGORIES)}
+ELLIPSOID = CATEGORY_INDEX["vegetation_ellipsoid"]
+VEGETATION = (CATEGORY_INDEX["vegetation_cuboid"], ELLIPSOID)
+VEHICLES = (CATEGORY_INDEX["vehicle_big"], CATEGORY_INDEX["vehicle_small"])
+
+# The paper's five, and Argoverse 2's crossings.
+GROUND_CLASSES = ("road", "sidewalk", "parking", "terrain", "ground", "crossing")
+KITTI_GROUND_CLASSES = GROUND_CLASSES[:5]
+
+DENSITIES = ("low", "medium", "high")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A top-down pixel grid in the scene frame: row 0 is farthest ahead, column 0 leftmost.
+
+    Pixel centre (row, col) lies at x = front_m - (row + .5) resolution_m, y = left_m - (col + .5) resolution_m.
+    """
+
+    front_m: float = 64.0
+    left_m: float = 32.0
+    resolution_m: float = 0.25
+    rows: int = 256
+    cols: int = 256
+
+    @property
+    def back_m(self) -> float:
+        return self.front_m - self.rows * self.resolution_m
+
+    @property
+    def right_m(self) -> float:
+        return self.left_m - self.cols * self.resolution_m
+
+    def x_m(self) -> np.ndarray:
+        """(rows,) x of the pixel centres."""
+        return self.front_m - (np.arange(self.rows) + 0.5) * self.resolution_m
+
+    def y_m(self) -> np.ndarray:
+        """(cols,) y of the pixel centres."""
+        return self.left_m - (np.arange(self.cols) + 0.5) * self.resolution_m
+
+    def contains(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """True where a point lies inside the grid's rectangle (half-open: the far and left border belong)."""
+        return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
+
+    def pixel(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(row, col) of the pixel that holds each point; may lie outside the grid."""
+        row = np.floor((self.front_m - np.asarray(x_m)) / self.resolution_m).astype(np.int64)
+        col = np.floor((self.left_m - np.asarray(y_m)) / self.resolution_m).astype(np.int64)
+        return row, col
+
+
+def canonical_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same boxes with height nearest the vertical, length >= width and yaw in [-pi/2, pi/2).
+
+    rotation (n, 3, 3), columns = the box's axes in the scene frame; size_m (n, 3), full extents along them.
+    Returns rotation (n, 3, 3), right-handed with columns (length, width, height), and size_m (n, 3) = (l, w, h).
+    A mirrored input (determinant < 0) comes out right-handed: a box is its own mirror image.
+    """
+    rotation, size_m = np.asarray(rotation), np.asarray(size_m)
+    if len(size_m) == 0:
+        return rotation.reshape(0, 3, 3), size_m.reshape(0, 3)
+    up = np.abs(rotation[:, 2, :]).argmax(axis=1)
+    rest = np.array([[1, 2], [2, 0], [0, 1]])[up]
+    swap = np.take_along_axis(size_m, rest, 1) @ np.array([-1.0, 1.0]) > 0
+    rest[swap] = rest[swap, ::-1]
+    order = np.concatenate([rest, up[:, None]], axis=1)
+    rotation = np.take_along_axis(rotation, order[:, None, :], axis=2)
+    size_m = np.take_along_axis(size_m, order, axis=1)
+
+    height_axis = rotation[:, :, 2] * np.where(rotation[:, 2, 2] < 0, -1.0, 1.0)[:, None]
+    length_axis = rotation[:, :, 0]
+    backward = (length_axis[:, 0] < 0) | ((length_axis[:, 0] == 0) & (length_axis[:, 1] > 0))
+    length_axis = length_axis * np.where(backward, -1.0, 1.0)[:, None]
+    width_axis = np.cross(height_axis, length_axis)
+    return np.stack([length_axis, width_axis, height_axis], axis=2).astype(rotation.dtype), size_m
+
+
+def yaw_of(rotation: np.ndarray) -> np.ndarray:
+    """(n,) yaw of the length axis, in [-pi/2, pi/2) for canonical boxes."""
+    return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+
+
+def yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
+    """(..., 3, 3) rotation about z."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    zero, one = np.zeros_like(cos), np.ones_like(cos)
+    rows = [np.stack(row, -1) for row in ([cos, -sin, zero], [sin, cos, zero], [zero, zero, one])]
+    return np.stack(rows, -2)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One scene. n primitives, G ground classes on an H x W grid; metres, radians, scene frame.
+
+    `size_m` holds full extents along the columns of `rotation`; both are canonical (`canonical_boxes`).
+    `heading_rad` is NaN where the direction of travel is unknown (the scatter matrix loses 180 degrees).
+    `height_m` is 0 where `occupied` is False. `world_from_imu` (3, 4) is the dataset's own full pose, if any.
+    """
+
+    scene_id: str
+    source: str
+    sequence: str
+    frame: int
+    split: str
+    category: np.ndarray  # (n,) int8, index into CATEGORIES
+    center_m: np.ndarray  # (n, 3) float32
+    rotation: np.ndarray  # (n, 3, 3) float32
+    size_m: np.ndarray  # (n, 3) float32: length, width, height
+    ground_classes: tuple[str, ...]  # (G,) names from GROUND_CLASSES
+    height_m: np.ndarray  # (G, H, W) float32
+    occupied: np.ndarray  # (G, H, W) bool
+    grid: Grid = field(default_factory=Grid)
+    existence: np.ndarray | None = None  # (n,) float32, 1 for annotated primitives
+    heading_rad: np.ndarray | None = None  # (n,) float32
+    instance_id: np.ndarray | None = None  # (n,) int64, -1 where there is none
+    label: np.ndarray | None = None  # (n,) str, the dataset's own class name
+    world_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    world_yaw_rad: float = 0.0
+    world_from_imu: np.ndarray | None = None
+    vegetation_density: str | None = None
+    vehicle_density: str | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.category)
+        defaults = {
+            "existence": np.ones(n, np.float32),
+            "heading_rad": np.full(n, np.nan, np.float32),
+            "instance_id": np.full(n, -1, np.int64),
+            "label": np.array([CATEGORIES[c] for c in self.category], dtype=object),
+        }
+        for name, value in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        shape = (len(self.ground_classes), self.grid.rows, self.grid.cols)
+        expected = {"center_m": (n, 3), "rotation": (n, 3, 3), "size_m": (n, 3), "height_m": shape, "occupied": shape}
+        expected |= {name: (n,) for name in defaults}
+        for name, want in expected.items():
+            got = getattr(self, name).shape
+            if got != want:
+                raise ValueError(f"scene {self.scene_id}: {name} has shape {got}, expected {want}")
+
+    def __len__(self) -> int:
+        return len(self.category)
+
+    @property
+    def volume_m3(self) -> np.ndarray:
+        """(n,) volume of each primitive: l w h for cuboids, pi/6 l w h for ellipsoids."""
+        return self.size_m.prod(axis=1) * np.where(self.category == ELLIPSOID, np.pi / 6, 1.0)
+
+    @property
+    def yaw_rad(self) -> np.ndarray:
+        return yaw_of(self.rotation)
+
+    def counts(self) -> np.ndarray:
+        """(11,) primitives per category."""
+        return np.bincount(self.category, minlength=len(CATEGORIES))
+
+    def ground_area_m2(self) -> np.ndarray:
+        """(G,) occupied area per ground class."""
+        return self.occupied.sum(axis=(1, 2)) * self.grid.resolution_m**2
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """The fused ground (paper, supplement B.2, Layout Reconstruction): at each pixel the highest class wins.
+
+        Returns height_m (H, W) and ground_class (H, W) int8, index into ground_classes, -1 where there is none.
+        """
+        height = np.where(self.occupied, self.height_m, -np.inf)
+        winner = height.argmax(axis=0).astype(np.int8)
+        top = np.take_along_axis(height, winner[None].astype(np.int64), axis=0)[0]
+        empty = ~np.isfinite(top)
+        return np.where(empty, 0.0, top).astype(np.float32), np.where(empty, np.int8(-1), winner)
+
+    def select(self, keep: np.ndarray) -> Scene:
+        """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
+        per_primitive = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
+        return replace(self, **{name: getattr(self, name)[keep] for name in per_primitive})
+
+    def moved(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
+        """The same content in a frame whose origin lies at (-dx, -dy, -dz): everything, the grid too, moves by d."""
+        grid = replace(self.grid, front_m=self.grid.front_m + dx_m, left_m=self.grid.left_m + dy_m)
+        center = self.center_m + np.array([dx_m, dy_m, dz_m], np.float32)
+        height = np.where(self.occupied, self.height_m + np.float32(dz_m), np.float32(0))
+        return replace(self, center_m=center, height_m=height, grid=grid)
+
+    def cropped(self, grid: Grid) -> Scene:
+        """The part inside `grid` (same resolution, aligned to whole pixels); pixels beyond the scene are empty.
+
+        Raises ValueError if the grids are not aligned.
+        """
+        row0 = (self.grid.front_m - grid.front_m) / grid.resolution_m
+        col0 = (self.grid.left_m - grid.left_m) / grid.resolution_m
+        aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
+        if grid.resolution_m != self.grid.resolution_m or not aligned:
+            raise ValueError(f"grid {grid} is not aligned with {self.grid} to whole pixels")
+        row0, col0 = round(row0), round(col0)
+        shape = (len(self.ground_classes), grid.rows, grid.cols)
+        height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        here_r = slice(max(0, -row0), max(0, min(grid.rows, self.grid.rows - row0)))
+        here_c = slice(max(0, -col0), max(0, min(grid.cols, self.grid.cols - col0)))
+        there_r = slice(here_r.start + row0, here_r.stop + row0)
+        there_c = slice(here_c.start + col0, here_c.stop + col0)
+        if here_r.start < here_r.stop and here_c.start < here_c.stop:
+            height[:, here_r, here_c] = self.height_m[:, there_r, there_c]
+            occupied[:, here_r, here_c] = self.occupied[:, there_r, there_c]
+        inside = grid.contains(self.center_m[:, 0], self.center_m[:, 1])
+        return replace(self.select(inside), height_m=height, occupied=occupied, grid=grid)
+
+
+def merge(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
+    """One scene on `like.grid` from scenes on that grid, by ownership (mask per scene, (H, W) bool, disjoint).
+
+    A pixel comes from the scene that owns it; a primitive from the scene that owns the pixel under its centre.
+    """
+    height, occupied = np.zeros_like(like.height_m), np.zeros_like(like.occupied)
+    parts = []
+    for scene, mask in zip(scenes, owned, strict=True):
+        height[:, mask], occupied[:, mask] = scene.height_m[:, mask], scene.occupied[:, mask]
+        row, col = like.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
+        row, col = row.clip(0, like.grid.rows - 1), col.clip(0, like.grid.cols - 1)
+        parts.append(scene.select(mask[row, col]))
+    names = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(like, height_m=height, occupied=occupied, **joined)
