@@ -1,0 +1,110 @@
+"""Which poses train and which test (paper, supplement A, Dataset Construction). numpy and scipy only."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+TRAIN, TEST, UNUSED = "train", "test", "unused"
+
+# Paper, supplement A.
+MAX_SEGMENTS = 100
+TEST_M = 15.0
+MARGIN_M = 5.0
+REMOVAL_M = 5.0
+# The paper leaves open: drives shorter than its 73.7 km. A segment needs its 25 m of test and margins, and as much
+# again to train on.
+MIN_SEGMENT_M = 50.0
+
+# Argoverse 2 comes split by log; its own test logs have no annotations.
+ARGOVERSE2_SPLIT = {"train": TRAIN, "val": TEST}
+
+logger = logging.getLogger(__name__)
+
+
+def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Per sequence (p,) str, one of train, test, unused, for its positions (p, 3): metres, one world for all.
+
+    Give every pose of every sequence, in driving order, before any is dropped: the distance driven is cut into equal
+    segments, sequence after sequence; the jump from one to the next counts nothing. Of each segment
+
+        train ... | 5 m unused | 15 m test | 5 m unused
+
+    and then every train pose within 5 m (BEV) of a test pose, and every test pose within 5 m of a train pose,
+    becomes unused. The paper leaves open which goes first: both sides are judged on the labels before any removal,
+    so both partners of a close pair go.
+
+    Raises ValueError for positions that are not (p, 3) and finite.
+    """
+    for sequence, position_m in positions_by_sequence.items():
+        if np.ndim(position_m) != 2 or np.shape(position_m)[1] != 3:
+            raise ValueError(
+                f"sequence {sequence}: positions have shape {np.shape(position_m)}, expected (p, 3)"
+            )
+        if not np.isfinite(position_m).all():
+            raise ValueError(f"sequence {sequence}: positions are not finite; fix or drop those poses first")
+    if not any(len(position_m) for position_m in positions_by_sequence.values()):
+        return no_split(positions_by_sequence)
+
+    driven_m, total_m = _distance_driven(list(positions_by_sequence.values()))
+    labels = _label_by_distance(driven_m, total_m, num_segments(total_m))
+    bev_m = np.concatenate([np.asarray(p, np.float64)[:, :2] for p in positions_by_sequence.values()])
+    labels = _remove_close(labels, bev_m)
+    ends = np.cumsum([len(position_m) for position_m in positions_by_sequence.values()])
+    return dict(zip(positions_by_sequence, np.split(labels, ends[:-1]), strict=True))
+
+
+def no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Every pose trains."""
+    return {sequence: np.full(len(p), TRAIN, object) for sequence, p in positions_by_sequence.items()}
+
+
+def num_segments(total_m: float) -> int:
+    """min(100, floor(distance / 50 m)), at least 1; says so when it is fewer than the paper's 100."""
+    count = max(1, min(MAX_SEGMENTS, int(total_m // MIN_SEGMENT_M)))
+    if count < MAX_SEGMENTS:
+        logger.warning(
+            "the drives are %.0f m long: %d split segments of %.1f m instead of the paper's %d%s",
+            total_m,
+            count,
+            total_m / count,
+            MAX_SEGMENTS,
+            "" if total_m > TEST_M + 2 * MARGIN_M else "; nothing is left to train on, use no split",
+        )
+    return count
+
+
+def _distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Distance driven at each pose of all sequences together (sum of p,), and in total; metres."""
+    steps = [
+        np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])
+        for p in positions_m
+        if len(p)
+    ]
+    driven_m = np.cumsum(np.concatenate(steps))
+    return driven_m, float(driven_m[-1])
+
+
+def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> np.ndarray:
+    """(p,) str: the label of each pose by its place within its segment."""
+    ends_m = total_m * np.arange(1, segments + 1) / segments
+    segment = np.searchsorted(ends_m, driven_m, side="right").clip(max=segments - 1)
+    to_end_m = ends_m[segment] - driven_m
+    labels = np.full(len(driven_m), UNUSED, object)
+    labels[to_end_m > TEST_M + 2 * MARGIN_M] = TRAIN
+    labels[(to_end_m > MARGIN_M) & (to_end_m <= MARGIN_M + TEST_M)] = TEST
+    return labels
+
+
+def _remove_close(labels: np.ndarray, bev_m: np.ndarray) -> np.ndarray:
+    """The labels (p,) after removal: train and test poses within 5 m (BEV) of one another are unused."""
+    train, test = np.flatnonzero(labels == TRAIN), np.flatnonzero(labels == TEST)
+    if len(train) == 0 or len(test) == 0:
+        return labels
+    labels = labels.copy()
+    for side, other in ((train, test), (test, train)):
+        distance_m, _ = cKDTree(bev_m[other]).query(bev_m[side])
+        labels[side[distance_m <= REMOVAL_M]] = UNUSED
+    return labels
