@@ -14,8 +14,8 @@ MAX_SEGMENTS = 100
 TEST_M = 15.0
 MARGIN_M = 5.0
 REMOVAL_M = 5.0
-# The paper leaves open: drives shorter than its 73.7 km. A segment needs its 25 m of test and margins, and as much
-# again to train on.
+# The paper leaves open: drives shorter than its 73.7 km. A segment needs its 25 m of test and margins, and as
+# much again to train on.
 MIN_SEGMENT_M = 50.0
 
 # Argoverse 2 comes split by log; its own test logs have no annotations.
@@ -27,14 +27,14 @@ logger = logging.getLogger(__name__)
 def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Per sequence (p,) str, one of train, test, unused, for its positions (p, 3): metres, one world for all.
 
-    Give every pose of every sequence, in driving order, before any is dropped: the distance driven is cut into equal
-    segments, sequence after sequence; the jump from one to the next counts nothing. Of each segment
+    Give every pose of every sequence, in driving order, before any is dropped: the distance driven is cut
+    into equal segments, sequence after sequence; the jump from one to the next counts nothing. Of each segment
 
         train ... | 5 m unused | 15 m test | 5 m unused
 
     and then every train pose within 5 m (BEV) of a test pose, and every test pose within 5 m of a train pose,
-    becomes unused. The paper leaves open which goes first: both sides are judged on the labels before any removal,
-    so both partners of a close pair go.
+    becomes unused. The paper leaves open which goes first: both sides are judged on the labels before any
+    removal, so both partners of a close pair go.
 
     Raises ValueError for positions that are not (p, 3) and finite.
     """

@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder with real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, else shared/data beside the checkout."""
+    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data beside the checkout."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     path = Path(os.environ.get("PRITTI_TEST_DATA") or beside)
     if not path.is_dir():

@@ -62,6 +62,7 @@ MAX_BOX_DISTANCE_M = 1e3  # real boxes reach 220 m
 MAX_BOX_SIZE_M = 1e2
 MIN_BOX_SIZE_M = 1e-3
 MAX_COORDINATE_M = 1e6
+MAX_HEIGHT_M = 1e4
 
 
 def logs(root: str | Path) -> list[tuple[str, str]]:
@@ -77,17 +78,18 @@ def logs(root: str | Path) -> list[tuple[str, str]]:
     ]
     if not found:
         raise ValueError(
-            f"{root}: no train/LOG or val/LOG folder here (the test split has no annotations); --input must name the"
-            " folder that holds Argoverse 2's sensor logs by split"
+            f"{root}: no train/LOG or val/LOG folder here (the test split has no annotations); --input must"
+            " name the folder that holds Argoverse 2's sensor logs by split"
         )
     return found
 
 
 def read_drive(root: str | Path, split: str, log: str) -> Drive:
-    """The annotated sweeps of one log, city frame, float64. `frame` and `timestamp` are the sweep's time in ns.
+    """The annotated sweeps of one log, city frame, float64.
 
-    `instance_id` is a hash of the track's uuid, equal on every machine; `heading_rad` the yaw of the box's x axis.
-    Raises ValueError, naming the file, for anything missing, of the wrong type, or without a finite sensible value.
+    `frame` and `timestamp` are a sweep's time in ns, `instance_id` a hash of the track's uuid, equal on every
+    machine, `heading_rad` the yaw of the box's x axis.
+    Raises ValueError, naming the file, for anything missing, of the wrong type, or no finite sensible value.
     """
     if split == "test":
         raise ValueError(
@@ -124,7 +126,7 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
     )
 
 
-# ------------------------------------------------------------------------------------------------------- feather
+# ---------------------------------------------------------------------------------------------------- feather
 
 
 def _read_annotations(path: Path) -> dict[str, np.ndarray]:
@@ -216,7 +218,8 @@ def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: fl
     bad = np.flatnonzero((values < low) | (values > high))
     if len(bad):
         raise ValueError(
-            f"{path}: {name} of row {bad[0]} is {values[bad[0]]:g}, expected {low:g}..{high:g}; fix or drop the row"
+            f"{path}: {name} of row {bad[0]} is {values[bad[0]]:g}, expected {low:g}..{high:g};"
+            " fix or drop the row"
         )
 
 
@@ -248,13 +251,14 @@ def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
     return np.array([hashes[uuid] for uuid in track_uuid], np.int64)
 
 
-# ----------------------------------------------------------------------------------------------------------- map
+# -------------------------------------------------------------------------------------------------------- map
 
 
 def _read_ground(folder: Path) -> MapGround:
     """Drivable areas as road, pedestrian crossings as crossing, over the log's height raster."""
     path = _only(folder, "log_map_archive_*.json")
-    areas, crossings = (_section(path, name) for name in ("drivable_areas", "pedestrian_crossings"))
+    content = _read_json(path)
+    areas, crossings = (_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
     roads = [_points(path, area, "area_boundary", 3) for area in areas]
     quads = [_quad(_points(path, c, "edge1", 2, 2), _points(path, c, "edge2", 2, 2)) for c in crossings]
     return MapGround(
@@ -286,9 +290,9 @@ def _read_json(path: Path) -> dict:
     return content
 
 
-def _section(path: Path, name: str) -> list[dict]:
+def _section(path: Path, content: dict, name: str) -> list[dict]:
     """The entries of one section of the map file."""
-    section = _read_json(path).get(name)
+    section = content.get(name)
     if not isinstance(section, dict) or not all(isinstance(entry, dict) for entry in section.values()):
         raise ValueError(f"{path}: {name} is missing or no object of objects; download the log again")
     return list(section.values())
@@ -335,7 +339,7 @@ def _read_heights(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: is {kind}, expected a 2D float array; download the log again")
     height_m = np.array(mapped, np.float32)
     known = height_m[~np.isnan(height_m)]
-    if len(known) == 0 or np.abs(known).max() > MAX_COORDINATE_M:
+    if len(known) == 0 or np.abs(known).max() > MAX_HEIGHT_M:
         raise ValueError(f"{path}: {len(known)} heights, not all sensible; download the log again")
     return height_m
 

@@ -4,8 +4,8 @@
     ROOT/data_poses/2013_05_28_drive_0003_sync/poses.txt
 
 A sequence is named by its four digits. The world is z up; the IMU's x points forward, y right, z down.
-The XML (over 100 MB for the longest drives) is streamed. One defective object is dropped and reported; a file that
-is broken as a whole is a ValueError.
+The XML (over 100 MB for the longest drives) is streamed. One defective object is dropped and reported; a
+file that is broken as a whole is a ValueError.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from pipelines.sources.drive import STATIC, Drive, SlabGround
 
 SOURCE = "kitti360"
 
-# Label -> category, the paper's Tab. "object categories". Labels are compared by `_plain`: without case, blanks and
-# underscores, so the XML's "trafficSign" and the development kit's "traffic sign" are one.
+# Label -> category, the paper's Tab. "object categories". Labels are compared by `_plain`: without case,
+# blanks and underscores, so the XML's "trafficSign" and the development kit's "traffic sign" are one.
 CATEGORY_LABELS = {
     "vegetation_cuboid": ("vegetation",),  # vegetation_ellipsoid if it is a sphere mesh
     "vehicle_big": ("truck", "bus"),
@@ -76,7 +76,7 @@ DUPLICATE_M = 1e-3  # two objects whose vertices all agree to this are one objec
 MAX_COORDINATE_M = 1e5  # the real world frame spans several km
 MAX_SIZE_M = 1e3
 MIN_SIZE_M = 1e-3
-# Smallest singular value of the unit axes: with two axes closer than about 40 degrees a box is not sheared but broken.
+# Of the unit axes: two of them closer than about 40 degrees make no sheared box but a broken one.
 MIN_SINGULAR = 0.5
 
 SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
@@ -126,14 +126,14 @@ def sequences(root: str | Path) -> list[str]:
     names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
     if not names:
         raise ValueError(
-            f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that holds"
-            " data_3d_bboxes and data_poses"
+            f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that"
+            " holds data_3d_bboxes and data_poses"
         )
     for name in names:
         if not _poses_path(root, name).is_file():
             raise ValueError(
-                f"{_poses_path(root, name)}: missing, but sequence {name} is annotated; unpack data_poses.zip of"
-                " KITTI-360 here, or take the sequence's XML away"
+                f"{_poses_path(root, name)}: missing, but sequence {name} is annotated; unpack KITTI-360's"
+                " data_poses.zip here, or take the sequence's XML away"
             )
     return names
 
@@ -141,12 +141,12 @@ def sequences(root: str | Path) -> list[str]:
 def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     """Everything annotated along one sequence, world frame, float64; and what was dropped on the way.
 
-    `instance_id` is the track number (dynamicSeq) of a moving object, else the object's index in the file; the two
-    count separately. `timestamp` is the frame of a moving box, else STATIC.
+    `instance_id` is the track number (dynamicSeq) of a moving object, else the object's index in the file;
+    the two count separately. `timestamp` is the frame of a moving box, else STATIC.
     Raises ValueError, naming the file, for a missing or broken XML or poses file.
     """
     frame, world_from_imu = read_poses(root, sequence)
-    path = Path(root) / "data_3d_bboxes" / "train_full" / f"2013_05_28_drive_{sequence}_sync.xml"
+    path = _boxes_path(root, sequence)
     boxes: list[_Box] = []
     slabs: list[_Slab] = []
     seen: dict[tuple, list[np.ndarray]] = {}
@@ -154,6 +154,9 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     for fields in _stream_objects(path):
         label = _label(fields)
         plain = _plain(label)
+        if not plain:
+            defects.append(Defect(_index_or_none(fields), label, "no label"))
+            continue
         if plain in DROPPED_LABELS:
             dropped[label] += 1
             continue
@@ -187,7 +190,11 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     return drive, report
 
 
-# --------------------------------------------------------------------------------------------------------- poses
+# ------------------------------------------------------------------------------------------------------ poses
+
+
+def _boxes_path(root: str | Path, sequence: str) -> Path:
+    return Path(root) / "data_3d_bboxes" / "train_full" / f"2013_05_28_drive_{sequence}_sync.xml"
 
 
 def _poses_path(root: str | Path, sequence: str) -> Path:
@@ -235,13 +242,13 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     return np.array(frame, np.int64), world_from_imu
 
 
-# ----------------------------------------------------------------------------------------------------------- XML
+# -------------------------------------------------------------------------------------------------------- XML
 
 
 def _stream_objects(path: Path) -> Iterator[dict]:
     """The fields of each <objectN>, tag -> element; what was read before is freed.
 
-    Raises ValueError for a missing or malformed file, and for one with a document type (entity bombs need one).
+    Raises ValueError for a missing or malformed file, and for one with a document type, as entity bombs need.
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:
@@ -282,7 +289,8 @@ def _text(fields: dict, tag: str, default: str | None = None) -> str:
 
 
 def _label(fields: dict) -> str:
-    return _text(fields, "label", "(no label)")[:40]
+    """The object's label as written, empty if it has none."""
+    return _text(fields, "label", " ").strip()[:40]
 
 
 def _integer(fields: dict, tag: str) -> int:
@@ -339,7 +347,7 @@ def _vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.nd
     return vertices, world_from_local, vertices_m
 
 
-# --------------------------------------------------------------------------------------------------------- boxes
+# ------------------------------------------------------------------------------------------------------ boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,11 +382,11 @@ def _parse_box(fields: dict, label: str) -> _Box:
 def box_geometry(
     world_from_local: np.ndarray, vertices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """center_m (3,), proper rotation (3, 3) and full size_m (3,) of a box or ellipsoid mesh under an affine map.
+    """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
 
-    world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the sphere of
-    radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a sheared one the
-    nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+    world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
+    sphere of radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a sheared one
+    come the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
     Raises DefectiveObject for a box without volume, of absurd size, or with axes too close to one another.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -413,7 +421,7 @@ def _stack_boxes(boxes: list[_Box]) -> dict[str, np.ndarray]:
     }
 
 
-# -------------------------------------------------------------------------------------------------------- ground
+# ----------------------------------------------------------------------------------------------------- ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,11 +460,11 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
     )
 
 
-# ------------------------------------------------------------------------------------------------- small helpers
+# ---------------------------------------------------------------------------------------------- small helpers
 
 
 def _seen_before(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
-    """Whether an object of this key had these vertices (v, 3), within DUPLICATE_M; if not, it is remembered."""
+    """Whether an object of this key had these vertices (v, 3), within DUPLICATE_M; if not, remembers it."""
     center_m = vertices_m.mean(axis=0)
     low, high = np.floor(center_m - DUPLICATE_M).tolist(), np.floor(center_m + DUPLICATE_M).tolist()
     for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):
