@@ -1,0 +1,61 @@
+"""Colours and class ids of the authors' renderings, keyed by category and ground class.
+
+A class id names either a ground class or a primitive category, so that one small integer says what a pixel, a
+triangle or a voxel shows. The authors' data have no crossings: id 17 and its colour are ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.scene import CATEGORIES, GROUND_CLASSES, Scene
+
+EMPTY = 0
+GROUND_CLASS_ID = {"ground": 1, "terrain": 2, "sidewalk": 3, "parking": 4, "road": 5, "crossing": 17}
+CATEGORY_CLASS_ID = {name: 6 + index for index, name in enumerate(CATEGORIES)}
+CLASS_ID = GROUND_CLASS_ID | CATEGORY_CLASS_ID
+
+COLOR_HEX = {
+    "ground": "510051",
+    "terrain": "98fb98",
+    "sidewalk": "f423e8",
+    "parking": "faaaa0",
+    "road": "804080",
+    "crossing": "c8a0d8",
+    "vegetation_cuboid": "6b8e23",
+    "vegetation_ellipsoid": "6b8e23",
+    "vehicle_big": "003c64",
+    "vehicle_small": "00008e",
+    "two_wheelers": "770b20",
+    "human": "dc143c",
+    "construction_big": "464646",
+    "construction_small": "66669c",
+    "pole": "999999",
+    "traffic_control": "faaa1e",
+    "object": "0080c0",
+}
+EMPTY_HEX = "ffffff"
+
+
+def rgb(color_hex: str) -> tuple[int, int, int]:
+    """(red, green, blue), 0..255, sRGB, of six hexadecimal digits."""
+    return tuple(bytes.fromhex(color_hex))
+
+
+def _colors_by_class_id() -> np.ndarray:
+    colors = np.zeros((max(CLASS_ID.values()) + 1, 3), np.uint8)
+    colors[EMPTY] = rgb(EMPTY_HEX)
+    for name, class_id in CLASS_ID.items():
+        colors[class_id] = rgb(COLOR_HEX[name])
+    return colors
+
+
+CLASS_COLORS = _colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white where there is nothing
+CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) by category
+
+assert set(GROUND_CLASS_ID) == set(GROUND_CLASSES) and set(COLOR_HEX) == set(CLASS_ID)
+
+
+def ground_ids(scene: Scene) -> np.ndarray:
+    """(G + 1,) class id of each of the scene's ground classes; the last, also found at index -1, is EMPTY."""
+    return np.array([GROUND_CLASS_ID[name] for name in scene.ground_classes] + [EMPTY], np.uint8)

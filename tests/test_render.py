@@ -1,0 +1,83 @@
+"""Pictures show what trimesh's rays hit."""
+
+import numpy as np
+import pytest
+import trimesh
+from test_mesh import empty_scene, example_scene
+
+from models.scene import ELLIPSOID, Grid
+from pipelines.scenes.mesh import cuboid_triangles, scene_from_unit, scene_triangles
+from pipelines.scenes.palette import CLASS_COLORS, ground_ids
+from pipelines.scenes.render import bev_picture, cast_ellipsoids
+
+
+def test_bev_shows_what_vertical_rays_hit():
+    scene = example_scene(80)
+    corners, class_id, _ = scene_triangles(scene)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    x, y = np.meshgrid(scene.grid.x_m()[1::3], scene.grid.y_m()[1::3], indexing="ij")
+    origins = np.stack([x, y, np.full_like(x, 100)], axis=-1).reshape(-1, 3)
+    hit = mesh.ray.intersects_first(origins, np.tile([0.0, 0, -1], (len(origins), 1)))
+    expected = np.append(class_id, 0)[hit].reshape(x.shape)
+    picture = bev_picture(scene)[1::3, 1::3]
+    same = (picture == CLASS_COLORS[expected]).all(axis=-1)
+    # The ground mesh ends at pixel centres and blends no classes within a triangle: rims may differ.
+    assert same.mean() > 0.985
+    objects = expected >= 6
+    objects &= expected < 17
+    assert same[objects].mean() > 0.998
+
+
+def test_bev_of_bare_ground_is_the_fused_raster():
+    scene = example_scene(0)
+    _, winner = scene.surface()
+    assert np.array_equal(bev_picture(scene), CLASS_COLORS[ground_ids(scene)[winner]])
+
+
+def test_bev_is_deterministic_and_white_where_empty():
+    scene = example_scene()
+    assert np.array_equal(bev_picture(scene), bev_picture(scene))
+    assert (bev_picture(empty_scene()) == 255).all()
+
+
+@pytest.mark.parametrize(
+    "rows, cols, shape", [(256, 256, (256, 256)), (512, 256, (256, 128)), (384, 512, (192, 256))]
+)
+def test_bev_fills_the_picture_for_any_grid(rows, cols, shape):
+    grid = Grid(front_m=64 + 32, left_m=32 + 8, rows=rows, cols=cols)
+    picture = bev_picture(example_scene(150, grid))
+    assert picture.shape == (*shape, 3) and picture.dtype == np.uint8
+    assert (picture[[0, -1]] < 255).any(axis=(1, 2)).all()
+
+
+def test_supersampling_keeps_the_mean_colour():
+    scene = example_scene()
+    fine, coarse = bev_picture(scene, 512), bev_picture(scene, 256, supersample=2)
+    assert coarse.shape == (256, 256, 3)
+    assert np.abs(fine.mean(axis=(0, 1)) - coarse.mean(axis=(0, 1))).max() < 0.5
+
+
+def test_ellipsoids_are_cast_exactly():
+    scene = example_scene(220)
+    scene = scene.select(scene.category == ELLIPSOID)
+    grid = Grid(resolution_m=0.5, rows=128, cols=128)
+    height, index = cast_ellipsoids(scene, grid)
+    assert np.array_equal(index >= 0, np.isfinite(height))
+    row, col = np.nonzero(index >= 0)
+    points = np.stack([grid.x_m()[row], grid.y_m()[col], height[row, col]], axis=-1)
+
+    unit_from_scene = np.linalg.inv(scene_from_unit(scene))
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
+    own = radius[index[row, col], np.arange(len(points))]
+    assert np.allclose(own, 0.5, atol=1e-6)  # on the surface of the one hit
+    homogeneous[:, 2] += 1e-3
+    radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
+    assert (radius > 0.5 - 1e-6).all()  # and above every other
+
+
+def test_nothing_round_to_cast():
+    scene = empty_scene()
+    height, index = cast_ellipsoids(scene, scene.grid)
+    assert not np.isfinite(height).any() and (index == -1).all()
+    assert len(cuboid_triangles(scene).corners_m) == 0
