@@ -19,7 +19,8 @@ def solid(center_m, rotation, size_m):
 
 
 def manifold_iou(a: Boxes, b: Boxes) -> np.ndarray:
-    common = np.array([(solid(*x) ^ solid(*y)).volume() for x, y in zip(zip(*a), zip(*b), strict=True)])
+    solids_a, solids_b = ([solid(*box) for box in zip(*side, strict=True)] for side in (a, b))
+    common = np.array([(x ^ y).volume() for x, y in zip(solids_a, solids_b, strict=True)])
     return common / (a.volume_m3 + b.volume_m3 - common)
 
 

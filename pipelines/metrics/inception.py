@@ -1,0 +1,268 @@
+"""Inception features from a local weight file, and random-network features that need none.
+
+The network is the one every FID is defined by: TensorFlow's graph of 2015-12-05 (1008 classes), in plain torch. Its
+parameter names are those of pytorch-fid's and torch-fidelity's converted weights, so that either file loads. Nothing
+is ever fetched; docs/evaluation.md says how to get the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import safetensors.torch
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+INPUT_SIZE = 299
+FEATURES, CLASSES = 2048, 1008
+
+# A branch is a chain of convolutions (output channels, kernel height x width); SPLIT ends it with a 1x3 and a 3x1
+# side by side. One-step chains bear the branch's name, others name_1, name_2, ...
+SPLIT = "split"
+Chain = tuple[tuple[int, int, int] | str, ...]
+
+
+CHAINS_5 = {
+    "branch1x1": ((64, 1, 1),),
+    "branch5x5": ((48, 1, 1), (64, 5, 5)),
+    "branch3x3dbl": ((64, 1, 1), (96, 3, 3), (96, 3, 3)),
+}
+
+
+def _chains_6(channels: int) -> dict[str, Chain]:
+    c = channels
+    return {
+        "branch1x1": ((192, 1, 1),),
+        "branch7x7": ((c, 1, 1), (c, 1, 7), (192, 7, 1)),
+        "branch7x7dbl": ((c, 1, 1), (c, 7, 1), (c, 1, 7), (c, 7, 1), (192, 1, 7)),
+    }
+
+
+CHAINS_6A = {"branch3x3": ((384, 3, 3),), "branch3x3dbl": ((64, 1, 1), (96, 3, 3), (96, 3, 3))}
+CHAINS_7A = {
+    "branch3x3": ((192, 1, 1), (320, 3, 3)),
+    "branch7x7x3": ((192, 1, 1), (192, 1, 7), (192, 7, 1), (192, 3, 3)),
+}
+CHAINS_7 = {
+    "branch1x1": ((320, 1, 1),),
+    "branch3x3": ((384, 1, 1), SPLIT),
+    "branch3x3dbl": ((448, 1, 1), (384, 3, 3), SPLIT),
+}
+
+
+class InceptionFeatures(NamedTuple):
+    pool3: Tensor  # (n, 2048)
+    logits: Tensor  # (n, 1008), without the bias: what ADM's Inception score takes
+
+
+class Conv(nn.Module):
+    """Convolution without bias, batch norm (eps 1e-3), ReLU. Same size out unless `reduce`: stride 2, no padding."""
+
+    def __init__(self, inputs: int, outputs: int, height: int, width: int, reduce: bool = False, pad: bool = True):
+        super().__init__()
+        padding = (height // 2, width // 2) if pad and not reduce else 0
+        self.conv = nn.Conv2d(inputs, outputs, (height, width), 2 if reduce else 1, padding, bias=False)
+        self.bn = nn.BatchNorm2d(outputs, eps=0.001)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.bn(self.conv(x)))
+
+
+class Mixed(nn.Module):
+    """Chains of convolutions and a pooled branch side by side.
+
+    With `pool_channels`, the pool keeps the size and a 1x1 convolution follows; without, everything ends in stride 2.
+    The average leaves padding out, and 7c pools by maximum: both as in the TensorFlow graph.
+    """
+
+    def __init__(self, inputs: int, chains: dict[str, Chain], pool_channels: int | None, max_pool: bool = False):
+        super().__init__()
+        self.chains: list[list[list[str]]] = []  # per branch, per step: names of modules side by side
+        self.reduce, self.max_pool = pool_channels is None, max_pool
+        self.outputs = 0
+        for branch, chain in chains.items():
+            steps, channels = [], inputs
+            for i, step in enumerate(chain):
+                name = branch if len(chain) == 1 else f"{branch}_{i + 1}"
+                if step == SPLIT:
+                    self.add_module(name + "a", Conv(channels, 384, 1, 3))
+                    self.add_module(name + "b", Conv(channels, 384, 3, 1))
+                    steps.append([name + "a", name + "b"])
+                    channels = 768
+                else:
+                    last = i == len(chain) - 1
+                    self.add_module(name, Conv(channels, *step, reduce=self.reduce and last))
+                    steps.append([name])
+                    channels = step[0]
+            self.chains.append(steps)
+            self.outputs += channels
+        if not self.reduce:
+            self.branch_pool = Conv(inputs, pool_channels, 1, 1)
+        self.outputs += inputs if self.reduce else pool_channels
+
+    def forward(self, x: Tensor) -> Tensor:
+        branches = []
+        for steps in self.chains:
+            y = x
+            for names in steps:
+                y = torch.cat([self.get_submodule(name)(y) for name in names], dim=1)
+            branches.append(y)
+        return torch.cat([*branches, self._pooled(x)], dim=1)
+
+    def _pooled(self, x: Tensor) -> Tensor:
+        if self.reduce:
+            return F.max_pool2d(x, 3, stride=2)
+        if self.max_pool:
+            return self.branch_pool(F.max_pool2d(x, 3, stride=1, padding=1))
+        return self.branch_pool(F.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False))
+
+
+class Inception(nn.Module):
+    """uint8 pictures (n, height, width, 3) -> InceptionFeatures. `weights_sha256` names the file it was loaded from."""
+
+    weights_sha256: str | None = None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Conv2d_1a_3x3 = Conv(3, 32, 3, 3, reduce=True)
+        self.Conv2d_2a_3x3 = Conv(32, 32, 3, 3, pad=False)
+        self.Conv2d_2b_3x3 = Conv(32, 64, 3, 3)
+        self.Conv2d_3b_1x1 = Conv(64, 80, 1, 1)
+        self.Conv2d_4a_3x3 = Conv(80, 192, 3, 3, pad=False)
+        self.Mixed_5b = Mixed(192, CHAINS_5, 32)
+        self.Mixed_5c = Mixed(256, CHAINS_5, 64)
+        self.Mixed_5d = Mixed(288, CHAINS_5, 64)
+        self.Mixed_6a = Mixed(288, CHAINS_6A, None)
+        self.Mixed_6b = Mixed(768, _chains_6(128), 192)
+        self.Mixed_6c = Mixed(768, _chains_6(160), 192)
+        self.Mixed_6d = Mixed(768, _chains_6(160), 192)
+        self.Mixed_6e = Mixed(768, _chains_6(192), 192)
+        self.Mixed_7a = Mixed(768, CHAINS_7A, None)
+        self.Mixed_7b = Mixed(1280, CHAINS_7, 192)
+        self.Mixed_7c = Mixed(2048, CHAINS_7, 192, max_pool=True)
+        self.fc = nn.Linear(FEATURES, CLASSES)
+        self.eval().requires_grad_(False)
+
+    def forward(self, images: Tensor) -> InceptionFeatures:
+        if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[-1] != 3:
+            raise ValueError(f"Inception takes uint8 (n, height, width, 3), got {images.dtype} {tuple(images.shape)}")
+        x = images.permute(0, 3, 1, 2).to(self.fc.weight.dtype)
+        x = (resize_like_tensorflow1(x, INPUT_SIZE) - 128) / 128  # n 3 299 299
+        x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))  # n 64 147 147
+        x = F.max_pool2d(x, 3, stride=2)  # n 64 73 73
+        x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(x))  # n 192 71 71
+        x = F.max_pool2d(x, 3, stride=2)  # n 192 35 35
+        x = self.Mixed_5d(self.Mixed_5c(self.Mixed_5b(x)))  # n 288 35 35
+        x = self.Mixed_6e(self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(self.Mixed_6a(x)))))  # n 768 17 17
+        x = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(x)))  # n 2048 8 8
+        pool3 = x.mean(dim=(2, 3))
+        return InceptionFeatures(pool3, pool3 @ self.fc.weight.T)
+
+
+def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
+    """(n, c, size, size) bilinear, as TF1's ResizeBilinear: corners not aligned, no half-pixel shift.
+
+    Output i reads input i * (in / out), so an enlarged picture sits half a pixel up and left of torch's own.
+    """
+    for dim in (2, 3):
+        length = x.shape[dim]
+        position = torch.arange(size, dtype=torch.float32, device=x.device) * np.float32(length / size).item()
+        low = position.long()
+        high = (low + 1).clamp(max=length - 1)
+        share = (position - low).to(x.dtype).view(-1, *[1] * (3 - dim))
+        below, above = x.index_select(dim, low), x.index_select(dim, high)
+        x = below + (above - below) * share
+    return x
+
+
+def load_inception(path: str | Path) -> Inception:
+    """The network with the weights of a local state dict (.pth, .pt or .safetensors).
+
+    A name like weights-inception-2015-12-05-6726825d.pth ends in the start of the file's sha256, which is checked.
+    Raises ValueError, naming the file, for a missing or corrupted file and for weights of another network.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; Inception weights must be local (docs/evaluation.md says how)")
+    sha256 = _sha256(path)
+    claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
+    if claimed and not sha256.startswith(claimed[1]):
+        raise ValueError(f"{path}: corrupted, its sha256 starts with {sha256[:8]} instead of {claimed[1]}")
+    try:
+        if path.suffix == ".safetensors":
+            state = safetensors.torch.load_file(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch's unpickler raises whatever a corrupted file makes it stumble over
+        raise ValueError(f"{path}: not a readable state dict ({error})") from error
+    network = Inception()
+    try:
+        network.load_state_dict(state)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"{path}: not the weights of the FID Inception network ({error})") from error
+    network.weights_sha256 = sha256
+    return network
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@torch.inference_mode()
+def inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> tuple[np.ndarray, np.ndarray]:
+    """pool3 (n, 2048) and logits without bias (n, 1008), float32, of uint8 pictures (n, height, width, 3)."""
+    device = network.fc.weight.device
+    parts = [network(batch.to(device)) for batch in _batches(images, batch_size)]
+    if not parts:
+        return np.empty((0, FEATURES), np.float32), np.empty((0, CLASSES), np.float32)
+    pool3, logits = (torch.cat(part).float().cpu().numpy() for part in zip(*parts, strict=True))
+    return pool3, logits
+
+
+def random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
+    """A small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
+
+    For tests and for comparing sources where no Inception weights are at hand. Distances of its features are called
+    `random_frechet` or the like, never FID. Weights come from numpy's legacy generator, whose stream is frozen.
+    """
+    random = np.random.RandomState(seed)
+    layers, inputs = [], 3
+    for outputs in channels:
+        conv = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
+        weight = random.standard_normal(conv.weight.shape) * np.sqrt(2 / (9 * inputs))
+        conv.weight.data = torch.from_numpy(weight.astype(np.float32))
+        layers += [conv, nn.ReLU()]
+        inputs = outputs
+    return nn.Sequential(*layers).eval().requires_grad_(False)
+
+
+@torch.inference_mode()
+def random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
+    """(n, 480) float32 features of uint8 pictures (n, height, width, 3) under `random_network(seed)`.
+
+    The mean over the picture after each convolution (32 + 64 + 128 + 256): coarse and fine structure alike.
+    """
+    network = random_network(seed)
+    parts = []
+    for batch in _batches(images, batch_size):
+        x, means = batch.permute(0, 3, 1, 2).float() / 128 - 1, []
+        for layer in network:
+            x = layer(x)
+            if isinstance(layer, nn.ReLU):
+                means.append(x.mean(dim=(2, 3)))
+        parts.append(torch.cat(means, dim=1))
+    return torch.cat(parts).numpy() if parts else np.empty((0, 480), np.float32)
+
+
+def _batches(images: np.ndarray, batch_size: int) -> Iterator[Tensor]:
+    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[-1] != 3:
+        raise ValueError(f"pictures must be uint8 (n, height, width, 3), got {images.dtype} {images.shape}")
+    for start in range(0, len(images), batch_size):
+        yield torch.from_numpy(np.ascontiguousarray(images[start : start + batch_size]))

@@ -1,0 +1,219 @@
+"""Reconstruction scores: ground IoU and height error, AP3D (paper, Sec. 4.1 Metrics, Tab. 2).
+
+One record per scene, cheap to make anywhere and to add up in any grouping; one function per table turns the sum into
+numbers. Everything is accumulated over the whole dataset before it is divided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.scene import CATEGORIES, ELLIPSOID, Scene
+from pipelines.metrics.iou3d import boxes_of, iou3d_of
+
+THRESHOLDS = np.linspace(0.05, 0.50, 10)  # IoU3D, Omni3D's ten steps
+RECALL_POINTS = np.linspace(0.0, 1.0, 101)
+SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # paper: all categories but VE
+
+
+# --------------------------------------------------------------------------------------------------------- ground
+
+
+@dataclass(frozen=True)
+class GroundSums:
+    """What ground scores are made of, summed over scenes; all (G,), one entry per ground class."""
+
+    intersection: np.ndarray  # pixels occupied in both
+    union: np.ndarray  # pixels occupied in either
+    pixels: np.ndarray  # pixels truly occupied
+    absolute_m: np.ndarray  # sum of |height error| over truly occupied pixels
+    squared_m2: np.ndarray  # sum of squared height errors over truly occupied pixels
+
+    def __add__(self, other: GroundSums) -> GroundSums:
+        return GroundSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+
+
+def ground_sums(
+    true_occupied: np.ndarray, true_height_m: np.ndarray, occupied: np.ndarray, height_m: np.ndarray
+) -> GroundSums:
+    """Sums of one scene (or a stack of scenes) from rasters (..., G, H, W): masks bool, heights in metres.
+
+    Heights are compared wherever the truth is occupied, as in the paper's loss, whether or not the prediction says
+    occupied: pass the decoder's heights. A Scene holds 0 m where it is not occupied, and then that 0 counts.
+    """
+    shapes = {np.shape(part) for part in (true_occupied, true_height_m, occupied, height_m)}
+    if len(shapes) != 1:
+        raise ValueError(f"ground rasters differ in shape: {sorted(shapes)}")
+    error_m = np.where(true_occupied, np.asarray(height_m, np.float64) - true_height_m, 0.0)
+    if not np.isfinite(error_m).all():
+        raise ValueError("ground heights hold NaN or infinite numbers on truly occupied pixels")
+    masks = (true_occupied & occupied, true_occupied | occupied, true_occupied, np.abs(error_m), error_m**2)
+    num_classes = error_m.shape[-3]
+    return GroundSums(*(np.moveaxis(part, -3, 0).reshape(num_classes, -1).sum(axis=1) for part in masks))
+
+
+@dataclass(frozen=True)
+class GroundScores:
+    """Ground scores of a dataset. A class that neither side ever occupies has no entry."""
+
+    iou: float  # intersection over union of all classes' pixels together
+    mean_iou: float  # mean of the classes' own
+    class_iou: dict[str, float]
+    height_mae_m: float
+    height_rmse_m: float
+    class_height_rmse_m: dict[str, float]  # of truly occupied classes
+    height_mse: float  # the paper's: heights normalised to [0, 1] by the bounds
+
+
+def ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray) -> GroundScores:
+    """Scores of the summed scenes; height_bounds_m is (2,) or (G, 2), lowest and highest height of the data.
+
+    Raises ValueError if no pixel is occupied at all or if bounds are empty intervals.
+    """
+    low, high = np.broadcast_to(np.asarray(height_bounds_m, np.float64), (len(ground_classes), 2)).T
+    if not (high > low).all():
+        raise ValueError(f"height bounds must be (lowest, highest) in metres, got {height_bounds_m}")
+    pixels = sums.pixels.sum()
+    if pixels == 0:
+        raise ValueError("ground scores need at least one truly occupied pixel; all scenes are empty")
+    seen = sums.union > 0
+    names = np.asarray(ground_classes)
+    iou = sums.intersection[seen] / sums.union[seen]
+    truly = sums.pixels > 0
+    rmse_m = np.sqrt(sums.squared_m2[truly] / sums.pixels[truly])
+    return GroundScores(
+        iou=float(sums.intersection.sum() / sums.union.sum()),
+        mean_iou=float(iou.mean()),
+        class_iou=dict(zip(names[seen].tolist(), iou.tolist(), strict=True)),
+        height_mae_m=float(sums.absolute_m.sum() / pixels),
+        height_rmse_m=float(np.sqrt(sums.squared_m2.sum() / pixels)),
+        class_height_rmse_m=dict(zip(names[truly].tolist(), rmse_m.tolist(), strict=True)),
+        height_mse=float((sums.squared_m2 / (high - low) ** 2).sum() / pixels),
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- AP3D
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched detections of any number of scenes; per category sorted by score within a scene.
+
+    `rank` is a detection's place in its scene and category (0 = best score): truncating to the best k after matching
+    is the same as before, since greedy matching never looks at worse ones. So is a score threshold.
+    """
+
+    category: np.ndarray  # (d,) int8
+    score: np.ndarray  # (d,) float64
+    rank: np.ndarray  # (d,) int64
+    hit: np.ndarray  # (d, 10) bool: true positive at each of THRESHOLDS
+    truths: np.ndarray  # (11,) int64: number of true primitives per category
+
+
+def join_matches(parts: Sequence[Matches]) -> Matches:
+    """One record of all scenes' matches. Keep scenes in a fixed order: it decides between equal scores, as in COCO."""
+    if not parts:
+        raise ValueError("AP3D needs at least one scene's matches, got none")
+    joined = [np.concatenate([getattr(p, name) for p in parts]) for name in ("category", "score", "rank", "hit")]
+    return Matches(*joined, truths=np.sum([p.truths for p in parts], axis=0))
+
+
+def match_scene(truth: Scene, prediction: Scene) -> Matches:
+    """Matches of one predicted scene, ranked by `existence`, with its truth, for every category in SCORED."""
+    if not np.isfinite(prediction.existence).all():
+        raise ValueError(f"scene {prediction.scene_id}: existence holds NaN or infinite numbers")
+    true_boxes, boxes = boxes_of(truth), boxes_of(prediction)
+    category, score, rank, hit = [], [], [], []
+    truths = np.zeros(len(CATEGORIES), np.int64)
+    for c in SCORED:
+        true_index, index = np.flatnonzero(truth.category == c), np.flatnonzero(prediction.category == c)
+        index = index[np.argsort(-prediction.existence[index], kind="stable")]
+        truths[c] = len(true_index)
+        category.append(np.full(len(index), c, np.int8))
+        score.append(prediction.existence[index].astype(np.float64))
+        rank.append(np.arange(len(index)))
+        hit.append(match_greedily(iou3d_of(c, boxes.take(index), true_boxes.take(true_index))))
+    return Matches(*map(np.concatenate, (category, score, rank, hit)), truths=truths)
+
+
+def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
+    """(d, t) bool: is detection i, best score first, a true positive at threshold j, given iou (d, truths)?
+
+    At each threshold on its own, each detection in turn takes the unmatched truth it overlaps most, if by at least
+    the threshold; a later truth wins a tie (COCO).
+    """
+    num_detections, num_truths = iou.shape
+    hit = np.zeros((num_detections, len(thresholds)), bool)
+    if num_truths == 0:
+        return hit
+    backwards = iou[:, ::-1]  # argmax takes the first of equals
+    free = np.ones((len(thresholds), num_truths), bool)
+    rows = np.arange(len(thresholds))
+    for i in np.flatnonzero(iou.max(axis=1) >= thresholds.min()):
+        candidate = np.where(free, backwards[i], -1.0)
+        best = candidate.argmax(axis=1)
+        hit[i] = candidate[rows, best] >= thresholds
+        free[rows[hit[i]], best[hit[i]]] = False
+    return hit
+
+
+@dataclass(frozen=True)
+class DetectionScores:
+    """AP3D in [0, 1]. Categories without a single truth are left out; `table` holds them per threshold."""
+
+    ap3d: float  # mean over categories and thresholds
+    ap3d_50: float  # mean over categories at IoU3D 0.50
+    category_ap3d: dict[str, float]
+    category_ap3d_50: dict[str, float]
+    table: dict[str, list[float]]  # (10,) average precision at each of THRESHOLDS
+
+
+def detection_scores(
+    matches: Matches, max_detections: int | None = None, min_score: float = -np.inf
+) -> DetectionScores:
+    """AP3D and AP3D@50 as in Omni3D (paper, Sec. 4.1), over all scenes at once.
+
+    max_detections keeps the best so many per scene and category (Omni3D: 100; None: all); min_score drops detections
+    below a score. Raises ValueError if no category has a truth.
+    """
+    keep = matches.score >= min_score
+    if max_detections is not None:
+        keep &= matches.rank < max_detections
+    table = {}
+    for c in np.flatnonzero(matches.truths):
+        of_category = np.flatnonzero(keep & (matches.category == c))
+        order = of_category[np.argsort(-matches.score[of_category], kind="stable")]
+        table[CATEGORIES[c]] = average_precision(matches.hit[order], int(matches.truths[c]))
+    if not table:
+        raise ValueError("AP3D is undefined: no scored category has a true primitive")
+    means = {name: float(values.mean()) for name, values in table.items()}
+    at_50 = {name: float(values[-1]) for name, values in table.items()}
+    return DetectionScores(
+        ap3d=float(np.mean(list(means.values()))),
+        ap3d_50=float(np.mean(list(at_50.values()))),
+        category_ap3d=means,
+        category_ap3d_50=at_50,
+        table={name: values.tolist() for name, values in table.items()},
+    )
+
+
+def average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
+    """(t,) mean over 101 recall points of the interpolated precision; hit (d, t), best score first, num_truths > 0.
+
+    The precision at a recall is the highest one reached at that recall or beyond, 0 if it is never reached.
+    """
+    if len(hit) == 0:
+        return np.zeros(hit.shape[1])
+    found = hit.cumsum(axis=0)
+    recall = found / num_truths
+    precision = found / np.arange(1, len(hit) + 1)[:, None]
+    precision = np.maximum.accumulate(precision[::-1], axis=0)[::-1]
+    average = np.empty(hit.shape[1])
+    for t in range(hit.shape[1]):
+        first = np.searchsorted(recall[:, t], RECALL_POINTS, side="left")
+        reached = first < len(hit)
+        average[t] = precision[first[reached], t].sum() / len(RECALL_POINTS)
+    return average

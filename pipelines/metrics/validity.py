@@ -1,0 +1,125 @@
+"""Validity of scenes: overlapping, floating or sunken objects, cars off the road, buildings on it, broken roads.
+
+One record per scene: (measures, 2) float64, a numerator and a denominator per measure. Records add up; a stack of them
+can be resampled for intervals. A measure is a share, the lower the better except `road_connectivity` and label
+fidelity; real scenes give the level to compare with, it is not 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from models.scene import CATEGORIES, CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
+from pipelines.labels import DensityThresholds, density
+from pipelines.metrics.iou3d import boxes_of, iou3d_matrix
+
+MEASURES = (
+    "overlapping",  # solid primitives with IoU3D > 0.05 with another solid one
+    "floating",  # standing primitives with known ground whose lowest point is more than 0.5 m above the surface
+    "sunken",  # ... more than 0.5 m below it
+    "over_unknown_ground",  # standing primitives inside the grid whose centre lies over no ground at all
+    "off_road_vehicles",  # vehicles with known ground whose centre lies on no drivable class
+    "buildings_on_road",  # buildings with known ground whose centre lies on the road
+    "road_connectivity",  # road pixels in the scene's largest 4-connected road component; mean over scenes with road
+)
+LABEL_MEASURES = ("vegetation_fidelity", "vehicle_fidelity", "joint_fidelity")
+
+OVERLAP_IOU3D = 0.05
+TOLERANCE_M = 0.5
+SLAB_OFFSET_M = 0.3  # the authors' ground heights are slab tops, 0.3 m above the surface
+SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
+# Crowns, signs and lamps hang in the air in real scenes too.
+STANDING = tuple(
+    CATEGORY_INDEX[name]
+    for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole")
+)
+BUILDING = CATEGORY_INDEX["construction_big"]
+ROAD_CLASSES = ("road", "crossing")
+DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
+
+
+def scene_validity(scene: Scene, slab_offset_m: float = SLAB_OFFSET_M) -> np.ndarray:
+    """(7, 2) numerators and denominators of MEASURES for one scene.
+
+    slab_offset_m is how far the scene's ground heights lie above the surface that objects stand on.
+    """
+    category = scene.category
+    bottom_m = scene.center_m[:, 2] - 0.5 * (np.abs(scene.rotation[:, 2, :]) * scene.size_m).sum(axis=1)
+    row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
+    inside = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
+    pixel = row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1)
+    height_m, ground_class = scene.surface()
+    known = inside & (ground_class[pixel] >= 0)
+    above_m = bottom_m - (height_m[pixel] - slab_offset_m)
+
+    standing = np.isin(category, STANDING)
+    vehicles, buildings = np.isin(category, VEHICLES), category == BUILDING
+    drivable, road = (_mask(scene, classes) for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
+    return np.array(
+        [
+            _share(_overlapping(scene), np.isin(category, SOLID)),
+            _share(above_m > TOLERANCE_M, standing & known),
+            _share(above_m < -TOLERANCE_M, standing & known),
+            _share(~known, standing & inside),
+            _share(~drivable[pixel], vehicles & known),
+            _share(road[pixel], buildings & known),
+            _largest_component(road),
+        ],
+        np.float64,
+    )
+
+
+def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
+    """(3, 2) of LABEL_MEASURES: is the scene's own density label the one it bears (the one asked for)?
+
+    Raises ValueError for a scene that bears no label.
+    """
+    if scene.vegetation_density is None or scene.vehicle_density is None:
+        raise ValueError(f"scene {scene.scene_id} bears no density labels; label fidelity needs the ones asked for")
+    right = []
+    for categories, thresholds, label in (
+        (VEGETATION, vegetation, scene.vegetation_density),
+        (VEHICLES, vehicle, scene.vehicle_density),
+    ):
+        members = np.isin(scene.category, categories)
+        own = density(members.sum(), scene.volume_m3[members].sum(), thresholds)
+        right.append(bool(own == label))
+    return np.array([[right[0], 1], [right[1], 1], [all(right), 1]], np.float64)
+
+
+def validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
+    """Share per measure over all scenes, from records (scenes, measures, 2); None where nothing could be judged."""
+    records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
+    numerator, denominator = records.sum(axis=0).T
+    return {n: float(a / b) if b > 0 else None for n, a, b in zip(names, numerator, denominator, strict=True)}
+
+
+def _share(bad: np.ndarray, among: np.ndarray) -> tuple[int, int]:
+    return int((bad & among).sum()), int(among.sum())
+
+
+def _overlapping(scene: Scene) -> np.ndarray:
+    """(n,) bool: a solid primitive that overlaps another solid one by more than OVERLAP_IOU3D."""
+    solid = np.flatnonzero(np.isin(scene.category, SOLID))
+    boxes = boxes_of(scene).take(solid)
+    iou = iou3d_matrix(boxes, boxes)
+    np.fill_diagonal(iou, 0)
+    overlapping = np.zeros(len(scene), bool)
+    overlapping[solid] = (iou > OVERLAP_IOU3D).any(axis=1)
+    return overlapping
+
+
+def _mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
+    """(H, W) bool: any of the classes occupies the pixel (classes may overlap)."""
+    index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
+    return scene.occupied[index].any(axis=0)
+
+
+def _largest_component(mask: np.ndarray) -> tuple[float, int]:
+    """Share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
+    components, _ = ndimage.label(mask)
+    sizes = np.bincount(components.ravel())[1:]
+    return (float(sizes.max() / sizes.sum()), 1) if len(sizes) else (0.0, 0)

@@ -1,0 +1,98 @@
+"""Layout statistics by hand; Jensen-Shannon against scipy; the Frechet distance of layouts in closed form."""
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import jensenshannon
+
+from models.scene import CATEGORIES, CATEGORY_INDEX, Grid, Scene
+from pipelines.metrics.statistics import (
+    count_divergence,
+    jensen_shannon,
+    layout_frechet,
+    layout_statistics,
+    statistic_names,
+)
+
+CAR, POLE = CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["pole"]
+
+
+def scene(category, size_m) -> Scene:
+    n = len(category)
+    occupied = np.zeros((2, 4, 4), bool)
+    occupied[0, :2] = True
+    return Scene(
+        "a", "town", "0", 0, "test",
+        category=np.asarray(category, np.int8), center_m=np.zeros((n, 3), np.float32),
+        rotation=np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)),
+        size_m=np.asarray(size_m, np.float32).reshape(n, 3),
+        ground_classes=("road", "terrain"), height_m=np.zeros((2, 4, 4), np.float32), occupied=occupied,
+        grid=Grid(2.0, 1.0, 0.5, 4, 4),
+    )  # fmt: skip
+
+
+def test_statistics_by_hand():
+    names = statistic_names(("road", "terrain"))
+    got = dict(zip(names, layout_statistics(scene([CAR, POLE, CAR], [[4, 2, 1], [1, 1, 6], [5, 2, 2]])), strict=True))
+    assert got["num_vehicle_small"] == 2 and got["num_pole"] == 1 and got["num_human"] == 0
+    assert got["vehicle_small_length_m"] == 4.5 and got["vehicle_small_height_m"] == 1.5
+    assert got["pole_height_m"] == 6
+    assert np.isnan(got["human_length_m"])
+    assert got["road_share"] == 0.5 and got["terrain_share"] == 0
+
+
+def test_an_empty_scene_has_statistics_too():
+    got = layout_statistics(scene([], []))
+    assert (got[: len(CATEGORIES)] == 0).all() and got[-2] == 0.5
+
+
+def test_frechet_of_a_shift_counts_in_deviations_of_the_reference():
+    rng = np.random.default_rng(0)
+    reference = rng.normal(5, [0.1, 10, 3], (4000, 3))
+    assert layout_frechet(reference, reference) == pytest.approx(0, abs=1e-9)
+    shifted = reference + reference.std(axis=0) * [1, 2, 0]
+    assert layout_frechet(reference, shifted) == pytest.approx(1 + 4, rel=1e-9)
+    centre = reference.mean(axis=0)
+    n = len(reference)
+    assert layout_frechet(reference, centre + 2 * (reference - centre)) == pytest.approx(3 * n / (n - 1), rel=1e-9)
+
+
+def test_units_do_not_matter():
+    rng = np.random.default_rng(1)
+    a, b, unit = rng.normal(size=(50, 4)), rng.normal(1, 2, size=(40, 4)), np.array([1, 100, 0.01, 7])
+    assert layout_frechet(a, b) == pytest.approx(layout_frechet(a * unit, b * unit), rel=1e-6)
+
+
+def test_absent_categories_and_constant_columns_stay_finite():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    a[:, 0], b[:, 0] = 2, 5  # constant: 3 units apart
+    a[::2, 1] = np.nan
+    b[:, 2] = np.nan  # never there in the other source
+    assert layout_frechet(a, b) > 9 and np.isfinite(layout_frechet(a, b))
+    a[:, 1] = np.nan  # never there in the reference
+    assert np.isfinite(layout_frechet(a, b))
+    with pytest.raises(ValueError, match="at least 2 scenes"):
+        layout_frechet(a, b[:1])
+    with pytest.raises(ValueError, match="alike"):
+        layout_frechet(a, b[:, :2])
+
+
+def test_jensen_shannon_equals_scipys():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        p, q = rng.integers(0, 5, (2, 12)) + np.eye(12, dtype=int)[:2]
+        assert jensen_shannon(p, q) == pytest.approx(jensenshannon(p, q, base=2) ** 2, abs=1e-12)
+    assert jensen_shannon(np.array([1, 0]), np.array([0, 3])) == 1
+    assert jensen_shannon(np.array([2, 4]), np.array([1, 2])) == pytest.approx(0, abs=1e-12)
+    for bad in ([0, 0], [-1, 2], [1, 1, 1]):
+        with pytest.raises(ValueError, match="Jensen-Shannon"):
+            jensen_shannon(np.array([1, 2]), np.array(bad))
+
+
+def test_count_divergence_names_the_category_that_differs():
+    counts = np.random.default_rng(4).integers(0, 6, (200, len(CATEGORIES)))
+    other = counts[::-1].copy()
+    other[:, CAR] += 10
+    got = count_divergence(counts, other)
+    assert got["vehicle_small"] == pytest.approx(1)
+    assert all(got[name] == pytest.approx(0, abs=1e-12) for name in CATEGORIES if name != "vehicle_small")
