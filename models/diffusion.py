@@ -1,0 +1,162 @@
+"""Denoising diffusion on layout latents (paper, supplement B.3): schedule, training target and the one sampler.
+
+States are counted on the visited timesteps: state i means "noised to timestep visited[i]", state -1 means clean.
+Plain sampling walks n-1, n-2, ..., 0, -1; RePaint walks the same road with detours (repaint.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """DDPM with a linear variance schedule; the paper's numbers (supplement B.3, Implementation Details)."""
+
+    num_timesteps: int = 1000
+    beta_start: float = 0.0015
+    beta_end: float = 0.015
+
+    @cached_property
+    def alpha_bar(self) -> np.ndarray:
+        """(T,) float64 cumulative product of 1 - beta_t."""
+        return np.cumprod(1 - np.linspace(self.beta_start, self.beta_end, self.num_timesteps, dtype=np.float64))
+
+    def visited(self, num_steps: int) -> np.ndarray:
+        """(num_steps,) ascending timesteps, "leading" spacing: 0, 4, ..., 996 for 250 of 1000."""
+        if not 1 <= num_steps <= self.num_timesteps:
+            raise ValueError(f"num_steps is {num_steps}, expected 1 to {self.num_timesteps}")
+        return np.arange(num_steps) * (self.num_timesteps // num_steps)
+
+    def add_noise(
+        self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, "b"]
+    ) -> Float[Tensor, "b c h w"]:
+        """z_t = sqrt(alpha_bar_t) z_0 + sqrt(1 - alpha_bar_t) eps."""
+        alpha_bar = torch.from_numpy(self.alpha_bar).to(clean.device)[timestep][:, None, None, None]
+        return alpha_bar.sqrt().to(clean.dtype) * clean + (1 - alpha_bar).sqrt().to(clean.dtype) * noise
+
+
+class Walk:
+    """The visited timesteps of one sampling run, with every transition between their states."""
+
+    def __init__(self, diffusion: Diffusion, num_steps: int) -> None:
+        self.timesteps = diffusion.visited(num_steps)
+        self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # [-1] is the clean state
+
+    def __len__(self) -> int:
+        return len(self.timesteps)
+
+    def plain(self) -> list[tuple[int, int]]:
+        """(from, to) states of sampling without detours."""
+        return [(i, i - 1) for i in reversed(range(len(self)))]
+
+    def to_state(self, clean: Tensor, noise: Tensor, state: int) -> Tensor:
+        """Noise a clean latent to a state; state -1 returns it bit for bit."""
+        if state == -1:
+            return clean
+        a = self.alpha_bar[state]
+        return a**0.5 * clean + (1 - a) ** 0.5 * noise
+
+    def up(self, latent: Tensor, noise: Tensor, state: int, to: int) -> Tensor:
+        """q(z_to | z_state) for to > state: add the noise between two states."""
+        ratio = self.alpha_bar[to] / self.alpha_bar[state]
+        return ratio**0.5 * latent + (1 - ratio) ** 0.5 * noise
+
+    def down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
+        """p(z_{state-1} | z_state): posterior mean from the predicted noise, posterior variance.
+
+        Written through z_0 so that it holds for spaced timesteps (beta = 1 - alpha_bar_i / alpha_bar_{i-1}).
+        """
+        a, a_prev = self.alpha_bar[state], self.alpha_bar[state - 1]
+        beta = 1 - a / a_prev
+        clean = (latent - (1 - a) ** 0.5 * predicted_noise) / a**0.5
+        mean = a_prev**0.5 * beta / (1 - a) * clean + (a / a_prev) ** 0.5 * (1 - a_prev) / (1 - a) * latent
+        if state == 0:
+            return mean
+        return mean + ((1 - a_prev) / (1 - a) * beta) ** 0.5 * noise
+
+
+class SceneNoise:
+    """Standard normal noise keyed by (seed, scene index): each scene draws its own sequence.
+
+    The same scene comes out whatever the batch size, the number of workers or the scenes beside it.
+    """
+
+    def __init__(self, seed: int, indices: Sequence[int], shape: tuple[int, ...], device: torch.device | str) -> None:
+        self.generators = [keyed_generator(seed, index) for index in indices]
+        self.shape, self.device = shape, device
+
+    def draw(self) -> Float[Tensor, "b ..."]:
+        noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
+        return noise.to(self.device)
+
+
+def keyed_generator(*key: int) -> torch.Generator:
+    """A CPU generator that depends on every number of the key, and on nothing else."""
+    state = np.random.SeedSequence([k & 0xFFFFFFFF for k in key]).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+def guided(model: Denoiser, null_label: int, scale: float) -> Denoiser:
+    """Classifier-free guidance; at scale 1 the model itself, without a second half of the batch."""
+    if scale == 1.0:
+        return model
+
+    def predict(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
+        both = torch.cat([label, torch.full_like(label, null_label)])
+        conditional, unconditional = model(latent.repeat(2, 1, 1, 1), timestep.repeat(2), both).chunk(2)
+        return unconditional + scale * (conditional - unconditional)
+
+    return predict
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What must stay: clean latents and a mask, 1 = generate, 0 = keep (paper, Eqs. "z_known" ff.)."""
+
+    latent: Float[Tensor, "b c h w"]
+    mask: Float[Tensor, "b c h w"]
+
+
+@torch.no_grad()
+def sample(
+    model: Denoiser,
+    walk: Walk,
+    noise: SceneNoise,
+    label: Int[Tensor, "b"],
+    transitions: list[tuple[int, int]] | None = None,
+    known: Known | None = None,
+    on_step: Callable[[int, int], None] | None = None,
+) -> Float[Tensor, "b c h w"]:
+    """Clean latents, by DDPM ancestral sampling along `transitions` (plain by default).
+
+    Downward, the model denoises; upward, noise is added back (RePaint). With `known`, the known part is noised to
+    the state just reached and pasted in after each downward step. Differs from the paper, which prints the level
+    just left (Eq. "z_known"): the two parts would not match. At the end the known part is z_0, bit for bit.
+    `on_step(done, total)` is called after every transition.
+    """
+    transitions = transitions or walk.plain()
+    latent = noise.draw()
+    for done, (state, to) in enumerate(transitions, start=1):
+        if to > state:
+            latent = walk.up(latent, noise.draw(), state, to)
+        else:
+            timestep = torch.full_like(label, int(walk.timesteps[state]))
+            predicted = model(latent, timestep, label)
+            step_noise = noise.draw() if to >= 0 else torch.zeros_like(latent)
+            latent = walk.down(latent, predicted, step_noise, state)
+            if known is not None:
+                kept = walk.to_state(known.latent, noise.draw() if to >= 0 else known.latent, to)
+                latent = torch.where(known.mask.bool(), latent, kept)
+        if on_step:
+            on_step(done, len(transitions))
+    return latent

@@ -1,0 +1,138 @@
+"""The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids: adaLN-Zero blocks, one timestep and one
+label embedding shared by all of them (paper, supplement B.3).
+
+diffusers' own `DiTTransformer2DModel` embeds timestep and label anew in every block, which is 8 % larger and drops
+labels for guidance independently per block, so that its unconditional branch is never trained. Here one embedding
+and one mask per sample serve the whole network.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from diffusers import ConfigMixin, ModelMixin
+from diffusers.configuration_utils import register_to_config
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+FREQUENCIES = 256
+
+
+def timestep_frequencies(timestep: Float[Tensor, "batch"]) -> Float[Tensor, "batch 256"]:
+    """Sinusoidal embedding of a timestep, cosines first."""
+    half = FREQUENCIES // 2
+    frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
+    angle = timestep.float()[:, None] * frequency
+    return torch.cat([angle.cos(), angle.sin()], dim=-1)
+
+
+def sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
+    """Fixed 2D sine-cosine positions of a square token grid, row-major: first half columns, second half rows."""
+
+    def axis(position: Tensor) -> Tensor:
+        frequency = 10_000 ** (-torch.arange(width // 4, dtype=torch.float64) / (width // 4))
+        angle = position.flatten()[:, None] * frequency
+        return torch.cat([angle.sin(), angle.cos()], dim=1)
+
+    row, col = torch.meshgrid(torch.arange(rows), torch.arange(rows), indexing="ij")
+    return torch.cat([axis(col), axis(row)], dim=1).float()
+
+
+def modulate(x: Float[Tensor, "batch n d"], shift: Tensor, scale: Tensor) -> Float[Tensor, "batch n d"]:
+    return x * (1 + scale[:, None]) + shift[:, None]
+
+
+class Block(nn.Module):
+    """Self-attention and MLP, both modulated and gated by the condition (adaLN-Zero)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+        self.modulation = nn.Linear(width, 6 * width)
+
+    def forward(self, x: Float[Tensor, "batch n d"], condition: Float[Tensor, "batch d"]) -> Float[Tensor, "batch n d"]:
+        """`condition` has passed its SiLU."""
+        shift1, scale1, gate1, shift2, scale2, gate2 = self.modulation(condition).chunk(6, dim=1)
+        width = x.shape[-1:]
+        y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
+        q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # (b, heads, n, dh) each
+        y = self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        x = x + gate1[:, None] * y
+        y = modulate(F.layer_norm(x, width, eps=1e-6), shift2, scale2)
+        return x + gate2[:, None] * self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh"))
+
+
+class DiT(ModelMixin, ConfigMixin):
+    """Predicts the noise in a latent (b, channels, size, size) at timestep t under label y.
+
+    Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
+    divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
+    """
+
+    @register_to_config
+    def __init__(
+        self,
+        channels: int = 64,
+        size: int = 32,
+        patch: int = 2,
+        width: int = 768,
+        depth: int = 12,
+        heads: int = 12,
+        label: str = "vegetation",
+        num_labels: int = 3,
+        layout: dict | None = None,
+        shift: tuple[float, ...] | None = None,
+        scale: tuple[float, ...] | None = None,
+    ) -> None:
+        super().__init__()
+        if size % patch or width % heads or width % 4:
+            raise ValueError(f"DiT: size {size} / patch {patch} and width {width} / heads {heads} must be whole")
+        self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
+        self.timestep_mlp = nn.Sequential(nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
+        self.label_embedding = nn.Embedding(num_labels + 1, width)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.modulation = nn.Linear(width, 2 * width)
+        self.patch_out = nn.Linear(width, patch * patch * channels)
+        self.register_buffer("positions", sincos_positions(size // patch, width), persistent=False)
+        self.initialise()
+
+    def initialise(self) -> None:
+        """The original initialisation: xavier everywhere, every residual branch and the output start at zero."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
+                nn.init.zeros_(module.bias)
+        nn.init.xavier_uniform_(self.patch_in.weight.view(len(self.patch_in.weight), -1))
+        nn.init.zeros_(self.patch_in.bias)
+        for layer in (self.label_embedding, self.timestep_mlp[0], self.timestep_mlp[2]):
+            nn.init.normal_(layer.weight, std=0.02)
+        for layer in (*(block.modulation for block in self.blocks), self.modulation, self.patch_out):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    @property
+    def null_label(self) -> int:
+        return self.config.num_labels
+
+    def condition(self, timestep: Int[Tensor, "batch"], label: Int[Tensor, "batch"]) -> Float[Tensor, "batch d"]:
+        """One vector per sample that modulates every block: SiLU of timestep plus label embedding."""
+        frequencies = timestep_frequencies(timestep).to(self.patch_out.weight.dtype)
+        return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
+
+    def forward(
+        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, "batch"], label: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch c h w"]:
+        """The noise in `latent`."""
+        patch, tokens = self.config.patch, self.config.size // self.config.patch
+        condition = self.condition(timestep, label)
+        x = self.patch_in(latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
+        for block in self.blocks:
+            x = block(x, condition)
+        shift, scale = self.modulation(condition).chunk(2, dim=1)
+        x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c)
+        x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c)
+        return x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)

@@ -1,0 +1,216 @@
+"""One optimisation step, EMA, schedule and checkpoint of both stages, in plain torch.
+
+No Ray here: the same code trains alone on a GPU box. Randomness is keyed by (seed, step, position of the sample in
+the global batch), so that a resumed run and a run on more workers draw the same numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from diffusers import ModelMixin
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from models.diffusion import Diffusion, keyed_generator
+from models.dit import DiT
+from models.layout import LayoutBatch, LayoutSpec
+from models.losses import lvae_loss
+from models.lvae import LayoutVAE
+
+
+@dataclass(frozen=True)
+class Optimisation:
+    """AdamW with a cosine (OneCycle without warm-up) or constant learning rate."""
+
+    steps: int
+    learning_rate: float
+    weight_decay: float
+    final_learning_rate: float | None = None  # None: constant
+    warmup_steps: int = 0
+    betas: tuple[float, float] = (0.9, 0.999)
+    cycle_momentum: tuple[float, float] | None = None  # beta1 from the first to the second as the rate falls
+    grad_clip: float | None = None
+    ema_decay: float | None = None
+    seed: int = 0
+
+    def at(self, step: int) -> tuple[float, float]:
+        """Learning rate and beta1 of a step, counted from 0."""
+        rate, beta1 = self.learning_rate, self.betas[0]
+        if self.final_learning_rate is not None:
+            fall = (1 - math.cos(math.pi * min(step / max(self.steps - 1, 1), 1))) / 2
+            rate += fall * (self.final_learning_rate - rate)
+            if self.cycle_momentum:
+                beta1 = self.cycle_momentum[0] + fall * (self.cycle_momentum[1] - self.cycle_momentum[0])
+        if step < self.warmup_steps:
+            rate *= (step + 1) / self.warmup_steps
+        return rate, beta1
+
+
+LossFunction = Callable[[nn.Module, dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
+
+
+def stacked_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """(len(generators), *shape) standard normal numbers, one generator per sample."""
+    return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
+
+
+def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int]) -> LossFunction:
+    """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
+
+    def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
+        device = arrays["real"].device
+        batch = LayoutBatch.from_compact(arrays)
+        output, posterior = model(batch, stacked_noise(generators, latent_shape, device))
+        parts = lvae_loss(output, posterior, batch, spec).items()
+        return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
+
+    return loss
+
+
+def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunction:
+    """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM").
+
+    Latents are sampled anew from the cached posterior; one label-dropout mask per sample.
+    """
+    shape = (dit.config.channels, dit.config.size, dit.config.size)
+    shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
+    scale = torch.tensor(dit.config.scale or [1.0] * shape[0])[:, None, None]
+
+    def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
+        mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
+        device = mean.device
+        latent = mean + (0.5 * logvar).exp() * stacked_noise(generators, shape, device)
+        latent = (latent - shift.to(device)) / scale.to(device)
+        noise = stacked_noise(generators, shape, device)
+        uniform = torch.stack([torch.rand(2, generator=generator) for generator in generators]).to(device)
+        timestep = (uniform[:, 0] * diffusion.num_timesteps).long()
+        label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
+        predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
+        return {"loss": F.mse_loss(predicted, noise)}
+
+    return loss
+
+
+class Trainer:
+    """A model in training: `step` advances it, `save` and `load` make it stop and go on exactly.
+
+    `wrapped` is what is called (for instance the model under DistributedDataParallel); `model` is what is saved.
+    """
+
+    def __init__(
+        self, model: ModelMixin, loss: LossFunction, settings: Optimisation, device: torch.device, wrapped: nn.Module | None = None
+    ) -> None:
+        self.model, self.wrapped, self.loss, self.settings, self.device = model, wrapped or model, loss, settings, device
+        self.parameters = dict(model.named_parameters())
+        self.optimiser = torch.optim.AdamW(
+            self.parameters.values(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
+        )
+        self.ema = {n: p.detach().clone() for n, p in self.parameters.items()} if settings.ema_decay else None
+        self.steps_done = 0
+
+    def step(self, arrays: dict[str, Tensor], positions: Iterable[int]) -> dict[str, Tensor]:
+        """One optimisation step on a (local) batch; `positions` are its samples' places in the global batch.
+
+        Returns detached losses and the gradient norm. Raises ValueError if the loss is not finite, before
+        anything is changed.
+        """
+        rate, beta1 = self.settings.at(self.steps_done)
+        for group in self.optimiser.param_groups:
+            group["lr"], group["betas"] = rate, (beta1, self.settings.betas[1])
+        generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
+        parts = self.loss(self.wrapped, {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}, generators)
+        if not torch.isfinite(parts["loss"]):
+            raise ValueError(
+                f"step {self.steps_done}: the loss is {float(parts['loss'])}; lower the learning rate or look at this batch"
+            )
+        self.optimiser.zero_grad(set_to_none=True)
+        parts["loss"].backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.grad_clip or math.inf)
+        self.optimiser.step()
+        self.steps_done += 1
+        if self.ema:
+            self.update_ema()
+        return {name: value.detach() for name, value in parts.items()} | {"grad_norm": norm}
+
+    @torch.no_grad()
+    def update_ema(self) -> None:
+        """Exponential moving average with warm-up: decay = min(ema_decay, 1 - (1 + step)^-3/4), as diffusers does."""
+        decay = min(self.settings.ema_decay, 1 - (1 + self.steps_done) ** -0.75)
+        torch._foreach_lerp_(list(self.ema.values()), list(self.parameters.values()), 1 - decay)
+
+    @torch.no_grad()
+    def averaged(self) -> ModelMixin:
+        """The model to use: a copy with EMA weights, or the model itself where there is no EMA."""
+        if not self.ema:
+            return self.model
+        copy = type(self.model).from_config(self.model.config)
+        copy.load_state_dict({**self.model.state_dict(), **self.ema})
+        return copy.to(self.device).eval()
+
+    def save(self, directory: str | Path) -> None:
+        """Everything needed to go on exactly: safetensors and JSON, no pickles. `state.json` is written last."""
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        tensors |= {f"ema.{name}": value for name, value in (self.ema or {}).items()}
+        for name, parameter in self.parameters.items():
+            for key, value in self.optimiser.state[parameter].items():
+                tensors[f"optimiser.{key}.{name}"] = value
+        save_file({name: value.contiguous().cpu() for name, value in tensors.items()}, directory / "training.safetensors")
+        state = {"steps_done": self.steps_done, "settings": asdict(self.settings)}
+        temporary = directory / "state.json.tmp"
+        temporary.write_text(json.dumps(state, indent=1))
+        os.replace(temporary, directory / "state.json")
+
+    def load(self, directory: str | Path) -> None:
+        """Go on from `save`. Raises ValueError if the checkpoint was made with other settings."""
+        directory = Path(directory)
+        state = json.loads((directory / "state.json").read_text())
+        mine = json.loads(json.dumps(asdict(self.settings)))
+        for name, value in mine.items():
+            if state["settings"].get(name) != value:
+                raise ValueError(
+                    f"{directory}: was trained with {name}={state['settings'].get(name)}, asked for {value}; "
+                    "use the same options to resume, or another --name for a new run"
+                )
+        optimiser: dict[str, dict[str, Tensor]] = {name: {} for name in self.parameters}
+        model = {}
+        for path, value in load_file(directory / "training.safetensors", device=str(self.device)).items():
+            kind, name = path.split(".", 1)
+            if kind == "model":
+                model[name] = value
+            elif kind == "ema":
+                self.ema[name].copy_(value)
+            else:
+                key, name = name.split(".", 1)
+                optimiser[name][key] = value.cpu() if key == "step" else value
+        self.model.load_state_dict(model)
+        for name, parameter in self.parameters.items():
+            self.optimiser.state[parameter] = optimiser[name]
+        self.steps_done = state["steps_done"]
+
+
+def lvae_trainer(
+    model: LayoutVAE, settings: Optimisation, device: torch.device, wrap: Callable[[nn.Module], nn.Module] = lambda m: m
+) -> Trainer:
+    model = model.to(device)
+    return Trainer(model, layout_loss(model.spec, model.latent_shape), settings, device, wrap(model))
+
+
+def dit_trainer(
+    model: DiT,
+    settings: Optimisation,
+    label_dropout: float,
+    device: torch.device,
+    wrap: Callable[[nn.Module], nn.Module] = lambda m: m,
+) -> Trainer:
+    model = model.to(device)
+    return Trainer(model, noise_loss(model, Diffusion(), label_dropout), settings, device, wrap(model))

@@ -1,0 +1,90 @@
+"""Presets: one row per model size, same code on every rung. `smoke` takes seconds (tests), `town` is what two CPU
+cores can train (the demo), `kitti360` and `av2` are the paper (supplement B.2 and B.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LVAEPreset:
+    """Architecture and training of a layout VAE. `source` is the dataset it is meant for."""
+
+    source: str
+    raster_px: int  # rows = columns of the ground rasters
+    latent_channels: int  # per branch
+    channels: tuple[int, ...]  # ground branch; all but the last halve the resolution
+    norm_groups: int
+    width: int
+    layers: int
+    heads: int
+    hidden: int
+    head_hidden: int
+    batch_size: int
+    steps: int
+    learning_rate: float = 1e-4
+    final_learning_rate: float = 1e-5
+    weight_decay: float = 5e-4
+    warmup_steps: int = 0
+    grad_clip: float | None = None
+    ema_decay: float | None = None
+
+    def architecture(self) -> dict:
+        """Keyword arguments of `LayoutVAE` apart from the layout."""
+        names = ("latent_channels", "channels", "norm_groups", "width", "layers", "heads", "hidden", "head_hidden")
+        return {name: getattr(self, name) for name in names}
+
+
+# fmt: off
+LVAE_PRESETS = {
+    #                       source      px   c   channels             groups width layers heads hidden head batch  steps
+    "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     32,   1,     2,    64,    32,  4,     8,
+                           learning_rate=1e-3, final_learning_rate=1e-4),
+    "town":     LVAEPreset("town",      128, 16, (16, 32, 64, 128),   8,     128,  2,     4,    256,   128, 16,    20_000,
+                           learning_rate=1e-3, final_learning_rate=1e-5, grad_clip=1.0),
+    # The paper gives three days on one A100, not a number of steps.
+    "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    512,  6,     8,    1024,  1024, 32,   300_000),
+    "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    512,  6,     8,    1024,  1024, 32,   300_000),
+}
+
+
+@dataclass(frozen=True)
+class DiTPreset:
+    """Architecture and training of a diffusion transformer on the latents of `lvae`."""
+
+    lvae: str  # the LVAE preset whose latents it models
+    patch: int
+    depth: int
+    width: int
+    heads: int
+    batch_size: int
+    steps: int
+    normalise_latents: bool = False  # the paper and SLEDGE use latents as they are
+    learning_rate: float = 1e-4
+    weight_decay: float = 1e-6
+    grad_clip: float | None = 1.0
+    ema_decay: float | None = 0.9999
+    label_dropout: float = 0.1  # the paper leaves it open; DiT's value
+
+    def architecture(self) -> dict:
+        return {name: getattr(self, name) for name in ("patch", "depth", "width", "heads")}
+
+
+DIT_PRESETS = {
+    #                         lvae       patch depth width heads batch steps
+    "smoke":       DiTPreset("smoke",    2,    1,    32,   2,    8,    8, normalise_latents=True, learning_rate=1e-3),
+    "town":        DiTPreset("town",     2,    8,    256,  4,    32,   30_000, normalise_latents=True, learning_rate=5e-4, ema_decay=0.999),
+    # The paper gives three days on four A100s, not a number of steps.
+    "kitti360":    DiTPreset("kitti360", 2,    12,   768,  12,   256,  400_000),
+    "kitti360-l":  DiTPreset("kitti360", 2,    24,   1024, 16,   256,  400_000),
+    "kitti360-xl": DiTPreset("kitti360", 2,    28,   1152, 16,   256,  400_000),
+    "av2":         DiTPreset("av2",      2,    12,   768,  12,   256,  400_000),
+}
+# fmt: on
+
+
+def preset(table: dict, name: str):
+    """A preset by name; ValueError lists the known ones."""
+    if name not in table:
+        raise ValueError(f"unknown preset {name!r}, expected one of: {', '.join(table)}")
+    return table[name]

@@ -1,0 +1,199 @@
+"""The networks: sizes, masks, permutations, and that they can learn."""
+
+import numpy as np
+import pytest
+import torch
+from scenes import random_scene, small_spec
+from scipy.optimize import linear_sum_assignment
+
+from models.dit import DiT
+from models.layout import LayoutSpec
+from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
+from models.lvae import LayoutVAE, Posterior
+from models.matching import MATCH_CENTER, MATCH_CHOLESKY, MATCH_PROB, match
+from models.tensors import layout_batch
+from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
+
+
+def millions(model) -> float:
+    return sum(p.numel() for p in model.parameters()) / 1e6
+
+
+def small_lvae(seed: int = 0, **options) -> LayoutVAE:
+    torch.manual_seed(seed)
+    return LayoutVAE(layout=small_spec().to_dict(), **(LVAE_PRESETS["smoke"].architecture() | options))
+
+
+def test_paper_presets_have_the_papers_parameter_counts():
+    with torch.device("meta"):
+        row = LVAE_PRESETS["kitti360"]
+        lvae = LayoutVAE(layout=LayoutSpec().with_resolution(row.raster_px).to_dict(), **row.architecture())
+        assert lvae.latent_shape == (64, 32, 32)
+        assert abs(millions(lvae) - 93.1) < 0.1
+        for name, count in (("kitti360", 130), ("kitti360-l", 458), ("kitti360-xl", 675)):
+            assert abs(millions(DiT(**DIT_PRESETS[name].architecture())) / count - 1) < 0.005
+
+
+def test_unknown_preset_lists_the_known():
+    with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, town, kitti360, av2"):
+        preset(LVAE_PRESETS, "tiny")
+
+
+def test_object_latent_ignores_padding_and_order():
+    lvae, spec = small_lvae(), small_spec()
+    batch = layout_batch([random_scene(0), random_scene(1, n=0)], spec)
+    latent = lvae.object_encoder(batch.features, batch.real)
+    assert torch.isfinite(latent).all()
+    assert torch.equal(latent[1], lvae.object_encoder.grid)  # an empty scene is the learnable grid
+    noisy = torch.where(batch.real[..., None], batch.features, torch.rand_like(batch.features))
+    assert torch.allclose(lvae.object_encoder(noisy, batch.real), latent, atol=1e-5)
+    order = torch.cat([torch.randperm(6) + 6 * k for k in range(11)])
+    permuted = lvae.object_encoder(batch.features[:, order], batch.real[:, order])
+    assert torch.allclose(permuted, latent, atol=1e-5)
+
+
+def test_object_features_land_in_the_cell_under_their_centre():
+    lvae, spec = small_lvae(), small_spec()
+    scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # far left corner
+    batch = layout_batch([scene], spec)
+    change = (lvae.object_encoder(batch.features, batch.real)[0] - lvae.object_encoder.grid).abs().sum(0)
+    assert change[0, 0] > 0 and change.sum() == change[0, 0]
+
+
+def test_latent_stays_split():
+    lvae, batch = small_lvae(), layout_batch([random_scene(0)], small_spec())
+    latent = lvae.encode(batch).mean
+    changed = latent.clone()
+    changed[:, latent.shape[1] // 2 :] += 1
+    a, b = lvae.decode(latent), lvae.decode(changed)
+    assert torch.equal(a.height, b.height) and torch.equal(a.occupancy_logit, b.occupancy_logit)
+    assert not torch.allclose(a.features, b.features)
+
+
+def literal_total(features, logit, truth, real, columns) -> float:
+    """The paper's square matching cost of one category, term by term."""
+    p = torch.sigmoid(logit.double())
+    total = 0.0
+    for i, j in enumerate(columns):
+        target = 1.0 if real[i] else 0.0
+        total += MATCH_PROB * float(-(target * p[j].log() + (1 - target) * (1 - p[j]).log()))
+        if real[i]:
+            total += MATCH_CENTER * float((truth[i, :3] - features[j, :3]).abs().sum())
+            total += MATCH_CHOLESKY * float((truth[i, 3:] - features[j, 3:]).abs().sum())
+    return total
+
+
+def test_matching_reaches_the_optimum_of_the_padded_square_problem():
+    generator = torch.Generator().manual_seed(0)
+    slots = (9, 1, 6)
+    n = sum(slots)
+    for trial in range(20):
+        features, truth = (torch.rand(1, n, 9, generator=generator) for _ in range(2))
+        logit = 3 * torch.randn(1, n, generator=generator)
+        counts = [int(torch.randint(0, s + 1, (), generator=generator)) for s in slots]
+        real = torch.cat([torch.arange(s) < c for s, c in zip(slots, counts, strict=True)])[None]
+        assignment = match(features, logit, truth, real, slots)[0]
+        start = 0
+        for s, count in zip(slots, counts, strict=True):
+            here = slice(start, start + s)
+            part = (features[0, here], logit[0, here], truth[0, here], real[0, here])
+            square = np.array([[literal_total(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
+                               for i in range(s)])
+            rows, cols = linear_sum_assignment(square)
+            mine = assignment[here]
+            taken = [int((mine == start + i).nonzero()) for i in range(count)]
+            free = [j for j in range(s) if mine[j] < 0]
+            assert len(taken) + len(free) == s
+            assert abs(literal_total(*part, taken + free) - square[rows, cols].sum()) < 1e-5, trial
+            start += s
+
+
+def test_losses_are_their_equations():
+    spec = small_spec(slots=3)
+    generator = torch.Generator().manual_seed(1)
+    n, b = spec.num_slots, 2
+    features, truth = (torch.rand(b, n, 9, generator=generator) for _ in range(2))
+    logit = torch.randn(b, n, generator=generator)
+    real = torch.cat([torch.arange(3) < c for c in (3, 0, 1, 2, 0, 1, 3, 2, 1, 0, 2)])[None].repeat(b, 1)
+    assignment = match(features, logit, truth, real, spec.slots)
+    got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec)]
+
+    from models.losses import OBJECT_WEIGHTS
+
+    want = np.zeros(3)
+    for sample in range(b):
+        for c, name in enumerate(spec.categories):
+            count = max(int(real[sample, 3 * c : 3 * c + 3].sum()), 1)
+            for j in range(3 * c, 3 * c + 3):
+                i = int(assignment[sample, j])
+                p = float(torch.sigmoid(logit[sample, j]))
+                terms = [-np.log(p if i >= 0 else 1 - p), 0, 0]
+                if i >= 0:
+                    gap = (features[sample, j] - truth[sample, i]).abs()
+                    terms[1:] = float(gap[:3].sum()), float(gap[3:].sum())
+                want += np.array(OBJECT_WEIGHTS[name]) * terms / count / b
+    assert np.allclose(got, want, rtol=1e-4)
+
+    occupied = (torch.rand(2, 5, 8, 8, generator=generator) < 0.5).float()
+    occupied[1] = 0  # a sample without ground must not divide by zero
+    height, true_height = (torch.rand(2, 5, 8, 8, generator=generator) for _ in range(2))
+    want = float(((height - true_height).abs()[0] * occupied[0]).sum() / occupied[0].sum()) / 2
+    assert np.isclose(float(height_loss(height, true_height, occupied)), want, rtol=1e-5)
+    p = torch.sigmoid(height)
+    want = float(-(occupied * p.log() + (1 - occupied) * (1 - p).log()).mean())
+    assert np.isclose(float(occupancy_loss(height, occupied)), want, rtol=1e-5)
+    posterior = Posterior(torch.randn(2, 4, 3, 3, generator=generator), torch.randn(2, 4, 3, 3, generator=generator))
+    normal = torch.distributions.Normal
+    sigma = (0.5 * posterior.logvar).exp()
+    want = torch.distributions.kl_divergence(normal(posterior.mean, sigma), normal(0.0, 1.0)).sum() / 2
+    assert np.isclose(float(kl_loss(posterior)), float(want), rtol=1e-5)
+
+
+def test_lvae_overfits_one_batch():
+    spec = small_spec()
+    lvae = small_lvae(width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8)
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
+    generator = torch.Generator().manual_seed(0)
+    losses = []
+    for _ in range(200):
+        noise = torch.randn(2, *lvae.latent_shape, generator=generator)
+        output, posterior = lvae(batch, noise)
+        loss = lvae_loss(output, posterior, batch, spec)
+        optimiser.zero_grad()
+        loss.total.backward()
+        optimiser.step()
+        losses.append(loss.total.item())
+    assert losses[-1] < 0.25 * losses[0]
+    ground = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
+    assert ground.float().mean() > 0.97
+
+
+def test_dit_is_conditioned_and_starts_at_zero():
+    torch.manual_seed(0)
+    dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)
+    latent, time, label = torch.randn(3, 4, 8, 8), torch.tensor([0, 500, 999]), torch.tensor([0, 1, 3])
+    assert dit(latent, time, label).shape == latent.shape
+    assert (dit(latent, time, label) == 0).all()  # adaLN-Zero and a zero output layer
+    for parameter in dit.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    base = dit(latent, time, label)
+    assert not torch.allclose(base, dit(latent, time, torch.tensor([1, 2, 0])))
+    assert not torch.allclose(base, dit(latent, time.flip(0), label))
+    with pytest.raises(ValueError, match="must be whole"):
+        DiT(size=9)
+
+
+def test_dit_patches_are_put_back_where_they_came_from():
+    """With the network reduced to its patch embedding and its transpose, out = in."""
+    dit = DiT(channels=3, size=8, width=12, depth=1, heads=1)
+    with torch.no_grad():
+        dit.patch_in.weight.copy_(torch.eye(12).view(12, 3, 2, 2))
+        dit.positions.zero_()
+        dit.patch_out.weight.copy_(torch.eye(12).view(12, 3, 2, 2).permute(2, 3, 1, 0).reshape(12, 12))
+        dit.patch_out.bias.zero_()
+    latent = torch.randn(1, 3, 8, 8)
+    out = dit(latent, torch.tensor([1]), torch.tensor([0]))
+    tokens = torch.nn.functional.unfold(latent, 2, stride=2)  # (1, c p p, n)
+    normal = torch.nn.functional.layer_norm(tokens.transpose(1, 2), (12,), eps=1e-6).transpose(1, 2)
+    assert torch.allclose(out, torch.nn.functional.fold(normal, (8, 8), 2, stride=2), atol=1e-5)
