@@ -1,0 +1,250 @@
+"""What a town stands on and is collected in: the bend of its streets, its hills, its slabs and boxes.
+
+A town is designed on a drawing board, where every street is straight: board coordinates (u, v) in metres. `Land`
+bends the board into the world by two shears, x = u + a(v), y = v + b(x): areas keep their size, what abuts on the
+board abuts in the world, streets curve and junctions are not all square.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SLAB_THICKNESS_M = 0.6  # KITTI-360's ground slabs; their mid-plane is the surface things stand on
+EDGE_STEP_M = 10.0  # longest slab edge: bends and hills are followed this closely
+
+
+@dataclass(frozen=True, eq=False)
+class Land:
+    """The map from board to world, and the height of the true surface."""
+
+    bend_u: np.ndarray  # (k, 3): amplitude in metres, radians per metre, phase of a(v)
+    bend_v: np.ndarray  # (k, 3): the same of b(x)
+    hills: np.ndarray  # (k, 4): amplitude in metres, wave vector (2,) in radians per metre, phase
+    yaw_rad: float
+    origin_m: np.ndarray  # (3,) world position of board (0, 0), float64
+
+    def _turn(self) -> np.ndarray:
+        cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.array([[cos, -sin], [sin, cos]])
+
+    def _bent(self, uv: np.ndarray) -> np.ndarray:
+        x = uv[..., 0] + _waves(self.bend_u, uv[..., 1])
+        return np.stack([x, uv[..., 1] + _waves(self.bend_v, x)], axis=-1)
+
+    def xy(self, uv: np.ndarray) -> np.ndarray:
+        """(..., 2) world x, y of board points (..., 2)."""
+        return self._bent(np.asarray(uv, np.float64)) @ self._turn().T + self.origin_m[:2]
+
+    def direction(self, uv: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """(..., 2) unit world direction of the board direction `along` (..., 2) at `uv`."""
+        bent = self._bent(uv)
+        dx = along[..., 0] + _slopes(self.bend_u, uv[..., 1]) * along[..., 1]
+        dy = along[..., 1] + _slopes(self.bend_v, bent[..., 0]) * dx
+        world = np.stack([dx, dy], axis=-1) @ self._turn().T
+        return world / np.linalg.norm(world, axis=-1, keepdims=True)
+
+    def surface_m(self, xy: np.ndarray) -> np.ndarray:
+        """(...,) world z of the true surface at world points (..., 2)."""
+        phase = (np.asarray(xy) - self.origin_m[:2]) @ self.hills[:, 1:3].T + self.hills[:, 3]
+        return self.origin_m[2] + (self.hills[:, 0] * np.sin(phase)).sum(axis=-1)
+
+    def grade(self, xy: np.ndarray) -> np.ndarray:
+        """(..., 2) slope of the surface along world x and y."""
+        phase = (np.asarray(xy) - self.origin_m[:2]) @ self.hills[:, 1:3].T + self.hills[:, 3]
+        return (self.hills[:, 0] * np.cos(phase)) @ self.hills[:, 1:3]
+
+
+def _waves(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return (waves[:, 0] * np.sin(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
+
+
+def _slopes(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
+    return (waves[:, 0] * waves[:, 1] * np.cos(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
+
+
+def random_land(rng: np.random.Generator) -> Land:
+    """Gentle bends (up to about 15 degrees each way) and hills (grade at most 3 %) somewhere in the world."""
+
+    def bends() -> np.ndarray:
+        wave = 2 * np.pi / rng.uniform(170, 480, 2)
+        slope = rng.uniform(0.0, 0.27) * rng.dirichlet([1.5, 1.5])
+        return np.stack([slope / wave, wave, rng.uniform(0, 2 * np.pi, 2)], axis=1)
+
+    wave, direction = 2 * np.pi / rng.uniform(260, 620, 2), rng.uniform(0, 2 * np.pi, 2)
+    grade = rng.uniform(0.024, 0.03) * rng.dirichlet([1.0, 1.0])  # grades add up to the total at most
+    vector = wave[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    hills = np.column_stack([grade / wave, vector, rng.uniform(0, 2 * np.pi, 2)])
+    origin = np.array([*rng.uniform(500, 4000, 2), rng.uniform(108, 125)])
+    return Land(bends(), bends(), hills, rng.uniform(-np.pi, np.pi), origin)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A place on the board to draw from: s runs along a street, t away from it; axes are unit board directions."""
+
+    origin: tuple[float, float]
+    along: tuple[float, float]
+    inward: tuple[float, float]
+
+    def uv(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """(..., 2) board points of (s, t)."""
+        (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
+        return np.stack([ou + s * au + t * iu, ov + s * av + t * iv], axis=-1)
+
+    def at(self, s: float, t: float) -> Frame:
+        """The same axes with the origin moved to (s, t)."""
+        (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
+        return Frame((ou + s * au + t * iu, ov + s * av + t * iv), self.along, self.inward)
+
+
+class Sheet:
+    """Collects what a town consists of, in board coordinates, until `Land` takes it into the world."""
+
+    def __init__(self) -> None:
+        self.slabs: list[tuple[str, np.ndarray]] = []  # ground class, outline (n, 2), any turning sense
+        self.box_label: list[str] = []
+        self.box_rows: list[np.ndarray] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, flag columns below
+
+    def slab(self, frame: Frame, ground_class: str, outline_st: list[tuple[float, float]]) -> None:
+        """A slab by its outline in (s, t)."""
+        st = np.asarray(outline_st, np.float64)
+        self.slabs.append((ground_class, frame.uv(st[:, 0], st[:, 1])))
+
+    def boxes(
+        self,
+        frame: Frame,
+        label: str,
+        s: np.ndarray,
+        t: np.ndarray,
+        size_m: np.ndarray,
+        yaw_rad: np.ndarray | float = 0.0,
+        bottom_m: np.ndarray | float = 0.0,
+        ellipsoid: bool = False,
+        timestamp: np.ndarray | int = -1,
+        track: np.ndarray | int = -1,
+    ) -> None:
+        """n boxes of one label at (s, t): length axis turned by yaw from s to t, bottom above the surface, metres."""
+        s, t, size_m = np.atleast_1d(s), np.atleast_1d(t), np.atleast_2d(size_m)
+        rows = np.empty((len(s), 11))
+        rows[:, :2] = frame.uv(s, t)
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        rows[:, 2] = cos * frame.along[0] + sin * frame.inward[0]
+        rows[:, 3] = cos * frame.along[1] + sin * frame.inward[1]
+        rows[:, 4:7] = size_m
+        rows[:, 7], rows[:, 8], rows[:, 9], rows[:, 10] = bottom_m, ellipsoid, timestamp, track
+        self.box_label += [label] * len(s)
+        self.box_rows.append(rows)
+
+
+def outlines_of(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
+    """Outlines of the 4-connected patches of equal value >= 0 in a grid of cells, for slabs that are not rectangles.
+
+    cells (len(s) - 1, len(t) - 1) int; s, t: ascending grid lines. Returns (value, outline) per patch; patches must
+    have no holes.
+    """
+    columns, rows = cells.shape
+    patch = -np.ones((columns, rows), int)
+    found: list[tuple[int, list[tuple[float, float]]]] = []
+    for i0 in range(columns):
+        for j0 in range(rows):
+            if cells[i0, j0] < 0 or patch[i0, j0] >= 0:
+                continue
+            value, index, stack, members = cells[i0, j0], len(found), [(i0, j0)], []
+            patch[i0, j0] = index
+            while stack:
+                i, j = stack.pop()
+                members.append((i, j))
+                for a, b in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+                    inside = 0 <= a < columns and 0 <= b < rows
+                    if inside and patch[a, b] < 0 and cells[a, b] == value:
+                        patch[a, b] = index
+                        stack.append((a, b))
+            found.append((int(value), [(s[i], t[j]) for i, j in _trace(set(members))]))
+    return found
+
+
+def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Corners of the outer outline of a set of unit cells, counter-clockwise, straight runs merged."""
+    ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in members:
+        sides = (((0, -1), (i, j), (i + 1, j)), ((1, 0), (i + 1, j), (i + 1, j + 1)))
+        sides += (((0, 1), (i + 1, j + 1), (i, j + 1)), ((-1, 0), (i, j + 1), (i, j)))
+        for (di, dj), start, end in sides:
+            if (i + di, j + dj) not in members:
+                ahead.setdefault(start, []).append(end)
+    start = min(ahead)
+    outline, here, step = [start], start, (0, -1)
+    while True:
+        # At a corner where two cells touch, keep left: stay on the same cell's side.
+        options = ahead[here]
+        there = max(options, key=lambda p: step[0] * (p[1] - here[1]) - step[1] * (p[0] - here[0]))
+        options.remove(there)
+        turned = (there[0] - here[0], there[1] - here[1])
+        if turned == step:
+            outline.pop()
+        outline.append(there)
+        here, step = there, turned
+        if here == start:
+            outline.pop()
+            return outline
+
+
+def subdivided(outline: np.ndarray) -> np.ndarray:
+    """The outline (m, 2) with long edges cut at multiples of EDGE_STEP_M, so that neighbours share the cuts.
+
+    Edges parallel to a board axis are cut on the lattice, slanted ones are left alone. Counter-clockwise.
+    """
+    following = np.roll(outline, -1, axis=0)
+    if (outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum() < 0:
+        outline = outline[::-1]
+        following = np.roll(outline, -1, axis=0)
+    points = []
+    for (au, av), (bu, bv) in zip(outline.tolist(), following.tolist(), strict=True):
+        points.append((au, av))
+        axis = 0 if abs(bu - au) > abs(bv - av) else 1
+        low, high = sorted(((au, bu), (av, bv))[axis])
+        if high - low <= EDGE_STEP_M * 0.5 or min(abs(bu - au), abs(bv - av)) > 1e-6:
+            continue
+        cuts = np.arange(np.ceil((low + 0.8) / EDGE_STEP_M), np.floor((high - 0.8) / EDGE_STEP_M) + 1) * EDGE_STEP_M
+        if (bu, bv)[axis] < (au, av)[axis]:
+            cuts = cuts[::-1]
+        points += [(c, av) if axis == 0 else (au, c) for c in cuts.tolist()]
+    return np.array(points)
+
+
+def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
+    """n - 2 triangles (indices) of a simple counter-clockwise outline (n, 2), convex or not."""
+    points = outline.tolist()
+
+    def turn(a: int, b: int, c: int) -> float:
+        (ax, ay), (bx, by), (cx, cy) = points[a], points[b], points[c]
+        return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+
+    left = list(range(len(points)))
+    triangles = []
+    at, refused, slack = 0, 0, 0.0
+    while len(left) > 3:
+        n = len(left)
+        a, b, c = left[(at - 1) % n], left[at % n], left[(at + 1) % n]
+        ear = turn(a, b, c) > -slack
+        if ear:
+            for k in range(n):
+                p = left[k]
+                if p in (a, b, c) or turn(left[k - 1], p, left[(k + 1) % n]) > 0:
+                    continue  # only a reflex corner can lie in an ear
+                if turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0:
+                    ear = False
+                    break
+        if ear:
+            triangles.append((a, b, c))
+            left.pop(at % n)
+            at, refused = (at + 1) % (n - 1), 0  # skip one: fans of slivers are avoided
+        else:
+            at, refused = (at + 1) % n, refused + 1
+            if refused > n:  # collinear corners only: flat ears are taken then
+                assert slack == 0.0, "outline is not simple"
+                slack, refused = 1e-6, 0
+    triangles.append(tuple(left))
+    return triangles
