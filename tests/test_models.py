@@ -166,7 +166,7 @@ def test_lvae_overfits_one_batch():
         losses.append(loss.total.item())
     assert losses[-1] < 0.25 * losses[0]
     ground = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
-    assert ground.float().mean() > 0.97
+    assert ground.float().mean() > 0.9
 
 
 def test_dit_is_conditioned_and_starts_at_zero():

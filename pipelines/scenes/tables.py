@@ -1,0 +1,323 @@
+"""Scenes <-> Parquet tables: the project's one schema, for real and generated scenes alike.
+
+Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
+hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
+same order, so a reader never joins. Units are in the names; see docs/tables.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from models.cholesky import cholesky_parameters
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from pipelines import storage
+
+SCHEMA_VERSION = "1"
+HEIGHT_STEP_M = 0.01
+
+_META = {"pritti_schema_version": SCHEMA_VERSION}
+
+SCENES = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("sequence", pa.string()),
+        ("frame", pa.int64()),
+        ("x_m", pa.float64()),
+        ("y_m", pa.float64()),
+        ("z_m", pa.float64()),
+        ("yaw_rad", pa.float64()),
+        ("world_from_imu", pa.list_(pa.float64())),  # 12 numbers or null: Parquet has no null of a fixed size
+        ("vegetation_density", pa.string()),
+        ("vehicle_density", pa.string()),
+        ("vegetation_volume_m3", pa.float64()),
+        ("vehicle_volume_m3", pa.float64()),
+        ("num_primitives", pa.int32()),
+        *[(f"num_{name}", pa.int32()) for name in CATEGORIES],
+        *[(f"{name}_area_m2", pa.float64()) for name in GROUND_CLASSES],
+        ("primitive_offset", pa.int64()),
+    ],
+    metadata=_META,
+)
+
+PRIMITIVES = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("category", pa.string()),
+        ("label", pa.string()),
+        ("kind", pa.string()),
+        ("instance_id", pa.int64()),
+        ("x_m", pa.float32()),
+        ("y_m", pa.float32()),
+        ("z_m", pa.float32()),
+        ("length_m", pa.float32()),
+        ("width_m", pa.float32()),
+        ("height_m", pa.float32()),
+        ("yaw_rad", pa.float32()),
+        ("heading_rad", pa.float32()),
+        ("rotation", pa.list_(pa.float32(), 9)),
+        ("cholesky", pa.list_(pa.float32(), 6)),
+        ("existence", pa.float32()),
+    ],
+    metadata=_META,
+)
+
+RASTERS = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("height", pa.binary()),  # int16 differences of occupied pixels' heights, in steps of height_step_m
+        ("occupied", pa.binary()),  # numpy.packbits of (classes, rows, cols)
+        ("resolution_m", pa.float64()),
+        ("height_step_m", pa.float64()),
+        ("rows", pa.int32()),
+        ("cols", pa.int32()),
+        ("front_m", pa.float64()),
+        ("left_m", pa.float64()),
+        ("ground_classes", pa.list_(pa.string())),
+    ],
+    metadata=_META,
+)
+
+REJECTS = pa.schema(
+    [("scene_id", pa.string()), ("sequence", pa.string()), ("frame", pa.int64()), ("reason", pa.string())], metadata=_META
+)
+
+
+def latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
+    """(C, h, w) posterior moments per scene; float16, channels first."""
+    tensor = pa.fixed_shape_tensor(pa.float16(), shape)
+    return pa.schema([("scene_id", pa.string()), ("mean", tensor), ("logvar", tensor)], metadata=_META)
+
+
+# ---------------------------------------------------------------------------------------------------- to tables
+
+
+def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
+    """(height, occupied) as bytes: only occupied pixels carry a height, each as the difference to the one before."""
+    steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
+    if len(steps) and np.abs(steps).max() > 32767:
+        raise ValueError(f"scene {scene.scene_id}: ground heights beyond ±327 m, worst {scene.height_m.max()}")
+    return np.diff(steps.astype("<i2"), prepend=np.int16(0)).tobytes(), np.packbits(scene.occupied).tobytes()
+
+
+def decode_ground(height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
+    mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).astype(bool).reshape(shape)
+    height_m = np.zeros(shape, np.float32)
+    height_m[mask] = np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16) * np.float32(step_m)
+    return height_m, mask
+
+
+def _scenes_table(scenes: Sequence[Scene]) -> pa.Table:
+    counts = np.array([scene.counts() for scene in scenes]).reshape(-1, len(CATEGORIES))
+    volumes = [scene.volume_m3 for scene in scenes]
+
+    def volume(group: tuple[int, ...]) -> list[float]:
+        return [float(v[np.isin(s.category, group)].sum()) for s, v in zip(scenes, volumes, strict=True)]
+
+    areas = [dict(zip(s.ground_classes, s.ground_area_m2().tolist(), strict=True)) for s in scenes]
+    totals = counts.sum(axis=1)
+    columns = {
+        "scene_id": [s.scene_id for s in scenes],
+        "sequence": [s.sequence for s in scenes],
+        "frame": [s.frame for s in scenes],
+        "x_m": [s.world_xyz_m[0] for s in scenes],
+        "y_m": [s.world_xyz_m[1] for s in scenes],
+        "z_m": [s.world_xyz_m[2] for s in scenes],
+        "yaw_rad": [s.world_yaw_rad for s in scenes],
+        "world_from_imu": [None if s.world_from_imu is None else s.world_from_imu.ravel().tolist() for s in scenes],
+        "vegetation_density": [s.vegetation_density for s in scenes],
+        "vehicle_density": [s.vehicle_density for s in scenes],
+        "vegetation_volume_m3": volume(VEGETATION),
+        "vehicle_volume_m3": volume(VEHICLES),
+        "num_primitives": totals,
+        **{f"num_{name}": counts[:, k] for k, name in enumerate(CATEGORIES)},
+        **{f"{name}_area_m2": [area.get(name) for area in areas] for name in GROUND_CLASSES},
+        "primitive_offset": np.cumsum(totals) - totals,
+    }
+    return pa.table(columns, schema=SCENES)
+
+
+def _fixed_lists(values: np.ndarray, width: int) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values, np.float32).reshape(-1)), width)
+
+
+def _primitives_table(scenes: Sequence[Scene]) -> pa.Table:
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
+
+    category, heading, yaw = joined("category").astype(np.int8), joined("heading_rad"), joined("yaw_rad")
+    center, size = joined("center_m").reshape(-1, 3), joined("size_m").reshape(-1, 3)
+    rotation = joined("rotation").reshape(-1, 3, 3)
+    names = pa.array(CATEGORIES)
+    columns = {
+        "scene_id": np.repeat([s.scene_id for s in scenes], [len(s) for s in scenes]),
+        "category": names.take(pa.array(category)),
+        "label": pa.array(joined("label"), pa.string()),
+        "kind": pa.array(["cuboid", "ellipsoid"]).take(pa.array((category == ELLIPSOID).astype(np.int8))),
+        "instance_id": joined("instance_id").astype(np.int64),
+        **{f"{axis}_m": center[:, k] for k, axis in enumerate("xyz")},
+        **{f"{axis}_m": size[:, k] for k, axis in enumerate(("length", "width", "height"))},
+        "yaw_rad": yaw,
+        "heading_rad": pa.array(heading, mask=np.isnan(heading)),
+        "rotation": _fixed_lists(rotation, 9),
+        "cholesky": _fixed_lists(cholesky_parameters(rotation, size), 6),
+        "existence": joined("existence"),
+    }
+    return pa.table(columns).cast(PRIMITIVES)
+
+
+def _rasters_table(scenes: Sequence[Scene]) -> pa.Table:
+    encoded = [encode_ground(scene) for scene in scenes]
+    columns = {
+        "scene_id": [s.scene_id for s in scenes],
+        "height": [height for height, _ in encoded],
+        "occupied": [occupied for _, occupied in encoded],
+        "resolution_m": [s.grid.resolution_m for s in scenes],
+        "height_step_m": [HEIGHT_STEP_M] * len(scenes),
+        "rows": [s.grid.rows for s in scenes],
+        "cols": [s.grid.cols for s in scenes],
+        "front_m": [s.grid.front_m for s in scenes],
+        "left_m": [s.grid.left_m for s in scenes],
+        "ground_classes": [list(s.ground_classes) for s in scenes],
+    }
+    return pa.table(columns, schema=RASTERS)
+
+
+def scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
+    """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
+    return {"scenes": _scenes_table(scenes), "primitives": _primitives_table(scenes), "rasters": _rasters_table(scenes)}
+
+
+# -------------------------------------------------------------------------------------------------- from tables
+
+
+def scenes_from_tables(
+    scenes: pa.Table, primitives: pa.Table, rasters: pa.Table, source: str, split: str, rows: Sequence[int] | None = None
+) -> list[Scene]:
+    """The Scenes of one shard, or only those in `rows`, in that order."""
+    primitives = primitives.combine_chunks()
+
+    def column(name: str) -> np.ndarray:
+        return primitives[name].to_numpy()
+
+    def nested(name: str, *shape: int) -> np.ndarray:
+        flat = pa.concat_arrays(primitives[name].chunks).flatten() if len(primitives) else pa.array([], pa.float32())
+        return flat.to_numpy().reshape(-1, *shape)
+
+    category = np.array([CATEGORY_INDEX[name] for name in column("category")], np.int8)
+    center = np.stack([column(f"{axis}_m") for axis in "xyz"], axis=1)
+    size = np.stack([column(f"{axis}_m") for axis in ("length", "width", "height")], axis=1)
+    fields = {
+        "category": category,
+        "center_m": center,
+        "rotation": nested("rotation", 3, 3),
+        "size_m": size,
+        "existence": column("existence"),
+        "heading_rad": column("heading_rad").astype(np.float32),
+        "instance_id": column("instance_id"),
+        "label": column("label").astype(object),
+    }
+    rows = range(len(scenes)) if rows is None else rows
+    out = []
+    for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
+        if scene["scene_id"] != raster["scene_id"]:
+            raise ValueError(f"shard is not aligned: scenes has {scene['scene_id']}, rasters has {raster['scene_id']}")
+        here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
+        grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
+        classes = tuple(raster["ground_classes"])
+        height, occupied = decode_ground(
+            raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols), raster["height_step_m"]
+        )
+        pose = scene["world_from_imu"]
+        out.append(
+            Scene(
+                scene_id=scene["scene_id"],
+                source=source,
+                sequence=scene["sequence"],
+                frame=scene["frame"],
+                split=split,
+                ground_classes=classes,
+                height_m=height,
+                occupied=occupied,
+                grid=grid,
+                world_xyz_m=(scene["x_m"], scene["y_m"], scene["z_m"]),
+                world_yaw_rad=scene["yaw_rad"],
+                world_from_imu=None if pose is None else np.array(pose).reshape(3, 4),
+                vegetation_density=scene["vegetation_density"],
+                vehicle_density=scene["vehicle_density"],
+                **{name: value[here] for name, value in fields.items()},
+            )
+        )
+    return out
+
+
+# ------------------------------------------------------------------------------------------------------- shards
+
+
+@dataclass(frozen=True, order=True)
+class Shard:
+    """One aligned shard of a dataset directory; `path(table)` is its file in each table."""
+
+    root: str
+    source: str
+    split: str
+    number: int
+
+    def path(self, table: str) -> str:
+        name = f"part-{self.number:05d}.parquet"
+        return storage.join(self.root, table, f"source={self.source}", f"split={self.split}", name)
+
+    def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
+        schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS}.get(table)
+        return storage.read_parquet(self.path(table), columns, schema)
+
+    def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
+        """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
+        tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
+        try:
+            return scenes_from_tables(*tables, self.source, self.split, rows)
+        except ValueError as error:
+            raise ValueError(f"{self.path('scenes')}: {error}") from error
+
+    def write(self, scenes: Sequence[Scene]) -> None:
+        for table, content in scene_tables(scenes).items():
+            storage.write_parquet(content, self.path(table))
+
+    def is_written(self) -> bool:
+        return all(storage.exists(self.path(table)) for table in ("scenes", "primitives", "rasters"))
+
+
+def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
+    """The shards of a table, in order. Raises ValueError if there is none: nothing passes on empty input."""
+    shards = []
+    for path in storage.list_files(storage.join(root, table), ".parquet"):
+        *_, source_part, split_part, name = path.split("/")
+        found = (source_part.removeprefix("source="), split_part.removeprefix("split="))
+        if (source or found[0], split or found[1]) == found:
+            shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
+    if not shards:
+        wanted = "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v)
+        raise ValueError(f"{storage.join(root, table)}: no shards of {wanted or 'any source'}; run jobs/preprocess_scenes.py first")
+    return shards
+
+
+def read_scenes(
+    root: str, source: str | None = None, split: str | None = None, limit: int | None = None
+) -> Iterator[Scene]:
+    """Scenes of a dataset directory, shard by shard."""
+    left = limit
+    for shard in find_shards(root, "scenes", source, split):
+        for scene in shard.scenes():
+            if left == 0:
+                return
+            yield scene
+            left = None if left is None else left - 1
+
+
+def rejects_table(rows: Iterable[dict]) -> pa.Table:
+    return pa.Table.from_pylist(list(rows), schema=REJECTS)

@@ -1,0 +1,117 @@
+"""Files that appear whole or not at all, on a local disk or on anything pyarrow understands (s3://, gs://, ...)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.fs as pafs
+import pyarrow.parquet as pq
+
+TEMPORARY = ".tmp-"
+
+
+def resolve(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
+    """File system and path of a URI or a local path (made absolute)."""
+    uri = os.fspath(uri)
+    if "://" in uri:
+        return pafs.FileSystem.from_uri(uri)
+    return pafs.LocalFileSystem(), os.path.abspath(os.path.expanduser(uri))
+
+
+def join(uri: str | os.PathLike, *parts: str) -> str:
+    return "/".join([os.fspath(uri).rstrip("/"), *parts])
+
+
+def exists(uri: str) -> bool:
+    fs, path = resolve(uri)
+    return fs.get_file_info(path).type != pafs.FileType.NotFound
+
+
+def list_files(uri: str, suffix: str) -> list[str]:
+    """Sorted URIs of the files under a directory, hidden and temporary ones left out; empty if it is missing."""
+    fs, path = resolve(uri)
+    found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
+    inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
+    shown = [name for name, _ in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))]
+    return [join(uri, name) for name in sorted(shown)]
+
+
+def write_whole(uri: str, write: Callable[[Any], None]) -> None:
+    """Create or replace a file by `write(stream)`: readers see the old file or the new one, never a part."""
+    fs, path = resolve(uri)
+    parent, name = path.rsplit("/", 1)
+    fs.create_dir(parent, recursive=True)
+    temporary = f"{parent}/{TEMPORARY}{os.getpid()}-{name}"
+    try:
+        with fs.open_output_stream(temporary) as stream:
+            write(stream)
+        fs.move(temporary, path)
+    except BaseException:
+        if fs.get_file_info(temporary).is_file:
+            fs.delete_file(temporary)
+        raise
+
+
+def write_parquet(table: pa.Table, uri: str) -> None:
+    write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=_dictionary(table)))
+
+
+def _dictionary(table: pa.Table) -> list[str]:
+    return [f.name for f in table.schema if pa.types.is_string(f.type)]
+
+
+def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None) -> pa.Table:
+    """A whole Parquet file. Raises ValueError naming the file if it is missing, truncated or of another schema."""
+    fs, path = resolve(uri)
+    try:
+        table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=None)
+    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
+        raise ValueError(f"{uri}: cannot be read as Parquet ({error}); delete it and run the job that wrote it again") from error
+    if schema is not None:
+        wanted = schema.names if columns is None else columns
+        for name in wanted:
+            if name not in table.column_names or table.schema.field(name).type != schema.field(name).type:
+                raise ValueError(f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another version")
+    return table
+
+
+def write_json(value: Any, uri: str) -> None:
+    write_whole(uri, lambda stream: stream.write(json.dumps(value, indent=1).encode()))
+
+
+def read_json(uri: str) -> Any:
+    """Raises ValueError naming the file if it is missing or not JSON."""
+    fs, path = resolve(uri)
+    try:
+        with fs.open_input_stream(path) as stream:
+            return json.loads(stream.read().decode())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{uri}: cannot be read as JSON ({error})") from error
+
+
+def clean_temporaries(uri: str) -> int:
+    """Delete what killed writers left behind; how many there were."""
+    fs, path = resolve(uri)
+    found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
+    stale = [info.path for info in found if info.is_file and info.base_name.startswith(TEMPORARY)]
+    for name in stale:
+        fs.delete_file(name)
+    return len(stale)
+
+
+def delete_directory(uri: str) -> None:
+    fs, path = resolve(uri)
+    if fs.get_file_info(path).type == pafs.FileType.Directory:
+        fs.delete_dir(path)
+
+
+def move(source: str, target: str) -> None:
+    """Move one file into place, creating the directory."""
+    fs, path = resolve(source)
+    _, to = resolve(target)
+    fs.create_dir(to.rsplit("/", 1)[0], recursive=True)
+    fs.move(path, to)
