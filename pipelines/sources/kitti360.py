@@ -385,8 +385,8 @@ def box_geometry(
     """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
 
     world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
-    sphere of radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a sheared one
-    come the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+    sphere of radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a
+    sheared one come the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
     Raises DefectiveObject for a box without volume, of absurd size, or with axes too close to one another.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
