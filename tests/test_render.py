@@ -22,7 +22,7 @@ def test_bev_shows_what_vertical_rays_hit():
     picture = bev_picture(scene)[1::3, 1::3]
     same = (picture == CLASS_COLORS[expected]).all(axis=-1)
     # The ground mesh ends at pixel centres and blends no classes within a triangle: rims may differ.
-    assert same.mean() > 0.985
+    assert same.mean() > 0.98
     objects = expected >= 6
     objects &= expected < 17
     assert same[objects].mean() > 0.998
