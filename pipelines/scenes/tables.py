@@ -222,7 +222,7 @@ def scenes_from_tables(
         "instance_id": column("instance_id"),
         "label": column("label").astype(object),
     }
-    rows = range(len(scenes)) if rows is None else rows
+    rows = list(range(len(scenes)) if rows is None else rows)
     out = []
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
         if scene["scene_id"] != raster["scene_id"]:

@@ -1,0 +1,68 @@
+"""What every job shares: where things live, how Ray is started, and how an error reaches the person who typed.
+
+Importing this is cheap: ray and torch are imported when a job runs, not for `--help`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def home(*parts: str) -> str:
+    """A place under $PRITTI_HOME (default ~/pritti; may be a URI). Absolute: a submitted job runs in a copy."""
+    base = os.environ.get("PRITTI_HOME", "~/pritti")
+    base = base.rstrip("/") if "://" in base else os.path.abspath(os.path.expanduser(base))
+    return "/".join([base, *parts])
+
+
+def absolute(path: str) -> str:
+    """A path as the user means it, whatever directory the job's workers run in."""
+    return path if "://" in path else os.path.abspath(os.path.expanduser(path))
+
+
+def start_ray(num_cpus: int | None = None) -> None:
+    """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_DATA_DISABLE_PROGRESS_BARS", "1")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    import ray
+
+    if ray.is_initialized():
+        return
+    options = {"num_cpus": num_cpus} if num_cpus and "RAY_ADDRESS" not in os.environ else {}
+    ray.init(logging_level=logging.WARNING, log_to_driver=True, **options)
+    context = ray.data.DataContext.get_current()
+    context.enable_progress_bars = False
+    context.print_on_execution_start = False
+    logging.getLogger("ray.data").setLevel(logging.WARNING)
+
+
+def root_cause(error: BaseException) -> BaseException:
+    """The exception that user-facing text should come from: Ray wraps a worker's error several times."""
+    seen = set()
+    while id(error) not in seen:
+        seen.add(id(error))
+        error = getattr(error, "cause", None) or error.__cause__ or error
+    return error
+
+
+def run(main: Callable[[Any], None], config: Any, **tyro_options: Any) -> None:
+    """Parse the command line into `config` and run. A ValueError becomes one clear line and exit code 2."""
+    import tyro
+
+    parsed = tyro.cli(config, **tyro_options)
+    try:
+        main(parsed)
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on where it stopped")
+    except Exception as error:
+        cause = root_cause(error)
+        if isinstance(error, ValueError) or isinstance(cause, ValueError):
+            message = cause if isinstance(cause, ValueError) else error
+            print(f"error: {message}", file=sys.stderr)
+            sys.exit(2)
+        raise
