@@ -152,6 +152,14 @@ def test_duplicated_samples_have_radius_zero_and_still_contain_their_copies():
     assert got.precision == got.recall == 0
 
 
+def test_constant_features_lie_within_each_other_only_if_equal():
+    constant = np.full((6, 3), 0.1)
+    got = precision_recall(constant, constant, k=[3])[0]
+    assert got.precision == got.recall == 1
+    got = precision_recall(constant, constant + 1e-9, k=[3])[0]
+    assert got.precision == got.recall == 0
+
+
 def test_bad_features_are_refused():
     x = np.random.default_rng(8).normal(size=(10, 4))
     broken = x.copy()

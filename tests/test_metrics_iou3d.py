@@ -7,7 +7,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
-from models.scene import CATEGORY_INDEX, ELLIPSOID, yaw_rotation
+from models.scene import yaw_rotation
 from pipelines.metrics import iou3d
 from pipelines.metrics.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
 
@@ -146,6 +146,8 @@ def test_matrix_equals_pairs_and_takes_empty_sides():
     a, b = random_boxes(rng, 40, 10), random_boxes(rng, 30, 10)
     i, j = np.indices((40, 30)).reshape(2, -1)
     np.testing.assert_array_equal(iou3d_matrix(a, b), iou3d_pairs(a.take(i), b.take(j)).reshape(40, 30))
+    wanted = rng.random((40, 30)) < 0.5
+    np.testing.assert_array_equal(iou3d_matrix(a, b, wanted), iou3d_matrix(a, b) * wanted)
     empty = a.take(np.arange(0))
     assert iou3d_matrix(empty, b).shape == (0, 30) and iou3d_matrix(a, empty).shape == (40, 0)
 
@@ -202,11 +204,3 @@ def test_points_fill_the_ball_evenly():
     assert (radius <= 0.5).mean() == pytest.approx(1 / 8, abs=2e-3)
     octant = (points > 0) @ [1, 2, 4]
     np.testing.assert_allclose(np.bincount(octant) / 4096, 1 / 8, atol=3e-3)
-
-
-def test_ellipsoids_are_told_from_boxes_by_category():
-    one = boxes(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
-    half = shifted(one, 0.5, 0)
-    assert iou3d.iou3d_of(CATEGORY_INDEX["pole"], one, half)[0, 0] == pytest.approx(1 / 3, abs=1e-8)
-    lens = sphere_lens(np.array(0.5), np.array(0.5), np.array(0.5))
-    assert iou3d.iou3d_of(ELLIPSOID, one, half)[0, 0] == pytest.approx(lens / (np.pi / 3 - lens), abs=0.01)

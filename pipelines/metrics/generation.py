@@ -67,18 +67,19 @@ def moments(features: np.ndarray) -> Moments:
 
 
 def frechet_distance(a: Moments, b: Moments) -> float:
-    """Squared Frechet distance of the two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (A^1/2 B A^1/2)^1/2).
+    """Squared Frechet distance of the two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (AB)^1/2).
 
-    The eigenvalues of A^1/2 B A^1/2 are those of AB, but it is symmetric: two eigh instead of a general sqrtm, and
-    nothing complex to throw away. Rank-deficient covariances are fine.
+    With A = F F^T, AB has the eigenvalues of the symmetric F^T B F: two symmetric eigenproblems instead of a general
+    sqrtm, and nothing complex to throw away. Rank-deficient covariances are fine.
     """
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
-    values, vectors = np.linalg.eigh(a.covariance)
-    root_a = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
-    product = root_a @ b.covariance @ root_a
-    root_trace = np.sqrt(np.maximum(np.linalg.eigvalsh((product + product.T) / 2), 0)).sum()
-    distance = np.square(a.mean - b.mean).sum() + np.trace(a.covariance) + np.trace(b.covariance) - 2 * root_trace
+    covariance_a, covariance_b = a.covariance, b.covariance
+    values, vectors = np.linalg.eigh(covariance_a)
+    factor = vectors * np.sqrt(np.maximum(values, 0))
+    product_values = np.linalg.eigvalsh(factor.T @ covariance_b @ factor)
+    root_trace = np.sqrt(np.maximum(product_values, 0)).sum()
+    distance = np.square(a.mean - b.mean).sum() + np.trace(covariance_a) + np.trace(covariance_b) - 2 * root_trace
     return float(max(distance, 0.0))
 
 

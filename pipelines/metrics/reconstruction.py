@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
-from pipelines.metrics.iou3d import boxes_of, iou3d_of
+from pipelines.metrics.iou3d import boxes_of, iou3d_matrix
 
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # IoU3D, Omni3D's ten steps
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
@@ -125,7 +125,9 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
     """Matches of one predicted scene, ranked by `existence`, with its truth, for every category in SCORED."""
     if not np.isfinite(prediction.existence).all():
         raise ValueError(f"scene {prediction.scene_id}: existence holds NaN or infinite numbers")
-    true_boxes, boxes = boxes_of(truth), boxes_of(prediction)
+    same_category = prediction.category[:, None] == truth.category
+    scored = np.isin(prediction.category, SCORED)
+    iou = iou3d_matrix(boxes_of(prediction), boxes_of(truth), wanted=same_category & scored[:, None])
     category, score, rank, hit = [], [], [], []
     truths = np.zeros(len(CATEGORIES), np.int64)
     for c in SCORED:
@@ -135,7 +137,7 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
         category.append(np.full(len(index), c, np.int8))
         score.append(prediction.existence[index].astype(np.float64))
         rank.append(np.arange(len(index)))
-        hit.append(match_greedily(iou3d_of(c, boxes.take(index), true_boxes.take(true_index))))
+        hit.append(match_greedily(iou[np.ix_(index, true_index)]))
     return Matches(*map(np.concatenate, (category, score, rank, hit)), truths=truths)
 
 
