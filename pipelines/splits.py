@@ -28,7 +28,8 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
     """Per sequence (p,) str, one of train, test, unused, for its positions (p, 3): metres, one world for all.
 
     Give every pose of every sequence, in driving order, before any is dropped: the distance driven is cut
-    into equal segments, sequence after sequence; the jump from one to the next counts nothing. Of each segment
+    into equal segments, sequence after sequence; the jump from one to the next counts nothing. Of each
+    segment
 
         train ... | 5 m unused | 15 m test | 5 m unused
 

@@ -117,6 +117,13 @@ def test_each_sweep_is_a_scene_of_its_own_boxes_in_the_ego_frame(root):
     assert scenes[2].scene_id == f"av2-{LOG}-{SWEEPS[2]}"
 
 
+def test_a_log_without_other_boxes_is_a_drive_without_boxes(root):
+    ego_only = annotation_table(ROWS[-1:])
+    pyarrow.feather.write_feather(ego_only, root / "train" / LOG / "annotations.feather")
+    drive = read_drive(root, "train", LOG)
+    assert len(drive) == 1 and len(drive.scene(0)) == 0
+
+
 def test_ids_are_the_same_on_every_machine(root):
     drive = read_drive(root, "train", LOG)
     expected = int.from_bytes(hashlib.blake2b(b"car", digest_size=8).digest(), "big") >> 1
@@ -190,7 +197,7 @@ def test_real_cars_stand_on_the_raster(real):
 
 
 def test_real_bollards_do_not_move(real):
-    """Seen from a moving car for seconds, they stay put only if every sweep's pose is applied the right way."""
+    """Seen from a moving car, they stay put only if every sweep's pose is applied the right way."""
     bollards = real.label == "BOLLARD"
     for track in np.unique(real.instance_id[bollards]):
         places = real.center_m[real.instance_id == track]
@@ -267,7 +274,8 @@ BROKEN_POSES = {
     "nan": (lambda t: rewrite(t, tx_m=with_first(float("nan"))), "tx_m of row 0 is nan"),
     "huge": (lambda t: rewrite(t, ty_m=with_first(1e9)), "ty_m of row 0 is 1e+09"),
     "no rows": (lambda t: t.slice(0, 0), "no pose at the annotated timestamp"),
-    "quaternion": (lambda t: rewrite(t, qw=with_first(3.0)), "quaternion of row 0"),
+    "quaternion": (lambda t: rewrite(t, qw=with_first(1.5)), "quaternion of row 0"),
+    "huge quaternion": (lambda t: rewrite(t, qw=with_first(1e300)), "qw of row 0 is 1e+300"),
 }
 
 
@@ -356,6 +364,12 @@ def test_truncated_files_are_one_clear_error(root, pattern, size):
     path = sorted((root / "train" / LOG).glob(pattern))[0]
     path.write_bytes(path.read_bytes()[:size] if size < path.stat().st_size else path.read_bytes()[:-7])
     assert_refused(root, "broken", path.name)
+
+
+def test_a_header_that_is_cut_open_is_one_clear_error(root):
+    path = root / "train" / LOG / "map" / f"{LOG}_ground_height_surface____PIT.npy"
+    path.write_bytes(path.read_bytes().replace(b"), }", b"(((("))
+    assert_refused(root, "broken npy", path.name)
 
 
 def test_a_header_that_promises_terabytes_asks_for_no_memory(root):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import pyarrow as pa
@@ -224,6 +225,8 @@ def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: fl
 
 
 def _check_quaternion(path: Path, columns: dict[str, np.ndarray]) -> None:
+    for name in QUATERNION:
+        _check_range(path, name, columns[name], -2, 2)
     norm = np.linalg.norm(_columns(columns, QUATERNION), axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
     if len(bad):
@@ -329,9 +332,10 @@ def _read_heights(path: Path) -> np.ndarray:
     """(rows, cols) float heights in metres, city frame, NaN where unknown."""
     _check_file(path)
     try:
-        # mapped, so that a header that promises too much asks for no memory
+        # Mapped, so that a header that promises too much asks for no memory; it is parsed as Python, hence
+        # the errors below.
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, OverflowError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, OverflowError, TokenError) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise ValueError(f"{path}: broken npy file ({reason}); download the log again") from error
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":

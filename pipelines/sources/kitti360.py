@@ -146,7 +146,21 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     Raises ValueError, naming the file, for a missing or broken XML or poses file.
     """
     frame, world_from_imu = read_poses(root, sequence)
-    path = _boxes_path(root, sequence)
+    boxes, slabs, report = _read_objects(_boxes_path(root, sequence))
+    drive = Drive(
+        source=SOURCE,
+        sequence=sequence,
+        **_stack_boxes(boxes),
+        ground_classes=KITTI_GROUND_CLASSES,
+        ground=_stack_slabs(slabs),
+        frame=frame,
+        world_from_imu=world_from_imu,
+    )
+    return drive, report
+
+
+def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
+    """The boxes and slabs of one XML file in its order, each once, and what was dropped."""
     boxes: list[_Box] = []
     slabs: list[_Slab] = []
     seen: dict[tuple, list[np.ndarray]] = {}
@@ -155,7 +169,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
         label = _label(fields)
         plain = _plain(label)
         if not plain:
-            defects.append(Defect(_index_or_none(fields), label, "no label"))
+            defects.append(Defect(_index(fields), label, "no label"))
             continue
         if plain in DROPPED_LABELS:
             dropped[label] += 1
@@ -166,7 +180,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
         try:
             parsed = _parse_slab(fields, plain) if plain in GROUND_CLASS_OF else _parse_box(fields, label)
         except DefectiveObject as error:
-            defects.append(Defect(_index_or_none(fields), label, str(error)))
+            defects.append(Defect(_index(fields), label, str(error)))
             continue
         if _seen_before(seen, (plain, parsed.timestamp), parsed.vertices_m):
             duplicates += 1
@@ -178,16 +192,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     )
     if objects == 0:
         raise ValueError(f"{path}: holds no <objectN>; unpack data_3d_bboxes.zip of KITTI-360 again")
-    drive = Drive(
-        source=SOURCE,
-        sequence=sequence,
-        **_stack_boxes(boxes),
-        ground_classes=KITTI_GROUND_CLASSES,
-        ground=_stack_slabs(slabs),
-        frame=frame,
-        world_from_imu=world_from_imu,
-    )
-    return drive, report
+    return boxes, slabs, report
 
 
 # ------------------------------------------------------------------------------------------------------ poses
@@ -290,7 +295,7 @@ def _text(fields: dict, tag: str, default: str | None = None) -> str:
 
 def _label(fields: dict) -> str:
     """The object's label as written, empty if it has none."""
-    return _text(fields, "label", " ").strip()[:40]
+    return " ".join(_text(fields, "label", " ").split())[:40]
 
 
 def _integer(fields: dict, tag: str) -> int:
@@ -300,7 +305,8 @@ def _integer(fields: dict, tag: str) -> int:
     return int(text)
 
 
-def _index_or_none(fields: dict) -> int:
+def _index(fields: dict) -> int:
+    """The object's own index, -1 if it has none."""
     try:
         return _integer(fields, "index")
     except DefectiveObject:
