@@ -347,6 +347,9 @@ def _vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.nd
     vertices = _matrix(fields, "vertices", 3)
     if len(vertices) < 6:
         raise DefectiveObject(f"{len(vertices)} vertices are no solid")
+    largest = max(np.abs(world_from_local).max(), np.abs(vertices).max())
+    if largest > MAX_COORDINATE_M:
+        raise DefectiveObject(f"transform or vertices hold {largest:.3g}")
     vertices_m = vertices @ world_from_local[:3, :3].T + world_from_local[:3, 3]
     if np.abs(vertices_m).max() > MAX_COORDINATE_M:
         raise DefectiveObject(f"lies {np.abs(vertices_m).max():.3g} m from the world's origin")
