@@ -1,0 +1,185 @@
+"""Feeds models/training.py through Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
+
+Resume = the same command again: Ray Train finds the run of the same name and hands its last checkpoint back.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import ray.train
+import ray.train.torch
+import torch
+from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
+
+from jobs.command import root_cause
+from jobs.tracking import Tracker
+from models.training import Optimisation, Trainer
+from pipelines import storage
+from pipelines.feed import Reader, Stream, batches
+
+Wrap = Callable[[torch.nn.Module], torch.nn.Module]
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """One training run, as its workers receive it. Everything in it pickles.
+
+    `build(device, wrap)` makes the Trainer; `validate(trainer)` returns metrics and pictures (names to arrays) and
+    runs on rank 0 at every checkpoint; `identity` is what a resumed run must share with the one it continues.
+    """
+
+    name: str
+    storage_path: str
+    build: Callable[[torch.device, Wrap], Trainer]
+    stream: Stream
+    reader: Reader
+    settings: Optimisation
+    identity: dict
+    tracker: Tracker
+    checkpoint_every: int
+    log_every: int
+    validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
+
+
+def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in batch.items()}
+
+
+def train_worker(config: dict[str, Any]) -> None:
+    """What every worker runs: batches -> steps, with a log line, a checkpoint and a validation now and then."""
+    run: TrainingRun = config["run"]
+    context = ray.train.get_context()
+    rank, world = context.get_world_rank(), context.get_world_size()
+    torch.set_num_threads(config["threads"])
+    device = ray.train.torch.get_device()
+    wrap = ray.train.torch.prepare_model if world > 1 else lambda model: model
+    trainer = run.build(device, wrap)
+    if checkpoint := ray.train.get_checkpoint():
+        with checkpoint.as_directory() as directory:
+            trainer.load(directory)
+    local = run.stream.batch_size // world
+    positions = range(rank * local, (rank + 1) * local)
+    started, logged, waited = time.perf_counter(), trainer.steps_done, 0.0
+    feed = timed(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
+    for batch, seconds in feed:
+        waited += seconds
+        losses = trainer.step(as_tensors(batch), positions)
+        step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
+        if rank == 0 and (step % run.log_every == 0 or last):
+            elapsed, done = time.perf_counter() - started, step - logged
+            metrics = {name: float(value) for name, value in losses.items()} | {
+                "learning_rate": run.settings.at(step - 1)[0],
+                "scenes_per_second": done * run.stream.batch_size / elapsed,
+                "waiting_for_data": waited / elapsed,
+            }
+            run.tracker.metrics(metrics, step)
+            left = (run.settings.steps - step) * elapsed / done
+            print(f"{run.name}: step {step}/{run.settings.steps}  loss {metrics['loss']:.4g}  "
+                  f"{metrics['scenes_per_second']:.1f} scenes/s  {left / 60:.1f} min left", flush=True)
+            started, logged, waited = time.perf_counter(), step, 0.0
+        if step % run.checkpoint_every == 0 or last:
+            report(run, trainer, rank, float(losses["loss"]))
+            started, logged, waited = time.perf_counter(), step, 0.0
+
+
+def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:
+    """Items with the seconds that each was waited for."""
+    while True:
+        started = time.perf_counter()
+        try:
+            item = next(iterator)
+        except StopIteration:
+            return
+        yield item, time.perf_counter() - started
+
+
+def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
+    """Save a checkpoint (rank 0) and tell Ray Train; every worker must call it."""
+    metrics = {"step": trainer.steps_done, "loss": loss}
+    if rank != 0:
+        ray.train.report(metrics)
+        return
+    if run.validate:
+        values, pictures = run.validate(trainer)
+        if values:
+            run.tracker.metrics(values, trainer.steps_done)
+        for name, image in pictures.items():
+            run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
+    with tempfile.TemporaryDirectory() as directory:
+        trainer.save(directory)
+        trainer.averaged().save_pretrained(os.path.join(directory, "model"))
+        ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
+
+
+def fit(run: TrainingRun, num_workers: int, output: str) -> str:
+    """Train to the end and put the model (EMA weights if there are any) into `output`; returns `output`.
+
+    Raises ValueError if a run of this name exists with another identity, or for a loss that is not finite.
+    """
+    record = storage.join(run.storage_path, run.name, "identity.json")
+    if storage.exists(record):
+        made = storage.read_json(record)
+        if made != run.identity:
+            name = next(key for key in sorted(made | run.identity) if made.get(key) != run.identity.get(key))
+            raise ValueError(
+                f"run {run.name!r} was started with {name}={made.get(name)}, asked for {run.identity.get(name)}; "
+                "use the same options to resume, or another --name for a new run"
+            )
+    storage.write_json(run.identity, record)
+    os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
+    gpus = ray.cluster_resources().get("GPU", 0) >= num_workers
+    cpus = float(ray.cluster_resources().get("CPU", 1))
+    per_worker = 1.0 if cpus > 2 * num_workers else 0.5
+    trainer = ray.train.torch.TorchTrainer(
+        train_worker,
+        train_loop_config={"run": run, "threads": max(1, int(cpus) // num_workers)},
+        scaling_config=ScalingConfig(num_workers=num_workers, use_gpu=gpus, resources_per_worker={"CPU": per_worker}),
+        run_config=RunConfig(
+            name=run.name,
+            storage_path=run.storage_path,
+            checkpoint_config=CheckpointConfig(num_to_keep=2),
+            failure_config=FailureConfig(max_failures=2),
+        ),
+    )
+    try:
+        result = trainer.fit()
+    except KeyboardInterrupt:
+        run.tracker.finish("KILLED")
+        raise
+    except Exception as error:
+        run.tracker.finish("FAILED")
+        for failure in getattr(error, "worker_failures", {}).values():
+            if isinstance(root_cause(failure), ValueError):
+                raise root_cause(failure) from error
+        raise
+    with result.checkpoint.as_directory() as directory:
+        publish_directory(os.path.join(directory, "model"), output)
+        run.tracker.artifacts(os.path.join(directory, "model"), "model")
+    run.tracker.finish("FINISHED")
+    return output
+
+
+def publish_directory(directory: str, output: str) -> None:
+    """Copy a saved model or pipeline into place, file by file; what says that it is complete comes last."""
+    paths = [os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names]
+    for path in sorted(paths, key=lambda path: (path == "model_index.json", path.endswith("config.json"), path)):
+        with open(os.path.join(directory, path), "rb") as source:
+            storage.write_whole(storage.join(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream))
+
+
+def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:
+    """The settings with every change that is not None."""
+    return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+
+
+def identity_of(settings: Optimisation, **more: Any) -> dict:
+    """What makes a run the same run: its optimisation and whatever else determines its weights."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more

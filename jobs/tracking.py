@@ -1,0 +1,94 @@
+"""MLflow, from the driver and from rank 0 only: one run per training run, found again when it resumes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from jobs.command import home
+
+
+def tracking_uri() -> str:
+    """$MLFLOW_TRACKING_URI, or an sqlite file under $PRITTI_HOME."""
+    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home('mlflow.db')}"
+
+
+def client(uri: str):
+    """An MLflow client. Quiet, and without a call home."""
+    os.environ.setdefault("DO_NOT_TRACK", "true")
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    import logging
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    logging.getLogger("mlflow").setLevel(logging.WARNING)
+    from mlflow import MlflowClient
+
+    return MlflowClient(tracking_uri=uri)
+
+
+class Tracker:
+    """Writes to one MLflow run. Picklable: workers open their own client."""
+
+    def __init__(self, uri: str, run_id: str) -> None:
+        self.uri, self.run_id = uri, run_id
+        self._client = None
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_client": None}
+
+    @property
+    def client(self):
+        self._client = self._client or client(self.uri)
+        return self._client
+
+    @classmethod
+    def start(cls, experiment: str, name: str, parameters: dict) -> Tracker:
+        """The experiment's unfinished or finished run of this name, or a new one.
+
+        Called once, in the driver: two processes creating the database at once would break it.
+        """
+        uri = tracking_uri()
+        if uri.startswith("sqlite:///"):
+            Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+        api = client(uri)
+        found = api.get_experiment_by_name(experiment)
+        if found is None:
+            artifacts = home("mlartifacts") if uri.startswith("sqlite:") else None
+            experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
+        else:
+            experiment_id = found.experiment_id
+        runs = api.search_runs([experiment_id], f"attributes.run_name = '{name}'", max_results=1)
+        if runs:
+            run_id = runs[0].info.run_id
+            api.update_run(run_id, status="RUNNING")
+        else:
+            run_id = api.create_run(experiment_id, run_name=name).info.run_id
+            for key, value in parameters.items():
+                api.log_param(run_id, key, value)
+        return cls(uri, run_id)
+
+    def metrics(self, values: dict[str, float], step: int) -> None:
+        import time
+
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
+
+    def picture(self, image, path: str) -> None:
+        """A picture (H, W, 3) uint8 as an artifact."""
+        from PIL import Image
+
+        self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
+
+    def artifacts(self, directory: str, path: str) -> None:
+        self.client.log_artifacts(self.run_id, directory, path)
+
+    def history(self, name: str) -> list[tuple[int, float]]:
+        """(step, value) of a metric, in order; a resumed run's repeated steps once."""
+        values = {m.step: m.value for m in self.client.get_metric_history(self.run_id, name)}
+        return sorted(values.items())
+
+    def finish(self, status: str) -> None:
+        """FINISHED, FAILED or KILLED."""
+        self.client.set_terminated(self.run_id, status)

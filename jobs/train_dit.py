@@ -1,0 +1,168 @@
+#!/usr/bin/env python3
+"""Train the diffusion transformer (stage 2): latents -> $PRITTI_HOME/models/pritti-<preset>, a complete pipeline.
+
+    jobs/train_dit.py                       the town preset on $PRITTI_HOME/datasets/town
+    jobs/train_dit.py smoke                 seconds; makes its own data, LVAE and latents
+    jobs/train_dit.py kitti360-xl --dataset DIR --label joint --workers 8
+
+Run it again with the same options to resume. Losses and sampled scenes go to MLflow ($MLFLOW_TRACKING_URI, default
+an sqlite file under $PRITTI_HOME).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+from jobs.command import absolute, home, run, start_ray
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
+
+    preset: tyro.conf.Positional[str] = "town"
+    """smoke, town, kitti360, kitti360-l, kitti360-xl or av2."""
+    dataset: str = ""
+    """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
+    latents: str = ""
+    """Directory with latents.json (default: the dataset directory)."""
+    label: Literal["vegetation", "vehicle", "joint", "none"] = "vegetation"
+    """What the model is conditioned on."""
+    name: str = ""
+    """Name of the run (default: dit-<preset>). Another name is another run."""
+    output: str = ""
+    """Where the trained pipeline goes (default: $PRITTI_HOME/models/pritti-<preset>)."""
+    workers: int = 1
+    """Ray Train workers; with GPUs, one each."""
+    steps: int | None = None
+    batch_size: int | None = None
+    """Global batch size over all workers."""
+    learning_rate: float | None = None
+    checkpoint_every: int | None = None
+    """Steps between checkpoints (default: a twentieth of the run)."""
+    seed: int = 0
+
+
+def train(config: Config) -> str:
+    """Train and return the pipeline's directory. Ray must run."""
+    from functools import partial
+
+    from jobs.ray_training import TrainingRun, fit, identity_of, settings_with
+    from jobs.smoke import smoke_dataset, smoke_latents
+    from jobs.tracking import Tracker
+    from jobs.validation import SamplingCheck
+    from models.pipeline import LABELS
+    from models.training import Optimisation
+    from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
+    from pipelines import storage
+    from pipelines.feed import LatentReader, Stream
+    from pipelines.ingest import Dataset
+    from pipelines.scenes.tables import find_shards
+
+    row = preset(DIT_PRESETS, config.preset)
+    smoke = config.preset == "smoke" and not config.dataset
+    default = home("datasets", "smoke" if smoke else LVAE_PRESETS[row.lvae].source)
+    root = absolute(config.dataset) if config.dataset else default
+    if smoke:
+        smoke_dataset(root)
+        smoke_latents(root)
+    dataset = Dataset.open(root)
+    latents_root = absolute(config.latents) if config.latents else root
+    if not storage.exists(storage.join(latents_root, "latents.json")):
+        raise ValueError(f"{latents_root}: no latents.json here; run jobs/encode_latents.py --dataset {root} first")
+    latents = storage.read_json(storage.join(latents_root, "latents.json"))
+    if not latents["complete"]:
+        raise ValueError(f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {root} again")
+    lvae_config = storage.read_json(storage.join(latents["lvae"], "config.json"))
+
+    name = config.name or f"dit-{config.preset}"
+    settings = settings_with(
+        Optimisation(
+            steps=row.steps,
+            learning_rate=row.learning_rate,
+            weight_decay=row.weight_decay,
+            betas=(0.95, 0.999),  # as in SLEDGE
+            grad_clip=row.grad_clip,
+            ema_decay=row.ema_decay,
+            seed=config.seed,
+        ),
+        steps=config.steps,
+        learning_rate=config.learning_rate,
+    )
+    channels, size, _ = latents["shape"]
+    architecture = row.architecture() | {
+        "channels": channels,
+        "size": size,
+        "label": config.label,
+        "num_labels": len(LABELS[config.label]),
+        "layout": lvae_config["layout"],
+        "shift": latents["channel_mean"] if row.normalise_latents else None,
+        "scale": latents["channel_std"] if row.normalise_latents else None,
+    }
+    batch_size = config.batch_size or row.batch_size
+    shards = find_shards(root, source=dataset.source, split="train")
+    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    identity = identity_of(
+        settings,
+        stage="dit",
+        preset=config.preset,
+        batch_size=batch_size,
+        label=config.label,
+        lvae=latents["lvae_digest"],
+        dataset=root,
+    )
+    training = TrainingRun(
+        name=name,
+        storage_path=home("runs"),
+        build=partial(build, architecture, settings, row.label_dropout),
+        stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
+        reader=LatentReader(latents_root, config.label),
+        settings=settings,
+        identity=identity,
+        tracker=Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}),
+        checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
+        log_every=max(1, min(50, settings.steps // 50)),
+        validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label),
+    )
+    output = absolute(config.output) if config.output else home("models", f"pritti-{config.preset}")
+    fit(training, config.workers, storage.join(output, "dit"))
+    return complete_pipeline(latents["lvae"], output)
+
+
+def build(architecture: dict, settings, label_dropout: float, device, wrap):
+    """The Trainer of stage 2, with the same initial weights on every worker."""
+    import torch
+
+    from models.dit import DiT
+    from models.training import dit_trainer
+
+    torch.manual_seed(settings.seed)
+    return dit_trainer(DiT(**architecture), settings, label_dropout, device, wrap)
+
+
+def complete_pipeline(lvae: str, output: str) -> str:
+    """Put the LVAE and the noise schedule beside a trained DiT: `output` is then a PrITTIPipeline directory."""
+    import tempfile
+
+    from jobs.ray_training import publish_directory
+    from models.dit import DiT
+    from models.pipeline import PrITTIPipeline, scheduler
+    from pipelines import storage
+    from pipelines.encode import load_lvae
+
+    pipeline = PrITTIPipeline(load_lvae(lvae), DiT.from_pretrained(storage.join(output, "dit")), scheduler())
+    with tempfile.TemporaryDirectory() as directory:
+        pipeline.save_pretrained(directory)
+        publish_directory(directory, output)
+    return output
+
+
+def main(config: Config) -> None:
+    start_ray()
+    print(f"trained: {train(config)}")
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)

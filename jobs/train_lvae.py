@@ -1,0 +1,118 @@
+#!/usr/bin/env python3
+"""Train the layout VAE (stage 1): scene tables -> $PRITTI_HOME/models/lvae-<preset>.
+
+    jobs/train_lvae.py                      the town preset on $PRITTI_HOME/datasets/town
+    jobs/train_lvae.py smoke                seconds; makes its own data
+    jobs/train_lvae.py kitti360 --dataset DIR --workers 4
+
+Run it again with the same options to resume. Losses and pictures go to MLflow ($MLFLOW_TRACKING_URI, default an
+sqlite file under $PRITTI_HOME).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+from jobs.command import absolute, home, run, start_ray
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
+
+    preset: tyro.conf.Positional[str] = "town"
+    """smoke, town, kitti360 or av2."""
+    dataset: str = ""
+    """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
+    name: str = ""
+    """Name of the run (default: lvae-<preset>). Another name is another run."""
+    output: str = ""
+    """Where the trained model goes (default: $PRITTI_HOME/models/<name>)."""
+    workers: int = 1
+    """Ray Train workers; with GPUs, one each."""
+    steps: int | None = None
+    batch_size: int | None = None
+    """Global batch size over all workers."""
+    learning_rate: float | None = None
+    checkpoint_every: int | None = None
+    """Steps between checkpoints (default: a twentieth of the run)."""
+    seed: int = 0
+
+
+def train(config: Config) -> str:
+    """Train and return the model's directory. Ray must run."""
+    from functools import partial
+
+    from jobs.ray_training import TrainingRun, fit, identity_of, settings_with
+    from jobs.smoke import smoke_dataset
+    from jobs.tracking import Tracker
+    from jobs.validation import ReconstructionCheck
+    from models.training import Optimisation
+    from models.zoo import LVAE_PRESETS, preset
+    from pipelines.feed import LayoutReader, Stream
+    from pipelines.ingest import Dataset
+    from pipelines.scenes.tables import find_shards
+
+    row = preset(LVAE_PRESETS, config.preset)
+    root = absolute(config.dataset) if config.dataset else home("datasets", "smoke" if config.preset == "smoke" else row.source)
+    if config.preset == "smoke" and not config.dataset:
+        smoke_dataset(root)
+    dataset = Dataset.open(root)
+    spec = dataset.spec.with_resolution(row.raster_px)
+    name = config.name or f"lvae-{config.preset}"
+    settings = settings_with(
+        Optimisation(
+            steps=row.steps,
+            learning_rate=row.learning_rate,
+            final_learning_rate=row.final_learning_rate,
+            weight_decay=row.weight_decay,
+            warmup_steps=row.warmup_steps,
+            cycle_momentum=(0.85, 0.95),  # OneCycleLR's defaults, as in SLEDGE
+            grad_clip=row.grad_clip,
+            ema_decay=row.ema_decay,
+            seed=config.seed,
+        ),
+        steps=config.steps,
+        learning_rate=config.learning_rate,
+    )
+    batch_size = config.batch_size or row.batch_size
+    shards = find_shards(root, source=dataset.source, split="train")
+    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    identity = identity_of(settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root)
+    tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()})
+    training = TrainingRun(
+        name=name,
+        storage_path=home("runs"),
+        build=partial(build, row.architecture(), spec.to_dict(), settings),
+        stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
+        reader=LayoutReader(spec),
+        settings=settings,
+        identity=identity,
+        tracker=tracker,
+        checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
+        log_every=max(1, min(50, settings.steps // 50)),
+        validate=ReconstructionCheck(root, dataset.source),
+    )
+    output = absolute(config.output) if config.output else home("models", name)
+    return fit(training, config.workers, output)
+
+
+def build(architecture: dict, layout: dict, settings, device, wrap):
+    """The Trainer of stage 1, with the same initial weights on every worker."""
+    import torch
+
+    from models.lvae import LayoutVAE
+    from models.training import lvae_trainer
+
+    torch.manual_seed(settings.seed)
+    return lvae_trainer(LayoutVAE(layout=layout, **architecture), settings, device, wrap)
+
+
+def main(config: Config) -> None:
+    start_ray()
+    print(f"trained: {train(config)}")
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)

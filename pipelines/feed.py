@@ -1,0 +1,158 @@
+"""Tables -> training batches, by Ray Data, in an order that depends on the seed alone.
+
+The stream of samples is fixed before anything is read: epoch after epoch, shards in random order, rows shuffled
+within a window of a few shards. Every worker knows from its rank and the step which rows it needs, so that a resumed
+run goes on with the very next batch and two workers see what one would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pyarrow as pa
+import ray.data
+
+from models.layout import LayoutSpec
+from models.pipeline import LABELS, label_index
+from models.tensors import compact_layout
+from pipelines.scenes.tables import Shard, scenes_from_tables
+
+WINDOW_SHARDS = 4
+SAMPLES_PER_TASK = 256
+READER_CPUS = 0.5  # leaves room beside a training worker on two cores: more would wait for each other for ever
+
+Arrays = dict[str, np.ndarray]
+Reader = Callable[[Shard, np.ndarray], Arrays]  # shard, rows -> stacked samples
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The endless, seeded order of samples of a training run."""
+
+    shards: tuple[Shard, ...]
+    counts: tuple[int, ...]
+    batch_size: int  # global
+    seed: int
+
+    def __post_init__(self) -> None:
+        if not self.shards or sum(self.counts) == 0:
+            raise ValueError("there is nothing to train on: the training split has no scenes")
+
+    def positions(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """(shard, row) of samples first .. first + count - 1 of the stream."""
+        epoch_size = sum(self.counts)
+        wanted = np.arange(first, first + count)
+        shard, row = np.empty(count, np.int64), np.empty(count, np.int64)
+        for epoch in np.unique(wanted // epoch_size):
+            here = wanted // epoch_size == epoch
+            shards, rows = epoch_order(self.counts, self.seed, int(epoch))
+            shard[here], row[here] = shards[wanted[here] % epoch_size], rows[wanted[here] % epoch_size]
+        return shard, row
+
+
+@lru_cache(maxsize=4)
+def epoch_order(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every (shard, row) once: shards permuted, rows shuffled within windows of WINDOW_SHARDS shards."""
+    rng = np.random.default_rng([seed, epoch])
+    order = rng.permutation(len(counts))
+    shards, rows = [], []
+    for start in range(0, len(order), WINDOW_SHARDS):
+        window = order[start : start + WINDOW_SHARDS]
+        shard = np.repeat(window, [counts[k] for k in window])
+        row = np.concatenate([np.arange(counts[k]) for k in window])
+        mix = rng.permutation(len(shard))
+        shards.append(shard[mix])
+        rows.append(row[mix])
+    return np.concatenate(shards), np.concatenate(rows)
+
+
+def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
+    """The rank's share of `count` consecutive global batches from batch `first`, in order."""
+    shard, row = stream.positions(first * batch, count * batch)
+    mine = (np.arange(count * batch) % batch) // (batch // world) == rank
+    shard, row = shard[mine], row[mine]
+    out: Arrays = {}
+    for k in np.unique(shard):
+        here = np.flatnonzero(shard == k)
+        for name, values in read(stream.shards[k], row[here]).items():
+            if name not in out:
+                out[name] = np.empty((len(shard), *values.shape[1:]), values.dtype)
+            out[name][here] = values
+    return out
+
+
+def batches(stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1) -> Iterator[Arrays]:
+    """Local batches of steps start_step .. stop_step - 1 for one worker: a Ray Data pipeline that reads ahead.
+
+    Raises ValueError if the global batch does not divide by the number of workers.
+    """
+    batch = stream.batch_size
+    if batch % world:
+        raise ValueError(f"batch size {batch} does not divide by {world} workers")
+    per_task = max(1, SAMPLES_PER_TASK // batch)
+    num_tasks = -(-(stop_step - start_step) // per_task)
+    if num_tasks <= 0:
+        return
+
+    def read_task(row: dict) -> Arrays:
+        """Row in: number of a task. Rows out: its samples, in order."""
+        first = start_step + int(row["id"][0]) * per_task
+        return read_samples(stream, read, first, min(per_task, stop_step - first), batch, rank, world)
+
+    context = ray.data.DataContext.get_current()
+    context.execution_options.preserve_order = True
+    dataset = ray.data.range(num_tasks, override_num_blocks=num_tasks)
+    dataset = dataset.map_batches(read_task, batch_size=None, batch_format="numpy", num_cpus=READER_CPUS)
+    yield from dataset.iter_batches(batch_size=batch // world, batch_format="numpy", prefetch_batches=2)
+
+
+@lru_cache(maxsize=2 * WINDOW_SHARDS)
+def _scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
+    return tuple(shard.read(table) for table in ("scenes", "primitives", "rasters"))
+
+
+@dataclass(frozen=True)
+class LayoutReader:
+    """Samples for stage 1: compact layouts (models/tensors.py) under a LayoutSpec."""
+
+    spec: LayoutSpec
+
+    def __call__(self, shard: Shard, rows: np.ndarray) -> Arrays:
+        scenes = scenes_from_tables(*_scene_tables(shard), shard.source, shard.split, rows.tolist())
+        layouts = [compact_layout(scene, self.spec) for scene in scenes]
+        return {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
+
+
+@lru_cache(maxsize=2 * WINDOW_SHARDS)
+def _latents(shard: Shard, latents_root: str, label: str) -> Arrays:
+    table = Shard(latents_root, shard.source, shard.split, shard.number).read("latents")
+    scenes = shard.read("scenes", ["scene_id", "vegetation_density", "vehicle_density"])
+    if table["scene_id"].to_pylist() != scenes["scene_id"].to_pylist():
+        raise ValueError(f"{shard.path('latents')} is not aligned with {shard.path('scenes')}; encode the latents anew")
+    moments = {name: table[name].combine_chunks().to_numpy_ndarray() for name in ("mean", "logvar")}
+    return moments | {"label": label_indices(scenes, label)}
+
+
+def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
+    """(n,) int64: index into pipeline.LABELS[label] per row of a scenes table."""
+    names = {
+        "vegetation": scenes["vegetation_density"].to_pylist(),
+        "vehicle": scenes["vehicle_density"].to_pylist(),
+        "none": LABELS["none"] * len(scenes),
+    }
+    names["joint"] = [f"{a}-{b}" for a, b in zip(names["vegetation"], names["vehicle"], strict=True)]
+    return np.array([label_index(label, name) for name in names[label]], np.int64)
+
+
+@dataclass(frozen=True)
+class LatentReader:
+    """Samples for stage 2: posterior moments and labels."""
+
+    latents_root: str
+    label: str
+
+    def __call__(self, shard: Shard, rows: np.ndarray) -> Arrays:
+        return {name: values[rows] for name, values in _latents(shard, self.latents_root, self.label).items()}

@@ -1,0 +1,113 @@
+"""Labels and seeds -> scenes: one Ray Data graph, a pipeline per actor, one output shard per task."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import ray.data
+import torch
+
+from models.pipeline import LABELS, PrITTIPipeline
+from pipelines import storage
+from pipelines.scenes.tables import Shard
+
+
+@dataclass(frozen=True)
+class SampleRequest:
+    """What to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+
+    model: str  # directory of a PrITTIPipeline
+    output: str
+    run: str
+    num_scenes: int
+    labels: tuple[str, ...]
+    seed: int
+    num_inference_steps: int
+    guidance_scale: float
+    shard_scenes: int = 64
+
+    def shards(self) -> list[Shard]:
+        count = -(-self.num_scenes // self.shard_scenes)
+        return [Shard(self.output, f"generated-{self.run}", "generated", k) for k in range(count)]
+
+    def indices(self, shard: Shard) -> range:
+        start = shard.number * self.shard_scenes
+        return range(start, min(start + self.shard_scenes, self.num_scenes))
+
+
+def load_pipeline(directory: str) -> PrITTIPipeline:
+    """Raises ValueError if the directory holds no complete pipeline."""
+    try:
+        pipeline = PrITTIPipeline.from_pretrained(directory)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+class Sampler:
+    """Actor. Row in: number of a shard. Row out: its size and time. Generates and writes the shard's scenes."""
+
+    def __init__(self, request: SampleRequest, batch_size: int) -> None:
+        self.request, self.batch_size = request, batch_size
+        self.pipeline = load_pipeline(request.model)
+
+    def __call__(self, row: dict) -> dict:
+        request, started = self.request, time.perf_counter()
+        shard = request.shards()[row["id"]]
+        indices = request.indices(shard)
+        if not shard.is_written():
+            scenes = []
+            for start in range(0, len(indices), self.batch_size):
+                chosen = indices[start : start + self.batch_size]
+                scenes += self.pipeline.generate(
+                    labels=[request.labels[i % len(request.labels)] for i in chosen],
+                    seed=request.seed,
+                    indices=chosen,
+                    num_inference_steps=request.num_inference_steps,
+                    guidance_scale=request.guidance_scale,
+                    run=request.run,
+                )
+            shard.write(scenes)
+        return {"scenes": len(indices), "seconds": time.perf_counter() - started}
+
+
+def sample_scenes(
+    request: SampleRequest, num_actors: int = 1, batch_size: int = 8, on_shard: Callable[[dict], None] | None = None
+) -> int:
+    """Write the requested scenes as tables; how many there are. Goes on where it stopped.
+
+    Raises ValueError for labels the model does not know, or if the output holds a run made with other options.
+    """
+    pipeline = load_pipeline(request.model)
+    known = LABELS[pipeline.dit.config.label]
+    if unknown := set(request.labels) - set(known):
+        raise ValueError(f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}")
+    record = storage.join(request.output, f"generated-{request.run}.json")
+    options = {name: value for name, value in asdict(request).items() if name != "output"} | {"labels": list(request.labels)}
+    if storage.exists(record):
+        made = storage.read_json(record)
+        differing = [name for name in options if made.get(name) != options[name]]
+        if differing:
+            name = differing[0]
+            raise ValueError(
+                f"{request.output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options[name]}; "
+                "choose another --run or --output"
+            )
+    storage.write_json(options, record)
+    storage.clean_temporaries(request.output)
+    shards = request.shards()
+    graph = ray.data.range(len(shards), override_num_blocks=len(shards)).map(
+        Sampler,
+        fn_constructor_args=(request, batch_size),
+        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(shards))),
+        num_gpus=1 if torch.cuda.is_available() else 0,
+    )
+    total = 0
+    for row in graph.iter_rows():
+        total += row["scenes"]
+        if on_shard:
+            on_shard(row)
+    return total
