@@ -6,9 +6,10 @@ import trimesh
 from test_mesh import empty_scene, example_scene
 
 from models.scene import ELLIPSOID, Grid
+from pipelines.scenes.casting import cast_ellipsoids, looking_at, looking_down
 from pipelines.scenes.mesh import cuboid_triangles, scene_from_unit, scene_triangles
 from pipelines.scenes.palette import CLASS_COLORS, ground_ids
-from pipelines.scenes.render import bev_picture, cast_ellipsoids
+from pipelines.scenes.render import bev_picture, contact_sheet, picture_3d
 
 
 def test_bev_shows_what_vertical_rays_hit():
@@ -61,7 +62,7 @@ def test_ellipsoids_are_cast_exactly():
     scene = example_scene(220)
     scene = scene.select(scene.category == ELLIPSOID)
     grid = Grid(resolution_m=0.5, rows=128, cols=128)
-    height, index = cast_ellipsoids(scene, grid)
+    height, index = cast_ellipsoids(scene, looking_down(grid))
     assert np.array_equal(index >= 0, np.isfinite(height))
     row, col = np.nonzero(index >= 0)
     points = np.stack([grid.x_m()[row], grid.y_m()[col], height[row, col]], axis=-1)
@@ -78,6 +79,69 @@ def test_ellipsoids_are_cast_exactly():
 
 def test_nothing_round_to_cast():
     scene = empty_scene()
-    height, index = cast_ellipsoids(scene, scene.grid)
+    height, index = cast_ellipsoids(scene, looking_down(scene.grid))
     assert not np.isfinite(height).any() and (index == -1).all()
     assert len(cuboid_triangles(scene).corners_m) == 0
+
+
+def test_camera_turns_without_mirroring_and_frames_the_grid():
+    grid = Grid()
+    above = looking_at(grid, 640, 480, azimuth_deg=0, elevation_deg=90)
+    assert np.allclose(above.camera_from_scene, np.eye(3), atol=1e-12)
+    for azimuth, elevation in ((30, 38), (-120, 20), (90, 75)):
+        camera = looking_at(grid, 640, 480, azimuth, elevation)
+        assert np.isclose(np.linalg.det(camera.camera_from_scene), 1)
+        corners = [[x, y, z] for x in (0, 64) for y in (-32, 32) for z in (-2, 11)]
+        x, y, _ = camera.turned(np.array(corners)).T
+        assert camera.view.contains(x, y).all()
+    with pytest.raises(ValueError, match="elevation_deg is 0"):
+        looking_at(grid, 640, 480, 30, 0)
+
+
+def test_oblique_ellipsoids_are_where_their_meshes_are():
+    scene = example_scene(60)
+    scene = scene.select(scene.category == ELLIPSOID)
+    camera = looking_at(scene.grid, 200, 150, 30, 38)
+    _, hit = cast_ellipsoids(scene, camera)
+    corners, _, primitive = scene_triangles(scene)
+    corners, primitive = corners[primitive >= 0], primitive[primitive >= 0]
+    turned = camera.turned(corners)
+    mesh = trimesh.Trimesh(turned.reshape(-1, 3), np.arange(3 * len(turned)).reshape(-1, 3), process=False)
+    x, y = np.meshgrid(camera.view.x_m(), camera.view.y_m(), indexing="ij")
+    origins = np.stack([x, y, np.full_like(x, 500)], axis=-1).reshape(-1, 3)
+    first = mesh.ray.intersects_first(origins, np.tile([0.0, 0, -1], (len(origins), 1)))
+    assert (np.append(primitive, -1)[first].reshape(hit.shape) == hit).mean() > 0.998
+
+
+def test_3d_picture_has_soft_light_and_is_deterministic():
+    scene = example_scene(40)
+    picture = picture_3d(scene, 240, 180)
+    assert picture.shape == (180, 240, 3) and picture.dtype == np.uint8
+    assert np.array_equal(picture, picture_3d(scene, 240, 180))
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
+
+
+def test_level_ground_in_the_sun_has_its_palette_colour():
+    picture = picture_3d(example_scene(0), 240, 180).reshape(-1, 3).astype(int)
+    for name in ("road", "sidewalk", "terrain"):
+        color = CLASS_COLORS[{"road": 5, "sidewalk": 3, "terrain": 2}[name]].astype(int)
+        assert (np.abs(picture - color).max(axis=1) <= 8).sum() > 100
+
+
+@pytest.mark.parametrize("rows, cols", [(256, 256), (512, 256), (512, 768)])
+def test_3d_picture_of_empty_and_of_stitched_scenes(rows, cols):
+    grid = Grid(front_m=96, left_m=cols / 8, rows=rows, cols=cols)
+    for n in (0, 30):
+        assert picture_3d(example_scene(n, grid), 160, 120).std() > 5
+    assert picture_3d(empty_scene(), 160, 120).shape == (120, 160, 3)
+
+
+def test_contact_sheet():
+    pictures = [np.full((40, 60, 3), value, np.uint8) for value in (0, 80, 160)]
+    sheet = contact_sheet(pictures, 2)
+    assert sheet.shape == (2 * 40 + 3 * 12, 2 * 60 + 3 * 12, 3)
+    assert (sheet[12:52, 12:72] == 0).all() and (sheet[12:52, 84:144] == 80).all()
+    assert (sheet[64:104, 84:144] == 255).all()
+    assert contact_sheet(pictures, 5, ["a", "b", "c"]).shape[1] == 3 * 60 + 4 * 12
+    with pytest.raises(ValueError, match="3 pictures and 1 captions"):
+        contact_sheet(pictures, 2, ["a"])
