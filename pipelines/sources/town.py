@@ -22,7 +22,12 @@ from pipelines.sources.town_land import (
     random_land,
     subdivided,
 )
+from pipelines.sources.town_kitti360 import write_kitti360
 from pipelines.sources.town_streets import Route, blocks_of, drive_route, lay_streets, pave
+from pipelines.sources.town_targets import TARGETS, measure, sample_of
+
+__all__ = ["TEST_SEEDS_START", "TOWN_VERSION", "TRAIN_SEEDS_START", "measure", "sample_of", "take", "town_drive", "town_plan"]
+__all__ += ["TARGETS", "write_kitti360"]
 
 TOWN_VERSION = 1
 TRAIN_SEEDS_START = 0
@@ -58,99 +63,102 @@ LABEL_CATEGORY = {
 # Tuned on 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1).
 DISTRICTS = {
     "centre": District(
-        house_scale=(1.0, 1.0, 1.1),
-        setback_m=1.6,
-        gap_m=(0.3, 1.6),
-        garages=0.8,
-        terrain_front=0.6,
-        terrain_back=0.2,
+        house_scale=(1.09, 1.07, 1.03),
+        setback_m=1.4,
+        gap_m=(0.1, 1.0),
+        garages=0.9,
+        terrain_front=0.75,
+        terrain_back=0.25,
         court_front=0.35,
-        terrace=0.7,
+        rough_drives=0.8,
+        terrace=0.9,
         sidewalks=0.97,
         bays=0.0,
-        curb_parking=0.45,
+        curb_parking=0.68,
         driveway_cars=0.3,
         parks=0.0,
         courts=0.04,
-        hedges=0.3,
-        walls=0.3,
-        shrubs_per_100m2=0.45,
-        bushes_per_100m2=0.25,
-        trees_per_100m2=0.25,
+        hedges=0.2,
+        walls=0.2,
+        shrubs_per_100m2=0.259,
+        bushes_per_100m2=0.265,
+        trees_per_100m2=0.242,
         street_trees_per_100m=1.0,
         tree_scale=0.95,
-        lamps_per_100m=1.8,
-        signs_per_100m=1.0,
+        lamps_per_100m=1.855,
+        signs_per_100m=0.552,
         lights=0.05,
-        things_per_plot=0.42,
+        things_per_plot=0.264,
         bicycles_per_plot=0.05,
         people_per_100m=0.02,
         trucks_per_100m=0.1,
     ),
     "suburb": District(
-        house_scale=(1.0, 1.0, 1.0),
+        house_scale=(1.07, 1.06, 1.0),
         setback_m=3.2,
-        gap_m=(1.0, 3.0),
-        garages=0.85,
-        terrain_front=0.85,
-        terrain_back=0.6,
+        gap_m=(0.5, 2.0),
+        garages=1.0,
+        terrain_front=0.97,
+        terrain_back=0.96,
         court_front=0.25,
-        terrace=0.9,
+        rough_drives=0.2,
+        terrace=1.0,
         sidewalks=0.92,
         bays=0.12,
-        curb_parking=0.42,
+        curb_parking=0.5,
         driveway_cars=0.4,
         parks=0.03,
         courts=0.12,
         hedges=0.9,
-        walls=0.55,
-        shrubs_per_100m2=3.0,
-        bushes_per_100m2=2.0,
-        trees_per_100m2=1.7,
+        walls=0.541,
+        shrubs_per_100m2=3.418,
+        bushes_per_100m2=2.419,
+        trees_per_100m2=2.238,
         street_trees_per_100m=3.0,
         tree_scale=0.95,
-        lamps_per_100m=2.8,
-        signs_per_100m=2.2,
+        lamps_per_100m=2.75,
+        signs_per_100m=2.05,
         lights=0.1,
-        things_per_plot=1.1,
-        bicycles_per_plot=0.12,
-        people_per_100m=0.03,
+        things_per_plot=0.891,
+        bicycles_per_plot=0.038,
+        people_per_100m=0.015,
         trucks_per_100m=0.1,
     ),
     "green": District(
-        house_scale=(1.0, 1.0, 1.0),
+        house_scale=(1.07, 1.06, 1.0),
         setback_m=6.0,
-        gap_m=(2.0, 5.0),
+        gap_m=(1.5, 4.0),
         garages=0.75,
         terrain_front=0.95,
-        terrain_back=0.7,
+        terrain_back=0.6,
         court_front=0.05,
+        rough_drives=0.2,
         terrace=0.5,
         sidewalks=0.92,
-        bays=0.06,
-        curb_parking=0.3,
+        bays=0.18,
+        curb_parking=0.272,
         driveway_cars=0.3,
         parks=0.2,
-        courts=0.05,
+        courts=0.08,
         hedges=0.9,
-        walls=0.9,
-        shrubs_per_100m2=4.0,
-        bushes_per_100m2=2.2,
-        trees_per_100m2=2.1,
+        walls=1.206,
+        shrubs_per_100m2=4.056,
+        bushes_per_100m2=2.0,
+        trees_per_100m2=2.163,
         street_trees_per_100m=4.0,
         tree_scale=1.12,
-        lamps_per_100m=2.8,
-        signs_per_100m=2.4,
+        lamps_per_100m=2.9,
+        signs_per_100m=2.55,
         lights=0.05,
-        things_per_plot=2.0,
-        bicycles_per_plot=0.4,
-        people_per_100m=0.3,
+        things_per_plot=2.2,
+        bicycles_per_plot=0.55,
+        people_per_100m=0.784,
         trucks_per_100m=0.08,
     ),
 }
 # A town's main district and the one at its edge, by seed modulo 4: any four towns in a row show all of them.
 TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
-SPACING_M = {"centre": (60, 78), "suburb": (60, 80), "green": (76, 100)}
+SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
 
 
 def town_drive(seed: int) -> Drive:
@@ -171,8 +179,8 @@ def town_drive(seed: int) -> Drive:
 
     sheet = Sheet()
     pave(streets, sheet)
-    mood_of_town = np.exp(rng.normal(0, [0.05, 0.1, 0.10, 0.10, 0.05, 0.2, 0.2, 0.2, 0.3, 0.3, 0.3]))
-    for block in blocks_of(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=38.0):
+    mood_of_town = np.exp(rng.normal(0, [0.04, 0.0, 0.1, 0.1, 0.1, 0.05, 0.12, 0.12, 0.12, 0.2, 0.2, 0.2]))
+    for block in blocks_of(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=48.0):
         mood = random_mood(rng)
         mood = Mood(*(np.array(list(vars(mood).values())) * mood_of_town).tolist())
         furnish(sheet, rng, block, DISTRICTS[block.kind], mood)
@@ -270,9 +278,12 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
 
     A track appears at a few successive poses; each of its boxes belongs to that pose's frame.
     """
+    vehicles = np.array([label in ("car", "truck", "bus") for label in sheet.box_label])
+    parked = np.concatenate(sheet.box_rows)[vehicles, :2]
+    moving: dict[int, list[np.ndarray]] = {}
     first, track = 0, 0
     while first < len(at):
-        what = str(rng.choice(["car", "bicycle", "pedestrian", "truck"], p=[0.80, 0.08, 0.09, 0.03]))
+        what = str(rng.choice(["car", "bicycle", "pedestrian", "truck"], p=[0.84, 0.05, 0.08, 0.03]))
         oncoming = rng.random() < 0.6
         count = int(rng.integers(1, 3) if oncoming else rng.integers(2, 6))
         size = sizes(rng, what, 1)[0]
@@ -280,12 +291,16 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
         for k in range(first, min(first + count, len(at))):
             sample = at[k] + int(ahead)
             if 2 < ahead < 62 and sample < len(route.uv):
-                heading = route.heading[sample]
-                place = Frame(tuple(route.uv[sample]), tuple(heading), (-heading[1], heading[0]))
-                lane = route.lane_m[sample]
-                aside = {"pedestrian": -lane - 1.2, "bicycle": -0.9 * lane}.get(what, 2 * lane * oncoming)
-                yaw = (np.pi if oncoming else 0.0) + rng.normal(0, 0.02)
-                sheet.boxes(place, what, 0.0, aside, size, yaw, timestamp=frame[k], track=track)
+                heading, lane = route.heading[sample], route.lane_m[sample]
+                left = np.array([-heading[1], heading[0]])
+                aside = {"pedestrian": -2.4 * lane, "bicycle": -1.2 * lane}.get(what, 2 * lane * oncoming)
+                place = route.uv[sample] + aside * left
+                others = np.vstack([parked, *moving.setdefault(int(frame[k]), [])]) - place
+                if not ((np.abs(others @ heading) < 5.6) & (np.abs(others @ left) < 2.0)).any():
+                    moving[int(frame[k])].append(place[None])
+                    yaw = (np.pi if oncoming else 0.0) + rng.normal(0, 0.02)
+                    here = Frame(tuple(place.tolist()), tuple(heading.tolist()), tuple(left.tolist()))
+                    sheet.boxes(here, what, 0.0, 0.0, size, yaw, timestamp=frame[k], track=track)
             step = at[min(k + 1, len(at) - 1)] - at[k]
             ahead -= step * {"pedestrian": 0.85, "bicycle": 0.5}.get(what, 1.8 if oncoming else rng.uniform(-0.2, 0.2))
         track += 1
@@ -320,12 +335,11 @@ def _boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.n
     size = rows[:, 4:7]
     foot = np.column_stack([xy, land.surface_m(xy) + rows[:, 7]])
     center = foot + normal * size[:, 2:] / 2
-    directed = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle", "pedestrian"])
+    directed = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle"])
     heading = np.where(directed, np.arctan2(along[:, 1], along[:, 0]), np.nan)
     timestamp, track = rows[:, 9].astype(np.int64), rows[:, 10].astype(np.int64)
     static = timestamp == STATIC
-    instance = np.cumsum(static) - 1
-    instance[~static] = static.sum() + track[~static]
+    instance = np.where(static, np.arange(len(label)) + 1, track)  # counted apart, as KITTI-360 does
     return {
         "category": category,
         "center_m": center,

@@ -16,6 +16,7 @@ NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
 CAR_SLOT_M = 6.2
 BAY_DEPTH_M = 2.3
+SQUEEZE = 0.4  # share of the last plot of a row that its neighbours make room for
 
 # label: median (l, w, h), spread of the common factor, spread of each extent, smallest and largest (l, w, h)
 SIZES = {
@@ -51,6 +52,7 @@ class District:
     terrain_front: float
     terrain_back: float
     court_front: float  # share of front yards that are paved
+    rough_drives: float  # share of driveways that are ground rather than parking
     terrace: float
     sidewalks: float
     bays: float
@@ -79,6 +81,7 @@ class Mood:
     """What makes one block differ from the next of its district: factors of mean 1."""
 
     room: float  # of plots: houses and the gaps between them
+    vacant: float  # share of plots without a house
     garages: float
     green: float
     trees: float
@@ -95,8 +98,11 @@ def random_mood(rng: np.random.Generator) -> Mood:
     def gamma(shape: float) -> float:
         return float(rng.gamma(shape) / shape)
 
-    size, room = np.exp(rng.normal(0, [0.13, 0.2])).tolist()
-    return Mood(room, gamma(2.5), gamma(9), gamma(9), size, gamma(4), gamma(3), gamma(5), gamma(2), gamma(1), gamma(0.8))
+    size, room = np.exp(rng.normal(0, [0.13, 0.16])).tolist()
+    if rng.random() < 0.13:  # a terrace of narrow houses
+        room = 0.5
+    vacant = 0.5 if rng.random() < 0.11 else 0.02
+    return Mood(room, vacant, gamma(1.2), gamma(9), gamma(9), size, gamma(4), gamma(3), gamma(5), gamma(2), gamma(1), gamma(1.2))
 
 
 def sizes(rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0) -> np.ndarray:
@@ -123,7 +129,8 @@ def furnish(sheet: Sheet, rng: np.random.Generator, block: Block, district: Dist
     if whole and use < district.parks:
         _park(sheet, rng, _interior(block, depths), district, mood)
     elif whole and use < district.parks + district.courts and min(width, height) > 45:
-        _court(sheet, rng, _interior(block, depths), district, mood)
+        fill = _garage_court if rng.random() < 0.4 else _court
+        fill(sheet, rng, _interior(block, depths), district, mood)
     else:
         rows = (0, 2) if width >= height else (1, 3)
         for k in rows if whole else [block.streets.index(True)]:
@@ -135,9 +142,12 @@ def furnish(sheet: Sheet, rng: np.random.Generator, block: Block, district: Dist
 
 
 def _interior(block: Block, depths: list) -> tuple[Frame, float, float]:
+    """What the sides leave of a block: a frame along its longer side, width, depth."""
     south, east, north, west = (d[0] for d in depths)
-    frame = Frame((block.u0 + west, block.v0 + south), (1.0, 0.0), (0.0, 1.0))
-    return frame, block.u1 - block.u0 - west - east, block.v1 - block.v0 - south - north
+    width, depth = block.u1 - block.u0 - west - east, block.v1 - block.v0 - south - north
+    if width >= depth:
+        return Frame((block.u0 + west, block.v0 + south), (1.0, 0.0), (0.0, 1.0)), width, depth
+    return Frame((block.u1 - east, block.v0 + south), (0.0, 1.0), (-1.0, 0.0)), depth, width
 
 
 # ---------------------------------------------------------------- sides of a block
@@ -146,7 +156,7 @@ def _interior(block: Block, depths: list) -> tuple[Frame, float, float]:
 def _side_depth(rng: np.random.Generator, district: District) -> tuple[float, bool, bool]:
     """(depth, has a sidewalk, has parking bays) of one side."""
     sidewalk, bay = bool(rng.random() < district.sidewalks), bool(rng.random() < district.bays)
-    return float(rng.uniform(2.0, 3.0)) + BAY_DEPTH_M * bay, sidewalk, bay
+    return float(rng.uniform(2.25, 3.0)) + BAY_DEPTH_M * bay, sidewalk, bay
 
 
 def _side(sheet, rng, block: Block, k: int, depths: list, district: District, mood: Mood) -> None:
@@ -337,24 +347,25 @@ def _garden(sheet, rng, frame, width, depth, taken: list, district: District, mo
 
 
 def _row(sheet, rng, frame: Frame, length: float, depth: float, district: District, mood: Mood) -> None:
-    """Houses side by side along a street, each on its plot; what is left over widens the plots."""
+    """Houses side by side along a street, each on its plot; plots give or take a little so that the row is full."""
     plots, used = [], 0.0
     while True:
         size = sizes(rng, "building", 1, np.array(district.house_scale) * [mood.room, mood.room**0.5, 1.0])[0]
-        front, back = (size[0], size[1]) if rng.random() < 0.7 else (size[1], size[0])
+        front, back = (size[0], size[1]) if rng.random() < 0.55 else (size[1], size[0])
         garage = bool(rng.random() < district.garages * mood.garages)
-        gaps = rng.uniform(*district.gap_m, 2) * mood.room**2
-        drive = float(rng.uniform(3.2, 6.4)) if garage else 0.0
-        need = front + drive + gaps.sum()
-        if used + need > length or front > length:
+        gaps = float((rng.uniform(*district.gap_m, 2) * mood.room**2).sum())
+        drive = float(rng.uniform(3.5, 6.6)) if garage else 0.0
+        need = front + drive + gaps
+        if used + (1 - SQUEEZE) * need > length:
             break
         plots.append((front, back, size[2], garage, drive, gaps))
         used += need
-    extra = (length - used) / max(1, len(plots))
+    squeeze = min(1.0, length / used) if used else 1.0
+    extra = max(0.0, length - used) / max(1, len(plots))
     s = 0.0
     for front, back, height, garage, drive, gaps in plots:
-        width = front + drive + float(gaps.sum()) + extra
-        house = (front, back, height, garage, drive)
+        width = (front + drive + gaps) * squeeze + extra
+        house = (front * squeeze, back, height, garage, drive * squeeze)
         _plot(sheet, rng, frame.at(s, 0.0), width, depth, house, district, mood)
         s += width
     if not plots and length > 6:
@@ -363,7 +374,13 @@ def _row(sheet, rng, frame: Frame, length: float, depth: float, district: Distri
 
 
 def _plot(sheet, rng, frame: Frame, width: float, depth: float, house: tuple, district: District, mood: Mood) -> None:
-    """One plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles."""
+    """One plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles; or an orchard."""
+    if rng.random() < mood.vacant:
+        lawn = TERRAIN if rng.random() < district.terrain_front else NOTHING
+        _paint(sheet, frame, width, depth, lawn, lawn, depth, [])
+        _garden(sheet, rng, frame, width, depth, [], district, mood)
+        _borders(sheet, rng, frame, width, depth, 4.0, (0.0, 0.0), False, district, mood)
+        return
     front, back, height, garage, drive, *_ = house
     setback = float(np.clip(district.setback_m * np.exp(0.75 * rng.standard_normal()), 0.2, max(0.3, depth - back - 2)))
     drive_left = rng.random() < 0.5
@@ -393,7 +410,8 @@ def _plot(sheet, rng, frame: Frame, width: float, depth: float, house: tuple, di
             d0, d1 = (0.15, 0.15 + beside) if drive_left else (width - 0.15 - beside, width - 0.15)
             drive_rect = (d0, d1, 0.0, g_front)
             taken += [garage_rect, drive_rect]
-            painted += [(PARKING, drive_rect), (NOTHING, garage_rect)]
+            rough = rng.random() < district.rough_drives
+            painted += [(GROUND if rough else PARKING, drive_rect), (NOTHING, garage_rect)]
             gate = (d0, d1)
             if rng.random() < district.driveway_cars * mood.cars and g_front > 5.2:
                 _cars(sheet, rng, frame, np.array([(d0 + d1) / 2]), float(rng.uniform(2.7, g_front - 2.5)), np.pi / 2)
@@ -404,7 +422,7 @@ def _plot(sheet, rng, frame: Frame, width: float, depth: float, house: tuple, di
         painted.append((GROUND, path))
         taken.append(path)
     if rng.random() < district.terrace and depth - house_rect[3] > 3:
-        deep = min(float(rng.uniform(2.5, 5.5)), depth - house_rect[3] - 0.5)
+        deep = min(float(rng.uniform(3.0, 6.0)), depth - house_rect[3] - 0.5)
         a = float(rng.uniform(s0, s0 + front / 2))
         patio = (a, a + front / 2, house_rect[3], house_rect[3] + deep)
         if all(patio[1] <= r[0] or patio[0] >= r[1] or patio[3] <= r[2] or patio[2] >= r[3] for r in taken[1:]):
@@ -522,7 +540,7 @@ def _park(sheet, rng, interior, district: District, mood: Mood) -> None:
         _border(sheet, rng, frame, *line, kind, 0.8)
     n = 2 + rng.poisson(3 * mood.things)
     sheet.boxes(frame, "box", rng.uniform(2, width - 2, n), middle + rng.choice([-1.6, 1.6], n), sizes(rng, "box", n))
-    n = rng.poisson(2.5 * mood.people)
+    n = rng.poisson(1.8 * mood.people)
     s, t = rng.uniform(2, width - 2, n), middle + rng.uniform(-1, 1, n)
     sheet.boxes(frame, "pedestrian", s, t, sizes(rng, "pedestrian", n), rng.uniform(-np.pi, np.pi, n))
 
@@ -534,6 +552,34 @@ def _meadow(sheet, rng, block: Block, district: District, mood: Mood) -> None:
         for a in (0.0, width / 2):
             _strip(sheet, frame, "terrain", 0.0, depth, a, a + width / 2, 20.0)
     _garden(sheet, rng, frame, width, depth, [], district, mood)
+
+
+def _garage_court(sheet, rng, interior, district: District, mood: Mood) -> None:
+    """Two rows of garages that face each other across a court, hedges behind them, a house at each end."""
+    frame, width, depth = interior
+    g = sizes(rng, "garage", 1)[0]
+    margin, aisle = (depth - 2 * g[0] - 9.0) / 2, 9.0
+    start = float(rng.uniform(4, max(4.5, width * 0.2)))
+    n = int((width - start - 18) / (g[1] + 0.1))
+    at = start + (np.arange(n) + 0.5) * (g[1] + 0.1)
+    end = start + n * (g[1] + 0.1)
+    for low in (margin, margin + g[0] + aisle):
+        here = at[rng.random(n) < 0.92]
+        size = np.exp(0.02 * rng.standard_normal((len(here), 3))) * g
+        sheet.boxes(frame, "garage", here, low + g[0] / 2, size, np.pi / 2, -0.1)
+    for a, b in ((0.0, (start + end) / 2), ((start + end) / 2, end)):
+        sheet.slab(frame, "parking", [(a, margin + g[0]), (b, margin + g[0]), (b, margin + g[0] + aisle), (a, margin + g[0] + aisle)])
+    cars = at[rng.random(n) < 0.25 * mood.cars]
+    _cars(sheet, rng, frame, cars, margin + g[0] + 2.7, np.pi / 2)
+    for low in (0.0, depth - margin):
+        strip = frame.at(0.0, low)
+        if margin > 1 and rng.random() < district.terrain_front:
+            _strip(sheet, frame, "terrain", 0.0, width, low, low + margin, 25.0)
+        if margin > 1.5:
+            _garden(sheet, rng, strip, width, margin, [], district, mood)
+        _border(sheet, rng, strip, 0.5, margin / 2, width - 0.5, margin / 2, "hedge", 0.8 * min(1.0, district.hedges))
+    house = frame.at(end + 1, margin)
+    _plot(sheet, rng, house, width - end - 1, depth - 2 * margin, (12.0, 16.0, 10.0, False, 0.0), district, mood)
 
 
 def _court(sheet, rng, interior, district: District, mood: Mood) -> None:

@@ -72,8 +72,10 @@ def random_land(rng: np.random.Generator) -> Land:
         slope = rng.uniform(0.0, 0.27) * rng.dirichlet([1.5, 1.5])
         return np.stack([slope / wave, wave, rng.uniform(0, 2 * np.pi, 2)], axis=1)
 
-    wave, direction = 2 * np.pi / rng.uniform(260, 620, 2), rng.uniform(0, 2 * np.pi, 2)
-    grade = rng.uniform(0.024, 0.03) * rng.dirichlet([1.0, 1.0])  # grades add up to the total at most
+    # Two crossing swells: their grades are perpendicular and never exceed 3 % together.
+    wave, direction = 2 * np.pi / rng.uniform(320, 760, 2), rng.uniform(0, 2 * np.pi) + np.array([0.0, np.pi / 2])
+    steepest, share = rng.uniform(0.026, 0.03), rng.uniform(0.3, 1.27)
+    grade = steepest * np.array([np.cos(share), np.sin(share)])
     vector = wave[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     hills = np.column_stack([grade / wave, vector, rng.uniform(0, 2 * np.pi, 2)])
     origin = np.array([*rng.uniform(500, 4000, 2), rng.uniform(108, 125)])

@@ -102,7 +102,7 @@ def lay_streets(
         merged[pair[0]] = merged[pair[1]] = span
     cells = {merged.get((i, j), (i, i + 1, j, j + 1)) for i in range(nu - 1) for j in range(nv - 1)}
     corner = {(i, j): float(rng.uniform(3.6, 6.2)) for i in range(nu) for j in range(nv)}
-    half_u, half_v = rng.uniform(2.75, 3.75, nu), rng.uniform(2.75, 3.75, nv)
+    half_u, half_v = rng.uniform(2.85, 3.75, nu), rng.uniform(2.85, 3.75, nv)
     return Streets(u, v, half_u, half_v, frozenset(edges), corner), sorted(cells)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from models.scene import CATEGORIES, DENSITIES, KITTI_GROUND_CLASSES, VEGETATION, Scene
+from models.scene import CATEGORIES, DENSITIES, VEGETATION, Scene
 from pipelines.labels import density, density_thresholds
 
 COUNT_TOLERANCE = 0.20  # relative; absolute COUNT_TOLERANCE_SMALL where the target is under 3
@@ -66,38 +67,62 @@ class Row(NamedTuple):
     ok: bool
 
 
-def measure(scenes: Iterable[Scene]) -> list[Row]:
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What `measure` needs to know of n scenes; `size_m[name]` holds the sizes of all boxes of a SIZES_M name."""
+
+    counts: np.ndarray  # (n, 11) per category
+    vegetation_volume_m3: np.ndarray  # (n,)
+    areas: np.ndarray  # (n, 6) shares, in the order of AREAS
+    size_m: dict[str, np.ndarray]  # (k, 3)
+
+    @property
+    def vegetation_count(self) -> np.ndarray:
+        return self.counts[:, list(VEGETATION)].sum(axis=1)
+
+    def labels(self) -> np.ndarray:
+        """(n,) vegetation density of each scene by the sample's own percentiles."""
+        thresholds = density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
+        return density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
+
+
+def sample_of(scenes: Iterable[Scene]) -> Sample:
+    """The numbers of a stream of scenes; no scene is kept."""
+    counts, volumes, areas, size_of = [], [], [], {name: [np.zeros((0, 3))] for name in SIZES_M}
+    for scene in scenes:
+        counts.append(scene.counts())
+        volumes.append(scene.volume_m3[np.isin(scene.category, VEGETATION)].sum())
+        share = dict(zip(scene.ground_classes, scene.occupied.mean(axis=(1, 2)), strict=True))
+        share["none"] = 1.0 - scene.occupied.any(axis=0).mean()
+        areas.append([share.get(name, 0.0) for name in AREAS])
+        for name in SIZES_M:
+            of_label = name in ("building", "garage")
+            which = scene.label == name if of_label else scene.category == CATEGORIES.index(name)
+            size_of[name].append(scene.size_m[which])
+    size_m = {name: np.concatenate(parts) for name, parts in size_of.items()}
+    return Sample(np.array(counts), np.array(volumes), np.array(areas), size_m)
+
+
+def measure(scenes: Iterable[Scene] | Sample) -> list[Row]:
     """Measured beside target for every number of TARGETS; labels come from the scenes' own percentiles.
 
     A category or label that never occurs gives nan and is not ok.
     """
-    counts, volumes, areas, size_of = [], [], [], {name: [] for name in SIZES_M}
-    for scene in scenes:
-        counts.append(scene.counts())
-        volumes.append(scene.volume_m3[np.isin(scene.category, VEGETATION)].sum())
-        ground = dict(zip(scene.ground_classes, scene.occupied.mean(axis=(1, 2)), strict=True))
-        ground["none"] = 1.0 - scene.occupied.any(axis=0).mean()
-        areas.append([ground.get(name, 0.0) for name in (*KITTI_GROUND_CLASSES, "none")])
-        for name in SIZES_M:
-            is_label = name in ("building", "garage")
-            which = scene.label == name if is_label else scene.category == CATEGORIES.index(name)
-            size_of[name].append(scene.size_m[which])
-    counts, volumes, areas = np.array(counts), np.array(volumes), np.array(areas)
-    vegetation = counts[:, list(VEGETATION)].sum(axis=1)
-    label = density(vegetation, volumes, density_thresholds(vegetation, volumes))
-
+    sample = scenes if isinstance(scenes, Sample) else sample_of(scenes)
+    label = sample.labels()
     rows = []
     for k, which in enumerate(DENSITIES):
-        mean = counts[label == which].mean(axis=0) if (label == which).any() else np.full(len(CATEGORIES), np.nan)
+        here = label == which
+        mean = sample.counts[here].mean(axis=0) if here.any() else np.full(len(CATEGORIES), np.nan)
         for index, name in enumerate(CATEGORIES):
             target = float(COUNTS[name][k])
             tolerance = COUNT_TOLERANCE_SMALL if target < 3 else COUNT_TOLERANCE * target
             rows.append(_row(f"mean count {name}", which, target, mean[index], tolerance))
-        share = areas[label == which].mean(axis=0) if (label == which).any() else np.full(len(AREAS), np.nan)
-        for index, name in enumerate((*KITTI_GROUND_CLASSES, "none")):
+        share = sample.areas[here].mean(axis=0) if here.any() else np.full(len(AREAS), np.nan)
+        for index, name in enumerate(AREAS):
             rows.append(_row(f"area share {name}", which, AREAS[name][k], share[index], AREA_TOLERANCE))
     for name, target_size in SIZES_M.items():
-        size = np.concatenate(size_of[name])
+        size = sample.size_m[name]
         median = np.median(size, axis=0) if len(size) else np.full(3, np.nan)
         for axis, extent in enumerate(("length", "width", "height")):
             target = float(target_size[axis])
