@@ -30,6 +30,7 @@ def network() -> Inception:
             module.running_var.uniform_(0.5, 1.5)
             torch.nn.init.uniform_(module.weight, 0.8, 1.2)
             torch.nn.init.normal_(module.bias, 0, 0.1)
+    network.fc.bias.normal_(0, 10)
     return network
 
 

@@ -104,7 +104,7 @@ def random_dataset(rng, num_scenes=6):
     return truths, predictions
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("max_detections", [3, 100])
 def test_ap3d_equals_the_literal_version(seed, max_detections):
     truths, predictions = random_dataset(np.random.default_rng(seed))
@@ -175,8 +175,8 @@ def test_truncation_is_per_scene_and_category():
 
 def test_a_score_threshold_equals_dropping_the_detections():
     truths, predictions = random_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence >= 0.3) for p in predictions]
-    assert scores(truths, predictions, min_score=0.3) == scores(truths, dropped)
+    dropped = [p.select(p.existence >= 0.375) for p in predictions]
+    assert scores(truths, predictions, min_score=0.375) == scores(truths, dropped)
 
 
 def test_greedy_matching_takes_the_best_free_truth_and_the_later_of_equals():
@@ -184,6 +184,8 @@ def test_greedy_matching_takes_the_best_free_truth_and_the_later_of_equals():
     hit = match_greedily(iou, np.array([0.3, 0.55]))
     np.testing.assert_array_equal(hit[:, 0], [True, True, True, False])
     np.testing.assert_array_equal(hit[:, 1], [True, False, False, False])
+    leaves_the_first_free = np.array([[0.5, 0.5], [0.6, 0.2]])
+    np.testing.assert_array_equal(match_greedily(leaves_the_first_free, np.array([0.3])), [[True], [True]])
     assert match_greedily(np.zeros((2, 0))).shape == (2, 10)
     assert average_precision(np.zeros((0, 10), bool), 3).tolist() == [0] * 10
 

@@ -69,6 +69,8 @@ def test_absent_categories_and_constant_columns_stay_finite():
     a[::2, 1] = np.nan
     b[:, 2] = np.nan  # never there in the other source
     assert layout_frechet(a, b) > 9 and np.isfinite(layout_frechet(a, b))
+    filled = np.where(np.isnan(b), a.mean(axis=0), b)
+    assert layout_frechet(a[:, [0, 2]], b[:, [0, 2]]) == pytest.approx(layout_frechet(a[:, [0, 2]], filled[:, [0, 2]]))
     a[:, 1] = np.nan  # never there in the reference
     assert np.isfinite(layout_frechet(a, b))
     with pytest.raises(ValueError, match="at least 2 scenes"):

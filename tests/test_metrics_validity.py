@@ -78,8 +78,13 @@ def test_a_tilted_box_stands_on_its_lowest_corner():
 
 
 def test_ground_that_is_unknown_judges_nothing_but_is_counted():
-    over_nothing, outside, good = (CAR, 0.5, 4.0, 7), (CAR, -3.0, 4.0, 7), (CAR, 5.0, 4.0, 0)
-    scene = town([over_nothing, outside, good])
+    over_nothing, behind, ahead, good = (
+        (CAR, 0.5, 4.0, 7),
+        (CAR, -3.0, 4.0, 7),
+        (CAR, 20.0, -4.0, 7),
+        (CAR, 5.0, 4.0, 0),
+    )
+    scene = town([over_nothing, behind, ahead, good])
     assert measure("floating", scene) == (0, 1)
     assert measure("off_road_vehicles", scene) == (0, 1)
     assert measure("over_unknown_ground", scene) == (1, 2)

@@ -2,7 +2,7 @@
 
 The network is the one every FID is defined by: TensorFlow's graph of 2015-12-05 (1008 classes), in plain torch. Its
 parameter names are those of pytorch-fid's and torch-fidelity's converted weights, so that either file loads. Nothing
-is ever fetched; docs/evaluation.md says how to get the file.
+is ever fetched: the user downloads the file once and names its path.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 INPUT_SIZE = 299
 FEATURES, CLASSES = 2048, 1008
+KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's release v0.2.0"
 
 # A branch is a chain of convolutions (output channels, kernel height x width); SPLIT ends it with a 1x3 and a 3x1
 # side by side. One-step chains bear the branch's name, others name_1, name_2, ...
@@ -184,12 +185,12 @@ def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
 def load_inception(path: str | Path) -> Inception:
     """The network with the weights of a local state dict (.pth, .pt or .safetensors).
 
-    A name like weights-inception-2015-12-05-6726825d.pth ends in the start of the file's sha256, which is checked.
+    A name like that of KNOWN_FILE ends in the start of the file's sha256, which is checked.
     Raises ValueError, naming the file, for a missing or corrupted file and for weights of another network.
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: no such file; Inception weights must be local (docs/evaluation.md says how)")
+        raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
     sha256 = _sha256(path)
     claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     if claimed and not sha256.startswith(claimed[1]):

@@ -14,7 +14,6 @@ tolerance. A face of B that coincides with one of A then lies outside A, so the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ GROWTH = 1e-9  # of the largest extent of a pair
 PARALLEL = 1e-12  # sine of the angle below which two faces have no common line
 PAIRS_PER_CHUNK = 4096  # of 256 to 16384 the fastest on two AVX2 cores: call overhead below, cache misses above
 BALL_POINTS = 4096
+CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
 class Boxes(NamedTuple):
@@ -144,7 +144,7 @@ def _own_edges(
     are perpendicular, so r of one face is d of the other.
     """
     total = np.zeros(half.shape[1])
-    for along, second, third in _cyclic():
+    for along, second, third in CYCLIC:
         clip = _Clip(-half[along], half[along])
         at_second, at_third = _signed(half[second])[:, None], _signed(half[third])[None]
         for j in range(3):
@@ -160,9 +160,9 @@ def _crossing_edges(
     """(n,) sum over the 36 face pairs of (d_a r_a + d_b r_b) |common line inside both boxes|."""
     total = np.zeros(half_a.shape[1])
     sign_b = np.array([-1.0, 1.0])[None, :, None]
-    for i, k, l in _cyclic():  # noqa: E741
+    for i, k, l in CYCLIC:  # noqa: E741
         plane_a = _signed(half_a[i])[:, None]  # (2, 1, n): x_i on the two faces of A
-        for j, *others in _cyclic():
+        for j, *others in CYCLIC:
             sine = np.hypot(axes[k, j], axes[l, j])
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
@@ -200,10 +200,6 @@ class _Clip:
         return np.maximum(self.high - self.low, 0)
 
 
-def _cyclic() -> Iterator[tuple[int, int, int]]:
-    yield from ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-
-
 def _signed(half: np.ndarray) -> np.ndarray:
     """(2, n): the two faces, negative side first."""
     return np.stack([-half, half])
@@ -216,7 +212,7 @@ def ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     """(n,) IoU3D of the ellipsoids inscribed in a[i] and b[i], estimated on a fixed set of BALL_POINTS points.
 
     The share of the smaller ellipsoid's points that lie in the larger one. Deterministic; not exact: the error is at
-    most 0.01, and 0.002 in the root mean square. The paper's AP3D leaves ellipsoids out.
+    most 0.01, and 0.002 in the root mean square (a test holds it on closed forms). The paper's AP3D has no ellipsoids.
     """
     swap = a.volume_m3 > b.volume_m3
     small = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), q, p) for p, q in zip(a, b, strict=True)))

@@ -107,7 +107,7 @@ class Matches:
     """
 
     category: np.ndarray  # (d,) int8
-    score: np.ndarray  # (d,) float64
+    score: np.ndarray  # (d,) float32
     rank: np.ndarray  # (d,) int64
     hit: np.ndarray  # (d, 10) bool: true positive at each of THRESHOLDS
     truths: np.ndarray  # (11,) int64: number of true primitives per category
@@ -135,7 +135,7 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
         index = index[np.argsort(-prediction.existence[index], kind="stable")]
         truths[c] = len(true_index)
         category.append(np.full(len(index), c, np.int8))
-        score.append(prediction.existence[index].astype(np.float64))
+        score.append(prediction.existence[index])
         rank.append(np.arange(len(index)))
         hit.append(match_greedily(iou[np.ix_(index, true_index)]))
     return Matches(*map(np.concatenate, (category, score, rank, hit)), truths=truths)
