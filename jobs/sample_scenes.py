@@ -46,7 +46,7 @@ def sample(config: Config) -> str:
     from models.pipeline import LABELS
     from pipelines import storage
     from pipelines.generate import SampleRequest, sample_scenes
-    from pipelines.scenes.mesh import write_glb
+    from pipelines.scenes.mesh import scene_glb
     from pipelines.scenes.tables import read_scenes
 
     model = absolute(config.model) if config.model else home("models", "pritti-town")
@@ -71,7 +71,8 @@ def sample(config: Config) -> str:
         shown = bar.add_task("sample scenes", total=config.num_scenes)
         sample_scenes(request, config.actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
     for scene in read_scenes(output, f"generated-{config.run}", limit=config.glb) if config.glb else ():
-        write_glb(scene, storage.join(output, "glb", config.run, f"{scene.scene_id}.glb"))
+        path = storage.join(output, "glb", config.run, f"{scene.scene_id}.glb")
+        storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
     return output
 
 

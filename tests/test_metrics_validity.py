@@ -145,5 +145,5 @@ def test_label_fidelity_compares_the_scenes_own_label_with_the_one_it_bears():
     np.testing.assert_array_equal(records[0], [[1, 1], [1, 1], [1, 1]])
     np.testing.assert_array_equal(records[1], [[1, 1], [0, 1], [0, 1]])
     assert validity_rates(records, LABEL_MEASURES) == dict(zip(LABEL_MEASURES, (1, 0.5, 0.5), strict=True))
-    with pytest.raises(ValueError, match="no density labels"):
+    with pytest.raises(ValueError, match="no density label"):
         label_fidelity(town(three_trees), many, many)

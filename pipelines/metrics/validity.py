@@ -76,10 +76,10 @@ def scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
 def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
     """(3, 2) of LABEL_MEASURES: is the scene's own density label the one it bears (the one asked for)?
 
-    Raises ValueError for a scene that bears no label.
+    A label that was not asked for counts nowhere. Raises ValueError for a scene that bears no label at all.
     """
-    if scene.vegetation_density is None or scene.vehicle_density is None:
-        raise ValueError(f"scene {scene.scene_id} bears no density labels; label fidelity needs the ones asked for")
+    if scene.vegetation_density is None and scene.vehicle_density is None:
+        raise ValueError(f"scene {scene.scene_id} bears no density label; label fidelity needs the one asked for")
     right = []
     for categories, thresholds, label in (
         (VEGETATION, vegetation, scene.vegetation_density),
@@ -87,8 +87,9 @@ def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: Density
     ):
         members = np.isin(scene.category, categories)
         own = density(members.sum(), scene.volume_m3[members].sum(), thresholds)
-        right.append(bool(own == label))
-    return np.array([[right[0], 1], [right[1], 1], [all(right), 1]], np.float64)
+        right.append(None if label is None else bool(own == label))
+    right.append(None if None in right else all(right))
+    return np.array([[bool(value), value is not None] for value in right], np.float64)
 
 
 def validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
