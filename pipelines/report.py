@@ -132,9 +132,7 @@ def _body(section: Section) -> str:
         case Pictures():
             return _paragraph(section.note) + _pictures(section)
         case Charts():
-            return (
-                f'{_paragraph(section.note)}<div class="charts">{"".join(map(_chart, section.charts))}</div>'
-            )
+            return f'{_paragraph(section.note)}<div class="charts">{"".join(map(_chart, section.charts))}</div>'
         case Table():
             return _paragraph(section.note) + _table(section)
     raise ValueError(f"not a section of a report: {section!r}")
@@ -186,9 +184,7 @@ def _table(table: Table) -> str:
     rows = []
     for row, meaning in zip(table.rows, meanings, strict=True):
         if len(row) != len(table.columns):
-            raise ValueError(
-                f"table {table.title!r} has {len(table.columns)} columns, a row has {len(row)} cells"
-            )
+            raise ValueError(f"table {table.title!r} has {len(table.columns)} columns, a row has {len(row)} cells")
         last = "" if meaning is None else f'<td class="meaning">{escape(meaning)}</td>'
         rows.append(f"<tr>{''.join(map(_cell, row))}{last}</tr>")
     numeric = [all(not isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]

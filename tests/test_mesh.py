@@ -33,9 +33,7 @@ def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene
     rng = np.random.default_rng(seed)
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
-    height = np.stack([0.5 * np.sin(x / 17) + 0.2 * np.cos(y / 11) + 0.05 * k for k in range(5)]).astype(
-        np.float32
-    )
+    height = np.stack([0.5 * np.sin(x / 17) + 0.2 * np.cos(y / 11) + 0.05 * k for k in range(5)]).astype(np.float32)
     road, bay = np.abs(y) < 3.5, (y > 5) & (y < 10) & (x % 20 < 8)
     beside, far = (np.abs(y) >= 3.5) & (np.abs(y) < 6), (np.abs(y) > 6) & (x % 30 < 18)
     occupied = np.stack([road, beside, bay, far, (y < -20) & (x < 20)])
@@ -136,9 +134,7 @@ def test_ground_is_the_fused_surface_at_pixel_centres():
     height, winner = scene.surface()
     row, col = scene.grid.pixel(vertices[:, 0], vertices[:, 1])
     assert len(vertices) == (winner >= 0).sum()
-    assert np.allclose(scene.grid.x_m()[row], vertices[:, 0]) and np.allclose(
-        scene.grid.y_m()[col], vertices[:, 1]
-    )
+    assert np.allclose(scene.grid.x_m()[row], vertices[:, 0]) and np.allclose(scene.grid.y_m()[col], vertices[:, 1])
     assert np.array_equal(vertices[:, 2].astype(np.float32), height[row, col])
     names = np.array(scene.ground_classes)[winner[row, col]]
     assert np.array_equal(class_id, [GROUND_CLASS_ID[name] for name in names])
@@ -161,10 +157,7 @@ def test_diagonal_and_winding_of_one_block():
     height, occupied = np.zeros((5, 2, 2), np.float32), np.zeros((5, 2, 2), bool)
     occupied[0] = True
     one = Scene(
-        **{
-            name: getattr(scene, name)
-            for name in ("scene_id", "source", "sequence", "frame", "split", "category")
-        },
+        **{name: getattr(scene, name) for name in ("scene_id", "source", "sequence", "frame", "split", "category")},
         **{name: getattr(scene, name) for name in ("center_m", "rotation", "size_m", "ground_classes")},
         height_m=height,
         occupied=occupied,

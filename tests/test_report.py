@@ -67,9 +67,7 @@ def sections():
         KeyFigures("Numbers", [Figure(1234567, "scenes", "of <b>town</b>"), Figure(None, "FID")]),
         Pictures("Pictures", [Picture("flat <i>", flat, "real"), Picture("shaded", shaded)], columns=2),
         Charts("Losses", [Chart("a < b", {"x & y": (steps, rng.random(500)), "few": ([0, 9], [1, 2])})]),
-        Table(
-            "Scores", ["metric", "value", "ok"], [["IoU <", 0.51234, True], ["FID", None, False]], ["a", "b"]
-        ),
+        Table("Scores", ["metric", "value", "ok"], [["IoU <", 0.51234, True], ["FID", None, False]], ["a", "b"]),
     ]
 
 
@@ -101,8 +99,7 @@ def test_pictures_survive(sections):
     sources = [attrs["src"] for attrs in Page(report_html("Demo", sections)).all("img")]
     assert sources[0].startswith("data:image/png;") and sources[1].startswith("data:image/webp;")
     decoded = [
-        np.asarray(Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))).convert("RGB"))
-        for source in sources
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))).convert("RGB")) for source in sources
     ]
     assert np.array_equal(decoded[0], flat)  # exact class colours
     assert decoded[1].shape == shaded.shape and np.abs(decoded[1].astype(int) - shaded).mean() < 4

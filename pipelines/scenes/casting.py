@@ -10,7 +10,7 @@ from models.scene import ELLIPSOID, Grid, Scene
 from pipelines.scenes.rasters import _ranges
 
 FILL = 0.95  # of the picture's width or height, whichever is tighter
-BELOW_M, ABOVE_M = 2.0, 11.0  # what a camera frames below and above the ego vehicle's ground
+BELOW_M, ABOVE_M = 2.0, 14.0  # what a camera frames below and above the ego vehicle's ground
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,14 +56,10 @@ def lit_picture(scene: Scene, camera: Camera) -> np.ndarray:
     seen = _surfaces(scene, camera, _joined(_ground(scene), solid), table_z_m)
 
     x, y = camera.view.x_m().astype(np.float32)[:, None], camera.view.y_m().astype(np.float32)[None, :]
-    point = [
-        up * x + left * y + near * seen.depth_m for up, left, near in camera.camera_from_scene.T.tolist()
-    ]
+    point = [up * x + left * y + near * seen.depth_m for up, left, near in camera.camera_from_scene.T.tolist()]
     sun = looking_at(scene.grid, SHADOW_PX, SHADOW_PX, SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG)
     cosine = (seen.normal @ sun.camera_from_scene[2].astype(np.float32)).clip(0)
-    direct = (
-        cosine / sun.camera_from_scene[2, 2].astype(np.float32) * _sunlit(scene, solid, sun, point, cosine)
-    )
+    direct = cosine / sun.camera_from_scene[2, 2].astype(np.float32) * _sunlit(scene, solid, sun, point, cosine)
     sky = (0.65 + 0.35 * seen.normal[..., 2]) * _open_sky(scene, solid, table_z_m, point)
     kept = 1 - _lines(seen)
     light = (direct * kept)[..., None] * SUN + (sky * kept)[..., None] * SKY
@@ -78,9 +74,9 @@ def _surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> S
     """The nearest surface at each pixel: a face, an ellipsoid, or the table beneath everything."""
     turned = camera.turned(faces.corners_m)
     seen = facing(turned)
-    height, hit = cast_down(turned[seen], camera.view)
-    depth = np.where(hit[0] < 0, _table_depth(camera, table_z_m), height[0])
-    hit = hit[0]  # -1, the last row of each of these, is the table
+    (depth,), (hit,) = cast_down(turned[seen], camera.view)
+    depth = np.where(hit < 0, _table_depth(camera, table_z_m), depth)
+    # -1 is the table: the last entry of each list.
     color_id = np.append(faces.color_id[seen], np.uint8(TABLE)).take(hit, mode="wrap")
     part = np.append(faces.part[seen], SCENERY).astype(np.int32).take(hit, mode="wrap")
     normal = np.vstack([_normals(faces.corners_m[seen]), [[0, 0, 1]]]).astype(np.float32)
@@ -109,8 +105,7 @@ def _cuboids(scene: Scene) -> Faces:
 
 
 def _sheet(scene: Scene) -> np.ndarray:
-    """(rows, cols) heights of the plate's nodes, about a metre apart: just below the ground, continued
-    beyond."""
+    """(rows, cols) heights of the plate, a node about every metre: just below the ground, and beyond it level."""
     height, winner = scene.surface()
     if (winner < 0).all():
         return np.zeros((2, 2))
@@ -132,16 +127,14 @@ def _plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
     return Faces(corners, np.full(len(corners), PLATE, np.uint8), np.full(len(corners), SCENERY))
 
 
-def _table_depth(camera: Camera, table_z: float) -> np.ndarray:
-    """(H, 1) depth of the level plane z = table_z at each row of the picture."""
-    up, _, towards = camera.camera_from_scene
-    ahead = np.array([up[2], towards[2]])  # of the vertical: its share of camera x and z
-    return ((table_z - ahead[0] * camera.view.x_m()) / ahead[1])[:, None]
+def _table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
+    """(H, 1) depth of the table at each row of the picture: its scene z is up x + near depth."""
+    up, _, near = camera.camera_from_scene[:, 2]
+    return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 
 
 def _quads(points: np.ndarray) -> np.ndarray:
-    """(2 (r - 1) (c - 1), 3, 3) triangles of a grid of points (r, c, 3), counter-clockwise for x and y
-    falling."""
+    """(2 (r - 1) (c - 1), 3, 3) triangles of a net of points (r, c, 3); facing up where x and y fall."""
     here, right, below, across = points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]
     return np.stack([here, below, right, right, below, across], axis=2).reshape(-1, 3, 3)
 
@@ -160,22 +153,18 @@ def _ellipsoid_normals(
     point = np.stack([view.x_m()[row], view.y_m()[col], depth_m[row, col]], axis=1) @ camera.camera_from_scene
     axes = scene.rotation / scene.size_m[:, None, :] ** 2
     gradient = axes @ scene.rotation.transpose(0, 2, 1)  # R diag(1 / size^2) R^T
-    normal = np.einsum(
-        "kij,kj->ki", gradient[primitive], (point - scene.center_m[primitive]).astype(np.float32)
-    )
+    normal = np.einsum("kij,kj->ki", gradient[primitive], point - scene.center_m[primitive])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def _top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
     """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf where there is none."""
     turned = camera.turned(solid.corners_m)
-    flat, _ = cast_down(turned[facing(turned)], camera.view)
-    return np.maximum(flat[0], cast_ellipsoids(scene, camera)[0]).astype(np.float32)
+    (flat,), _ = cast_down(turned[facing(turned)], camera.view)
+    return np.maximum(flat, cast_ellipsoids(scene, camera)[0]).astype(np.float32)
 
 
-def _sunlit(
-    scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray
-) -> np.ndarray:
+def _sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray) -> np.ndarray:
     """(H, W) share of the sun, 0..1, that reaches each point: a shadow map, softened over its neighbours."""
     blocker = _with_rim(_top(scene, solid, sun), -np.inf)
     x, y, z = (a * point[0] + b * point[1] + c * point[2] for a, b, c in sun.camera_from_scene.tolist())

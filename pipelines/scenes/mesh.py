@@ -68,9 +68,7 @@ def ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     vertex = np.cumsum(occupied).reshape(occupied.shape) - 1
     whole = occupied[:-1, :-1] & occupied[1:, :-1] & occupied[:-1, 1:] & occupied[1:, 1:]
     here, right, below, across = vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, :-1], vertex[1:, 1:]
-    triangles = np.stack([v[whole] for v in (here, below, right, right, below, across)], axis=1).reshape(
-        -1, 3
-    )
+    triangles = np.stack([v[whole] for v in (here, below, right, right, below, across)], axis=1).reshape(-1, 3)
     return vertices, triangles, ground_ids(scene)[winner[occupied]]
 
 
@@ -111,9 +109,7 @@ def scene_glb(scene: Scene) -> bytes:
     category, class id, colour, label, instance id and the exact parameters in its extras. Colours are stored
     in linear light, as glTF demands: a viewer shows the palette's sRGB values.
     """
-    world = trimesh.Scene(
-        metadata={name: getattr(scene, name) for name in ("scene_id", "source", "sequence")}
-    )
+    world = trimesh.Scene(metadata={name: getattr(scene, name) for name in ("scene_id", "source", "sequence")})
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = ground_mesh(scene)
     if len(triangles):

@@ -31,10 +31,10 @@ def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nd
 
     boxes = cuboid_triangles(scene)
     seen = facing(boxes.corners_m)
-    height, hit = cast_down(boxes.corners_m[seen], view)
-    box_id = np.append(boxes.class_id[seen], np.uint8(EMPTY)).take(hit[0], mode="wrap")
-    class_id = np.where(height[0] > top, box_id, class_id)
-    top = np.maximum(top, height[0])
+    (height,), (hit,) = cast_down(boxes.corners_m[seen], view)
+    box_id = np.append(boxes.class_id[seen], np.uint8(EMPTY)).take(hit, mode="wrap")
+    class_id = np.where(height > top, box_id, class_id)
+    top = np.maximum(top, height)
 
     height, _ = cast_ellipsoids(scene, looking_down(view))
     class_id = np.where(height > top, CATEGORY_IDS[ELLIPSOID], class_id)
