@@ -22,8 +22,8 @@ SQUEEZE = 0.4  # share of the last plot of a row that its neighbours make room f
 SIZES = {
     "building": ((16, 12, 11), 0.16, 0.14, (8, 6.5, 4), (34, 22, 24)),
     "garage": ((8, 6.4, 3.4), 0.10, 0.08, (5, 3, 2.4), (12, 9, 5)),
-    "tree": ((6.4, 5.7, 7.6), 0.36, 0.16, (1.2, 1.0, 1.0), (16, 15, 16)),
-    "bush": ((3.9, 3.3, 3.4), 0.35, 0.20, (0.8, 0.8, 0.6), (8, 7, 6)),
+    "tree": ((6.7, 6.0, 8.0), 0.36, 0.16, (1.2, 1.0, 1.0), (16, 15, 16)),
+    "bush": ((4.2, 3.6, 3.8), 0.35, 0.20, (0.8, 0.8, 0.6), (8, 7, 6)),
     "hedge": ((5.0, 1.5, 1.9), 0.15, 0.42, (1.7, 0.6, 0.6), (15, 3.4, 4.5)),
     "shrub": ((4.9, 2.7, 2.0), 0.30, 0.28, (0.9, 0.7, 0.4), (14, 9, 6)),
     "wall": ((3.5, 0.75, 1.5), 0.05, 0.48, (0.9, 0.2, 0.5), (14, 1.6, 4)),
@@ -99,10 +99,10 @@ def random_mood(rng: np.random.Generator) -> Mood:
         return float(rng.gamma(shape) / shape)
 
     size, room = np.exp(rng.normal(0, [0.13, 0.16])).tolist()
-    if rng.random() < 0.13:  # a terrace of narrow houses
+    if rng.random() < 0.22:  # a terrace of narrow houses
         room = 0.5
-    vacant = 0.5 if rng.random() < 0.11 else 0.02
-    return Mood(room, vacant, gamma(1.2), gamma(9), gamma(9), size, gamma(4), gamma(3), gamma(5), gamma(2), gamma(1), gamma(1.2))
+    vacant = 0.5 if rng.random() < 0.1 else 0.02
+    return Mood(room, vacant, gamma(1.2), gamma(9), gamma(9), size, gamma(6), gamma(3), gamma(5), gamma(3), gamma(1), gamma(1.2))
 
 
 def sizes(rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0) -> np.ndarray:
@@ -129,7 +129,7 @@ def furnish(sheet: Sheet, rng: np.random.Generator, block: Block, district: Dist
     if whole and use < district.parks:
         _park(sheet, rng, _interior(block, depths), district, mood)
     elif whole and use < district.parks + district.courts and min(width, height) > 45:
-        fill = _garage_court if rng.random() < 0.4 else _court
+        fill = _garage_court if rng.random() < 0.6 else _court
         fill(sheet, rng, _interior(block, depths), district, mood)
     else:
         rows = (0, 2) if width >= height else (1, 3)
@@ -583,30 +583,30 @@ def _garage_court(sheet, rng, interior, district: District, mood: Mood) -> None:
 
 
 def _court(sheet, rng, interior, district: District, mood: Mood) -> None:
-    """A large building behind its car park, with rows of cars, some trees and a wall at the back."""
+    """A large building behind its car park, with rows of cars, a garden and a wall at the back."""
     frame, width, depth = interior
-    deep = min(22.0, depth * 0.36)
-    lot = float(rng.uniform(17.0, 20.0))
-    big = np.array([min(width * 0.62, 44.0), deep, float(rng.uniform(6, 14))])
-    top = depth - deep / 2 - 3
-    sheet.boxes(frame, "building", width * 0.45, top, big, 0.0, -0.2)
+    lot = float(rng.uniform(16.0, 19.0))
     beds = np.linspace(0, width, max(2, round(width / 22)) + 1).tolist()
     for a, b in zip(beds[:-1], beds[1:], strict=True):
-        sheet.slab(frame, "parking", [(a, 2.5), (b, 2.5), (b, 2.5 + lot), (a, 2.5 + lot)])
         sheet.slab(frame, "terrain", [(a, 0), (b, 0), (b, 2.5), (a, 2.5)])
-        if rng.random() < 0.6:
-            sheet.slab(frame, "ground", [(a, 2.5 + lot), (b, 2.5 + lot), (b, top - deep / 2), (a, top - deep / 2)])
+        sheet.slab(frame, "parking", [(a, 2.5), (b, 2.5), (b, 2.5 + lot), (a, 2.5 + lot)])
+    _garden(sheet, rng, frame, width, 2.5, [], district, mood, lush=2.0)
     slots = np.arange(2.0, width - 2.0, 2.75)
     for t, yaw in ((5.1, np.pi / 2), (lot, -np.pi / 2)):
         taken = rng.random(len(slots)) < min(0.8, 0.25 * mood.cars)
         _cars(sheet, rng, frame, slots[taken], t, yaw)
-    strip = frame.at(0.0, 0.0)
-    _garden(sheet, rng, strip, width, 2.5, [], district, mood, lush=2.0)
-    _border(sheet, rng, frame, 0.5, depth - 0.6, width - 0.5, depth - 0.6, "wall", 0.8)
-    _border(sheet, rng, frame, width - 0.5, lot + 3, width - 0.5, depth - 1, "hedge", 0.7)
-    side = frame.at(width * 0.45 + big[0] / 2 + 1, lot + 4)
-    left = width - (width * 0.45 + big[0] / 2 + 2)
-    if left > 4:
-        _garden(sheet, rng, side, left, depth - lot - 5, [], district, mood)
-    if rng.random() < 0.15:
-        sheet.boxes(frame, "truck", width * 0.5, top - deep / 2 - 2.2, sizes(rng, "truck", 1), 0.0)
+
+    yard, behind = frame.at(0.0, 2.5 + lot), depth - 2.5 - lot
+    forecourt, deep = min(6.0, behind * 0.2), min(20.0, behind * 0.6)
+    big = np.array([min(width * 0.6, 44.0), deep, float(rng.uniform(6, 14))])
+    middle = width * float(rng.uniform(0.45, 0.55))
+    house = (middle - big[0] / 2, middle + big[0] / 2, forecourt, forecourt + deep)
+    sheet.boxes(yard, "building", middle, forecourt + deep / 2, big, 0.0, -0.2)
+    paved = (house[0] - 2.0, house[1] + 2.0, 0.0, forecourt)
+    lawn = TERRAIN if rng.random() < district.terrain_back else NOTHING
+    _paint(sheet, yard, width, behind, lawn, lawn, behind, [(GROUND, paved), (NOTHING, house)])
+    _garden(sheet, rng, yard, width, behind, [house, paved], district, mood)
+    _border(sheet, rng, yard, 0.5, behind - 0.6, width - 0.5, behind - 0.6, "wall", 0.8)
+    _border(sheet, rng, yard, width - 0.5, 1.0, width - 0.5, behind - 1, "hedge", 0.7)
+    if rng.random() < 0.2:
+        sheet.boxes(yard, "truck", middle, -2.0, sizes(rng, "truck", 1), 0.0)
