@@ -52,7 +52,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
     """Encodes layouts into a (2 c, h, w) latent and decodes them back.
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
-    2^(len(channels) - 1).
+    (fold 2^(len(channels) - 1)).
     """
 
     @register_to_config
@@ -62,6 +62,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         latent_channels: int = 32,
         channels: tuple[int, ...] = (64, 128, 256, 512),
         norm_groups: int = 32,
+        fold: int = 1,
         width: int = 512,
         layers: int = 6,
         heads: int = 8,
@@ -70,11 +71,11 @@ class LayoutVAE(ModelMixin, ConfigMixin):
     ) -> None:
         super().__init__()
         spec = LayoutSpec.from_dict(layout)
-        factor = 2 ** (len(channels) - 1)
+        factor = fold * 2 ** (len(channels) - 1)
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % factor:
             raise ValueError(f"LayoutVAE needs a square grid divisible by {factor}, got {spec.grid}")
         size, num_classes = spec.grid.rows // factor, len(spec.ground_classes)
-        ground = (num_classes, latent_channels, tuple(channels), norm_groups)
+        ground = (num_classes, latent_channels, tuple(channels), norm_groups, fold)
         self.ground_encoder, self.ground_decoder = GroundEncoder(*ground), GroundDecoder(*ground)
         self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
         self.object_decoder = ObjectDecoder(

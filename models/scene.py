@@ -193,13 +193,15 @@ class Scene:
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """The fused ground (paper, supplement B.2, Layout Reconstruction): at each pixel the highest class wins.
 
-        Returns height_m (H, W) and ground_class (H, W) int8, index into ground_classes, -1 where there is none.
+        Of equal heights the later class wins: a crossing lies on its road. Returns height_m (H, W) and ground_class
+        (H, W) int8, index into ground_classes, -1 where there is none.
         """
-        height = np.where(self.occupied, self.height_m, -np.inf)
-        winner = height.argmax(axis=0).astype(np.int8)
-        top = np.take_along_axis(height, winner[None].astype(np.int64), axis=0)[0]
-        empty = ~np.isfinite(top)
-        return np.where(empty, 0.0, top).astype(np.float32), np.where(empty, np.int8(-1), winner)
+        top = np.full(self.height_m.shape[1:], -np.inf, np.float32)
+        winner = np.full(top.shape, -1, np.int8)
+        for k, (height, occupied) in enumerate(zip(self.height_m, self.occupied, strict=True)):
+            higher = occupied & (height >= top)
+            top[higher], winner[higher] = height[higher], k
+        return np.where(winner < 0, np.float32(0), top), winner
 
     def select(self, keep: np.ndarray) -> Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""

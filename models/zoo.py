@@ -15,6 +15,7 @@ class LVAEPreset:
     latent_channels: int  # per branch
     channels: tuple[int, ...]  # ground branch; all but the last halve the resolution
     norm_groups: int
+    fold: int  # pixels that become channels first; 1 in the paper
     width: int
     layers: int
     heads: int
@@ -31,20 +32,20 @@ class LVAEPreset:
 
     def architecture(self) -> dict:
         """Keyword arguments of `LayoutVAE` apart from the layout."""
-        names = ("latent_channels", "channels", "norm_groups", "width", "layers", "heads", "hidden", "head_hidden")
+        names = ("latent_channels", "channels", "norm_groups", "fold", "width", "layers", "heads", "hidden", "head_hidden")
         return {name: getattr(self, name) for name in names}
 
 
 # fmt: off
 LVAE_PRESETS = {
-    #                       source      px   c   channels             groups width layers heads hidden head batch  steps
-    "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     32,   1,     2,    64,    32,  4,     8,
+    #                       source      px   c   channels             groups fold width layers heads hidden head batch  steps
+    "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     1,   32,   1,     2,    64,    32,  4,     8,
                            learning_rate=1e-3, final_learning_rate=1e-4),
-    "town":     LVAEPreset("town",      128, 16, (16, 32, 64, 128),   8,     128,  2,     4,    256,   128, 16,    20_000,
+    "town":     LVAEPreset("town",      128, 16, (64, 128),           8,     4,   128,  2,     4,    256,   128, 16,    20_000,
                            learning_rate=1e-3, final_learning_rate=1e-5, grad_clip=1.0),
     # The paper gives three days on one A100, not a number of steps.
-    "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    512,  6,     8,    1024,  1024, 32,   300_000),
-    "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    512,  6,     8,    1024,  1024, 32,   300_000),
+    "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
+    "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
 }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.scenes.rasters import _ranges
+from pipelines.scenes.rasters import ranges
 
 FILL = 0.95  # of the picture's width or height, whichever is tighter
 BELOW_M, ABOVE_M = 2.0, 14.0  # what a camera frames below and above the ego vehicle's ground
@@ -99,4 +99,4 @@ def _pixel_spans(middle: np.ndarray, reach: np.ndarray, count: int) -> tuple[np.
     """All integers in [0, count) within middle[i] ± reach[i], and the i of each."""
     first = np.ceil(middle - reach).clip(0, count).astype(np.int64)
     beyond = (np.floor(middle + reach).clip(-1, count - 1) + 1).astype(np.int64)
-    return _ranges(first, (beyond - first).clip(0))
+    return ranges(first, (beyond - first).clip(0))

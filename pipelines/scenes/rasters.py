@@ -14,7 +14,7 @@ from models.scene import Grid
 EDGE_PX = 1e-7  # a centre this close to an edge is inside: abutting triangles leave no crack
 
 
-def _ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Concatenated integer ranges first[i] .. first[i] + count[i] - 1, with the owner i of each value."""
     owner = np.repeat(np.arange(len(count)), count)
     start = np.cumsum(count) - count
@@ -29,7 +29,7 @@ def _row_spans(u: np.ndarray, v: np.ndarray, rows: int) -> tuple[np.ndarray, np.
     """
     first = np.ceil(u.min(axis=1) - EDGE_PX).clip(0, rows).astype(np.int64)
     last = np.floor(u.max(axis=1) + EDGE_PX).clip(-1, rows - 1).astype(np.int64)
-    row, triangle = _ranges(first, (last - first + 1).clip(0))
+    row, triangle = ranges(first, (last - first + 1).clip(0))
     low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         ua, ub, va, vb = u[triangle, a], u[triangle, b], v[triangle, a], v[triangle, b]
@@ -71,7 +71,7 @@ def cast_down(
     row, triangle, low, high = _row_spans(u, v, grid.rows)
     first = np.ceil(low - EDGE_PX).clip(0, grid.cols)
     count = (np.floor(high + EDGE_PX).clip(-1, grid.cols - 1) - first + 1).clip(0)
-    col, span = _ranges(first.astype(np.int64), count.astype(np.int64))
+    col, span = ranges(first.astype(np.int64), count.astype(np.int64))
     row, triangle = row[span], triangle[span]
     value = z[triangle, 0] + slope_u[triangle] * (row - u[triangle, 0]) + slope_v[triangle] * (col - v[triangle, 0])
     # Planes of sliver triangles are steep: keep a hit within its own triangle's heights.
@@ -94,7 +94,7 @@ def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
     beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)  # half-open: a vertex on a row counts once
-    row, edge = _ranges(first, beyond - first)
+    row, edge = ranges(first, beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])
     col = np.ceil(crossing).clip(0, grid.cols).astype(np.int64)
     toggles = np.bincount(row * (grid.cols + 1) + col, minlength=grid.rows * (grid.cols + 1))
