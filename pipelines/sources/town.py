@@ -12,7 +12,9 @@ import numpy as np
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.sources.drive import STATIC, Drive, SlabGround
-from pipelines.sources.town_blocks import District, Mood, furnish, random_mood, sizes
+from pipelines.sources.town_blocks import furnish
+from pipelines.sources.town_districts import DISTRICTS, Mood, random_mood
+from pipelines.sources.town_kitti360 import write_kitti360
 from pipelines.sources.town_land import (
     SLAB_THICKNESS_M,
     Frame,
@@ -22,23 +24,35 @@ from pipelines.sources.town_land import (
     random_land,
     subdivided,
 )
-from pipelines.sources.town_kitti360 import write_kitti360
 from pipelines.sources.town_streets import Route, blocks_of, drive_route, lay_streets, pave
 from pipelines.sources.town_targets import TARGETS, measure, sample_of
+from pipelines.sources.town_things import Site, sizes
 
-__all__ = ["TEST_SEEDS_START", "TOWN_VERSION", "TRAIN_SEEDS_START", "measure", "sample_of", "take", "town_drive", "town_plan"]
-__all__ += ["TARGETS", "write_kitti360"]
+__all__ = [
+    "TARGETS",
+    "TEST_SEEDS_START",
+    "TOWN_VERSION",
+    "TRAIN_SEEDS_START",
+    "measure",
+    "sample_of",
+    "take",
+    "town_drive",
+    "town_plan",
+    "write_kitti360",
+]
 
 TOWN_VERSION = 1
 TRAIN_SEEDS_START = 0
 TEST_SEEDS_START = 1_000_000
 MAX_POSES = 256
+SCENES_PER_TOWN = 200  # every town has at least this many poses
 POSE_SPACING_M = 10.0
 IMU_HEIGHT_M = 0.93  # above the true surface of the road, as KITTI-360's
 METRES_PER_FRAME = 0.7
 
 # KITTI-360's own names (its XML spelling) -> our categories; vegetation is told apart by its shape.
 LABEL_CATEGORY = {
+    "vegetation": "vegetation_cuboid",
     "truck": "vehicle_big",
     "bus": "vehicle_big",
     "car": "vehicle_small",
@@ -60,102 +74,6 @@ LABEL_CATEGORY = {
     "box": "object",
 }
 
-# Tuned on 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1).
-DISTRICTS = {
-    "centre": District(
-        house_scale=(1.15, 1.13, 1.03),
-        setback_m=1.2,
-        gap_m=(0.1, 1.0),
-        garages=1.0,
-        terrain_front=0.75,
-        terrain_back=0.26,
-        court_front=0.35,
-        rough_drives=0.8,
-        terrace=0.9,
-        sidewalks=0.97,
-        bays=0.0,
-        curb_parking=0.686,
-        driveway_cars=0.3,
-        parks=0.0,
-        courts=0.04,
-        hedges=0.2,
-        walls=0.19,
-        shrubs_per_100m2=0.251,
-        bushes_per_100m2=0.265,
-        trees_per_100m2=0.261,
-        street_trees_per_100m=1.0,
-        tree_scale=0.95,
-        lamps_per_100m=2.041,
-        signs_per_100m=0.399,
-        lights=0.05,
-        things_per_plot=0.309,
-        bicycles_per_plot=0.05,
-        people_per_100m=0.02,
-        trucks_per_100m=0.1,
-    ),
-    "suburb": District(
-        house_scale=(1.13, 1.1, 1.0),
-        setback_m=2.7,
-        gap_m=(0.4, 1.7),
-        garages=1.05,
-        terrain_front=0.97,
-        terrain_back=0.93,
-        court_front=0.25,
-        rough_drives=0.08,
-        terrace=1.0,
-        sidewalks=0.92,
-        bays=0.12,
-        curb_parking=0.5,
-        driveway_cars=0.4,
-        parks=0.03,
-        courts=0.15,
-        hedges=0.9,
-        walls=0.483,
-        shrubs_per_100m2=3.556,
-        bushes_per_100m2=2.564,
-        trees_per_100m2=2.443,
-        street_trees_per_100m=3.0,
-        tree_scale=0.95,
-        lamps_per_100m=2.75,
-        signs_per_100m=2.05,
-        lights=0.1,
-        things_per_plot=0.72,
-        bicycles_per_plot=0.022,
-        people_per_100m=0.002,
-        trucks_per_100m=0.1,
-    ),
-    "green": District(
-        house_scale=(1.12, 1.1, 1.0),
-        setback_m=5.5,
-        gap_m=(1.5, 4.0),
-        garages=0.75,
-        terrain_front=0.95,
-        terrain_back=0.6,
-        court_front=0.05,
-        rough_drives=0.2,
-        terrace=0.5,
-        sidewalks=0.92,
-        bays=0.18,
-        curb_parking=0.258,
-        driveway_cars=0.3,
-        parks=0.2,
-        courts=0.08,
-        hedges=0.9,
-        walls=1.085,
-        shrubs_per_100m2=3.934,
-        bushes_per_100m2=2.0,
-        trees_per_100m2=2.076,
-        street_trees_per_100m=4.0,
-        tree_scale=1.12,
-        lamps_per_100m=3.045,
-        signs_per_100m=2.856,
-        lights=0.05,
-        things_per_plot=2.226,
-        bicycles_per_plot=0.718,
-        people_per_100m=0.793,
-        trucks_per_100m=0.08,
-    ),
-}
 # A town's main district and the one at its edge, by seed modulo 4: any four towns in a row show all of them.
 TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
 SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
@@ -183,7 +101,7 @@ def town_drive(seed: int) -> Drive:
     for block in blocks_of(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=48.0):
         mood = random_mood(rng)
         mood = Mood(*(np.array(list(vars(mood).values())) * mood_of_town).tolist())
-        furnish(sheet, rng, block, DISTRICTS[block.kind], mood)
+        furnish(Site(sheet, rng, DISTRICTS[block.kind], mood), block)
 
     route = drive_route(rng, streets)
     at = _pose_samples(rng, route, land)
@@ -210,15 +128,12 @@ def town_plan(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> 
     for split, wanted, start in (("train", num_train, TRAIN_SEEDS_START), ("test", num_test, TEST_SEEDS_START)):
         if wanted < 0:
             raise ValueError(f"number of {split} scenes is {wanted}; ask for 0 or more")
-        towns = max(-(-wanted // SCENES_PER_TOWN), min(16, -(-wanted // 6)))
+        towns = max(-(-wanted // SCENES_PER_TOWN), min(24, -(-wanted // 6)))
         towns = -(-towns // len(TOWN_KINDS)) * len(TOWN_KINDS) if wanted >= len(TOWN_KINDS) else wanted
         share = np.diff(np.linspace(0, wanted, towns + 1).round().astype(int)) if towns else []
         first = start + seed * 10_000
         plan += [(first + k, split, int(n)) for k, n in enumerate(share)]
     return plan
-
-
-SCENES_PER_TOWN = 200  # every town has at least this many poses
 
 
 def take(num_poses: int, num_scenes: int) -> np.ndarray:
@@ -228,7 +143,7 @@ def take(num_poses: int, num_scenes: int) -> np.ndarray:
     """
     if num_scenes > num_poses:
         raise ValueError(f"{num_scenes} scenes wanted of a drive with {num_poses} poses; plan more towns")
-    return (np.arange(num_scenes) + 0.5).__mul__(num_poses / max(1, num_scenes)).astype(np.int64)
+    return ((np.arange(num_scenes) + 0.5) * num_poses / max(1, num_scenes)).astype(np.int64)
 
 
 # ---------------------------------------------------------------- the drive
@@ -313,9 +228,8 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
 def _boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
     """The Drive's arrays of primitives: placed on the surface and turned with the streets."""
     rows, label = np.concatenate(sheet.box_rows), np.array(sheet.box_label, dtype=object)
-    ellipsoid = rows[:, 8] > 0
-    names = ["vegetation_ellipsoid" if e else LABEL_CATEGORY.get(b, "vegetation_cuboid") for b, e in zip(label, ellipsoid)]
-    category = np.array([CATEGORY_INDEX[n] for n in names], np.int8)
+    category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
+    category[rows[:, 8] > 0] = CATEGORY_INDEX["vegetation_ellipsoid"]
     xy = land.xy(rows[:, :2])
     along = land.direction(rows[:, :2], rows[:, 2:4])
     grade = land.grade(xy)

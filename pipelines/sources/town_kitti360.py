@@ -17,7 +17,13 @@ from pipelines.sources.drive import STATIC, Drive, SlabGround
 
 WINDOW_POSES = 20  # an annotation window covers about 200 m of a drive of a pose every 10 m
 # Our ground class -> its name in the XML. Traps: "ground" is terrain, "unknownGround" is ground.
-XML_GROUND = {"road": "road", "sidewalk": "sidewalk", "parking": "driveway", "terrain": "ground", "ground": "unknownGround"}
+XML_GROUND = {
+    "road": "road",
+    "sidewalk": "sidewalk",
+    "parking": "driveway",
+    "terrain": "ground",
+    "ground": "unknownGround",
+}
 # Labels that no category takes, sprinkled among the objects.
 STRAY_LABELS = ("stop", "caravan", "sky", "vendingmachine", "railtrack", "train")
 
@@ -61,7 +67,8 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     """
     rng = np.random.default_rng([7302, seed])
     name = f"2013_05_28_drive_{int(drive.sequence) % 10_000:04d}_sync"
-    boxes, slabs, poses = Path(root) / "data_3d_bboxes" / "train_full", _slabs(drive.ground), Path(root) / "data_poses" / name
+    boxes, poses = Path(root) / "data_3d_bboxes" / "train_full", Path(root) / "data_poses" / name
+    slabs = _slabs(drive.ground)
     boxes.mkdir(parents=True, exist_ok=True)
     poses.mkdir(parents=True, exist_ok=True)
 
@@ -99,7 +106,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     with open(boxes / f"{name}.xml", "w", encoding="ascii") as file:
         file.write('<?xml version="1.0"?>\n<opencv_storage>\n')
         for number, (index, fields) in enumerate(objects, 1):
-            items = list(({"index": f"<index>{index}</index>"} | {k: _element(k, v) for k, v in fields.items()}).values())
+            items = [_element(tag, content) for tag, content in ({"index": str(index)} | fields).items()]
             if defects and rng.random() < 0.2:
                 items = [items[k] for k in rng.permutation(len(items))]
             file.write(f"<object{number}>\n" + "\n".join(items) + f"\n</object{number}>\n")
@@ -184,7 +191,7 @@ def _matrix(values: np.ndarray | None, kind: str = "f") -> str:
     """The inside of an OpenCV matrix element; None is an empty one."""
     rows, cols = (0, 0) if values is None else values.shape
     flat = [] if values is None else values.ravel().tolist()
-    data = " ".join(["%d" % v for v in flat] if kind == "u" else ["%.8e" % v for v in flat])
+    data = " ".join([f"{v:d}" if kind == "u" else f"{v:.8e}" for v in flat])
     return f"\n<rows>{rows}</rows>\n<cols>{cols}</cols>\n<dt>{kind}</dt>\n<data>\n{data} </data>"
 
 

@@ -107,7 +107,9 @@ class Sheet:
     def __init__(self) -> None:
         self.slabs: list[tuple[str, np.ndarray]] = []  # ground class, outline (n, 2), any turning sense
         self.box_label: list[str] = []
-        self.box_rows: list[np.ndarray] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, flag columns below
+        self.box_rows: list[
+            np.ndarray
+        ] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, ellipsoid, timestamp, track
 
     def slab(self, frame: Frame, ground_class: str, outline_st: list[tuple[float, float]]) -> None:
         """A slab by its outline in (s, t)."""

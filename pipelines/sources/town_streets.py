@@ -6,7 +6,9 @@ All on the drawing board (see town_land): u-streets run along v at a constant u,
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -106,7 +108,12 @@ def lay_streets(
     return Streets(u, v, half_u, half_v, frozenset(edges), corner), sorted(cells)
 
 
-def blocks_of(streets: Streets, cells: list[tuple[int, int, int, int]], kind_at, outskirts_m: float) -> list[Block]:
+def blocks_of(
+    streets: Streets,
+    cells: list[tuple[int, int, int, int]],
+    kind_at: Callable[[float, float], str],
+    outskirts_m: float,
+) -> list[Block]:
     """The blocks between the streets, and a ring of blocks of depth outskirts_m outside the outermost ones.
 
     kind_at(u, v) names the district of a board point.
@@ -145,7 +152,7 @@ def pave(streets: Streets, sheet: Sheet) -> None:
         middle = streets.v_m[a[1]] if axis == 0 else streets.u_m[a[0]]
         half = streets.half_v_m[a[1]] if axis == 0 else streets.half_u_m[a[0]]
         cuts = np.linspace(start, end, max(1, round((end - start) / ROAD_SLAB_M)) + 1)
-        for low, high in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+        for low, high in pairwise(cuts.tolist()):
             corners = [(low, middle - half), (high, middle - half), (high, middle + half), (low, middle + half)]
             sheet.slab(BOARD, "road", corners if axis == 0 else [(y, x) for x, y in corners])
     for node in sorted(streets.corner_m):
@@ -163,15 +170,15 @@ def junction_outline(streets: Streets, node: Node) -> list[tuple[float, float]]:
         along_first = (hu + r, hv) if quadrant % 2 == 0 else (hu, hv + r)
         along_second = (hu, hv + r) if quadrant % 2 == 0 else (hu + r, hv)
         if first and second:
-            local = _kerb(hu, hv, r)
-            local = local if quadrant % 2 == 0 else local[::-1]
+            local = kerb(hu, hv, r)[:: 1 if quadrant % 2 == 0 else -1]
         else:
             local = [along_first] * first + [(hu, hv)] + [along_second] * second
         points += [(float(u + su * x), float(v + sv * y)) for x, y in local]
     return points
 
 
-def _kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
+def kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
+    """A quarter circle of radius r round a block's corner, as seen from a junction with half-widths hu and hv."""
     angle = np.linspace(1.5 * np.pi, np.pi, 5)  # from the arm along u to the arm along v
     return list(zip((hu + r + r * np.cos(angle)).tolist(), (hv + r + r * np.sin(angle)).tolist(), strict=True))
 
@@ -189,7 +196,7 @@ def drive_route(rng: np.random.Generator, streets: Streets) -> Route:
     """A route on the right-hand lanes that passes every street at least once."""
     nodes = _walk(rng, streets)
     uv, lane = [], []
-    for k, (a, b) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
+    for k, (a, b) in enumerate(pairwise(nodes)):
         start, end, aside = _lane(streets, a, b)
         if k:
             uv.append(_turn(uv[-1][-1], _direction(nodes[k - 1], a), start, _direction(a, b)))

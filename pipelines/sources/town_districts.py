@@ -1,0 +1,186 @@
+"""The kinds of neighbourhood a town is made of, as data: what differs between districts and between their blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class District:
+    """How one kind of neighbourhood looks. Shares are probabilities; `per_100m2` and `per_100m` are intensities."""
+
+    house_scale: tuple[float, float, float]
+    setback_m: float  # median from sidewalk to house
+    gap_m: tuple[float, float]  # free ground between houses beside driveways
+    garages: float
+    terrain_front: float
+    terrain_back: float
+    court_front: float  # share of front yards that are paved
+    rough_drives: float  # share of driveways that are ground rather than parking
+    terrace: float
+    sidewalks: float
+    bays: float
+    curb_parking: float  # mean share of curb slots taken
+    driveway_cars: float
+    parks: float
+    courts: float  # share of blocks with a big building and its car park
+    hedges: float  # share of plot borders that are hedges
+    walls: float  # share that are walls or fences
+    shrubs_per_100m2: float
+    bushes_per_100m2: float
+    trees_per_100m2: float
+    street_trees_per_100m: float
+    tree_scale: float
+    lamps_per_100m: float
+    signs_per_100m: float
+    lights: float  # share of street corners with a traffic light
+    things_per_plot: float  # bins and boxes
+    bicycles_per_plot: float
+    people_per_100m: float
+    trucks_per_100m: float
+
+
+# Tuned on 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1).
+DISTRICTS = {
+    "centre": District(
+        house_scale=(1.16, 1.14, 1.03),
+        setback_m=1.2,
+        gap_m=(0.1, 1.0),
+        garages=1.1,
+        terrain_front=0.75,
+        terrain_back=0.26,
+        court_front=0.35,
+        rough_drives=0.8,
+        terrace=0.9,
+        sidewalks=0.97,
+        bays=0.0,
+        curb_parking=0.686,
+        driveway_cars=0.3,
+        parks=0.0,
+        courts=0.04,
+        hedges=0.2,
+        walls=0.19,
+        shrubs_per_100m2=0.208,
+        bushes_per_100m2=0.265,
+        trees_per_100m2=0.261,
+        street_trees_per_100m=1.0,
+        tree_scale=0.95,
+        lamps_per_100m=2.143,
+        signs_per_100m=0.359,
+        lights=0.05,
+        things_per_plot=0.321,
+        bicycles_per_plot=0.05,
+        people_per_100m=0.01,
+        trucks_per_100m=0.1,
+    ),
+    "suburb": District(
+        house_scale=(1.14, 1.12, 1.0),
+        setback_m=2.7,
+        gap_m=(0.3, 1.5),
+        garages=1.2,
+        terrain_front=0.97,
+        terrain_back=0.93,
+        court_front=0.25,
+        rough_drives=0.08,
+        terrace=1.0,
+        sidewalks=0.92,
+        bays=0.12,
+        curb_parking=0.5,
+        driveway_cars=0.4,
+        parks=0.03,
+        courts=0.15,
+        hedges=0.9,
+        walls=0.469,
+        shrubs_per_100m2=3.485,
+        bushes_per_100m2=2.564,
+        trees_per_100m2=2.443,
+        street_trees_per_100m=3.0,
+        tree_scale=0.95,
+        lamps_per_100m=2.75,
+        signs_per_100m=2.05,
+        lights=0.1,
+        things_per_plot=0.684,
+        bicycles_per_plot=0.02,
+        people_per_100m=0.0,
+        trucks_per_100m=0.1,
+    ),
+    "green": District(
+        house_scale=(1.14, 1.12, 1.0),
+        setback_m=5.5,
+        gap_m=(1.5, 4.0),
+        garages=0.78,
+        terrain_front=0.95,
+        terrain_back=0.52,
+        court_front=0.05,
+        rough_drives=0.2,
+        terrace=0.5,
+        sidewalks=0.92,
+        bays=0.18,
+        curb_parking=0.258,
+        driveway_cars=0.3,
+        parks=0.17,
+        courts=0.08,
+        hedges=0.9,
+        walls=1.031,
+        shrubs_per_100m2=3.934,
+        bushes_per_100m2=2.0,
+        trees_per_100m2=2.014,
+        street_trees_per_100m=4.0,
+        tree_scale=1.12,
+        lamps_per_100m=3.136,
+        signs_per_100m=3.027,
+        lights=0.05,
+        things_per_plot=2.501,
+        bicycles_per_plot=0.54,
+        people_per_100m=0.743,
+        trucks_per_100m=0.08,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Mood:
+    """What makes one block differ from the next of its district: factors of mean 1."""
+
+    room: float  # of plots: houses and the gaps between them
+    vacant: float  # share of plots without a house
+    garages: float
+    green: float
+    trees: float
+    tree_size: float
+    walls: float
+    cars: float
+    furniture: float
+    things: float
+    bicycles: float
+    people: float
+
+
+def random_mood(rng: np.random.Generator) -> Mood:
+    """A block's Mood. The gammas' shapes are what makes counts over-dispersed: 1 is widest."""
+
+    def gamma(shape: float) -> float:
+        return float(rng.gamma(shape) / shape)
+
+    size, room = np.exp(rng.normal(0, [0.13, 0.16])).tolist()
+    if rng.random() < 0.22:  # a terrace of narrow houses
+        room = 0.46
+    vacant = 0.6 if rng.random() < 0.13 else 0.02
+    green = gamma(9)
+    outdoors = green**2  # where it is green, people are out and ride
+    return Mood(
+        room=room,
+        vacant=vacant,
+        garages=gamma(0.8),
+        green=green,
+        trees=gamma(9),
+        tree_size=size,
+        walls=gamma(6),
+        cars=gamma(3),
+        furniture=gamma(6),
+        things=gamma(4),
+        bicycles=gamma(1.5) * outdoors,
+        people=gamma(1.2) * outdoors,
+    )
