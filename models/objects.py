@@ -110,9 +110,10 @@ class ObjectEncoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch n 9"], real: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch moments h w"]:
-        batch, n, _ = features.shape
+        features, real, category = self.without_padding(features, real)
+        batch = len(features)
         moments, rows, cols = self.grid.shape
-        category = self.category(self.slot_category).expand(batch, -1, -1)  # (b, n, 10)
+        category = self.category(category)  # (b, n, 10)
         x = self.project_in(torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1))  # (b, n, d)
         # A scene without primitives may attend to its first padding: nothing of it is scattered.
         visible = real.clone()
@@ -126,6 +127,16 @@ class ObjectEncoder(nn.Module):
         count = x.new_zeros(batch, rows * cols).scatter_add_(1, cell, real.to(x.dtype))
         mean = total / count.clamp(min=1)[..., None]
         return self.grid + mean.transpose(1, 2).unflatten(2, (rows, cols))
+
+    def without_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Features, padding flags and categories with real primitives first, cut to the fullest scene of the batch.
+
+        Masked slots change nothing but cost as much as real ones: half of the paper's 514 are empty on average.
+        """
+        most = max(int(real.sum(dim=1).max()), 1)
+        order = real.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :most]  # (b, most)
+        picked = features.gather(1, order[..., None].expand(-1, -1, features.shape[-1]))
+        return picked, real.gather(1, order), self.slot_category[order]
 
 
 def sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]:

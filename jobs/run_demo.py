@@ -1,0 +1,135 @@
+#!/usr/bin/env python3
+"""The main job on the built-in town, start to finish: preprocess -> train LVAE -> encode -> train DiT -> sample ->
+outpaint once -> evaluate -> report.html. No data, no GPU, no network.
+
+    jobs/run_demo.py                        15 minutes on two cores, everything under runs/demo
+    jobs/run_demo.py --lvae-steps 20000 --dit-steps 50000 --output DIR       longer is better
+
+Run it again to go on after an interruption.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from jobs.command import absolute, run, start_ray
+
+
+@dataclass(frozen=True)
+class Config:
+    output: str = "runs/demo"
+    """Where everything goes: data, runs, models, MLflow, report.html."""
+    preset: str = "town"
+    """Model preset; smoke shows the mechanism in two minutes."""
+    num_train: int = 1200
+    num_test: int = 200
+    lvae_steps: int = 400
+    dit_steps: int = 600
+    num_scenes: int = 48
+    """Scenes to generate."""
+    sampling_steps: int = 100
+    """Denoising steps (the paper: 250)."""
+    outpaint_steps: int = 50
+    """Denoising steps of outpainting (the paper: 250)."""
+    resamplings: int = 2
+    """Resamplings of outpainting (the paper: 10)."""
+    actors: int = 1
+    seed: int = 0
+
+
+class Stages:
+    """Runs stages one after the other, says so, and keeps their times over interruptions."""
+
+    def __init__(self, path: str, total: int) -> None:
+        from pipelines import storage
+
+        self.path, self.total, self.started = path, total, time.perf_counter()
+        self.seconds: dict[str, float] = storage.read_json(path) if storage.exists(path) else {}
+        self.done = 0
+
+    def run(self, name: str, work: Callable[[], Any]) -> Any:
+        from pipelines import storage
+
+        self.done += 1
+        print(f"\n[{self.done}/{self.total}] {name}", flush=True)
+        started = time.perf_counter()
+        result = work()
+        # A stage that was complete already takes a moment: keep what it took when it did the work.
+        self.seconds[name] = max(self.seconds.get(name, 0.0), time.perf_counter() - started)
+        storage.write_json(self.seconds, self.path)
+        return result
+
+
+def main(config: Config) -> None:
+    output = absolute(config.output)
+    os.environ["PRITTI_HOME"] = output
+    from jobs import encode_latents, evaluate_scenes, outpaint_scenes, preprocess_scenes, sample_scenes
+    from jobs import train_dit, train_lvae
+    from jobs.command import home
+    from jobs.demo_report import write_demo_report
+
+    data, lvae, model = home("datasets", "town"), home("models", f"lvae-{config.preset}"), home("models", f"pritti-{config.preset}")
+    stages = Stages(home("stages.json"), total=8)
+    start_ray()
+    stages.run(
+        "preprocess the town",
+        lambda: preprocess_scenes.main(
+            preprocess_scenes.Town(output=data, num_train=config.num_train, num_test=config.num_test, seed=config.seed)
+        ),
+    )
+    stages.run(
+        "train the layout VAE",
+        lambda: train_lvae.train(train_lvae.Config(config.preset, data, steps=config.lvae_steps, seed=config.seed)),
+    )
+    stages.run(
+        "encode latents", lambda: encode_latents.encode(encode_latents.Config(dataset=data, lvae=lvae, actors=config.actors))
+    )
+    stages.run(
+        "train the diffusion transformer",
+        lambda: train_dit.train(train_dit.Config(config.preset, data, steps=config.dit_steps, seed=config.seed)),
+    )
+    stages.run(
+        "sample scenes",
+        lambda: sample_scenes.sample(
+            sample_scenes.Config(
+                model=model,
+                num_scenes=config.num_scenes,
+                seed=config.seed,
+                steps=config.sampling_steps,
+                actors=config.actors,
+                glb=1,
+            )
+        ),
+    )
+    stages.run(
+        "outpaint a scene",
+        lambda: outpaint_scenes.outpaint(
+            outpaint_scenes.Config(
+                model=model,
+                source="generated-samples",
+                limit=1,
+                seed=config.seed,
+                steps=config.outpaint_steps,
+                resamplings=config.resamplings,
+            )
+        ),
+    )
+    scores = stages.run(
+        "evaluate",
+        lambda: evaluate_scenes.evaluate(
+            evaluate_scenes.Config(
+                real=data, generated=home("generated"), run="samples", lvae=lvae, limit=config.num_test, actors=config.actors
+            )
+        ),
+    )
+    report = home("report.html")
+    stages.run("write the report", lambda: write_demo_report(report, config, scores, stages.seconds))
+    print(f"\nreport: {os.path.relpath(report)}")
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)

@@ -1,0 +1,209 @@
+"""Schedule, sampler and RePaint against diffusers and against themselves."""
+
+import numpy as np
+import pytest
+import torch
+from diffusers import RePaintScheduler
+
+from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
+from models.dit import DiT
+from models.pipeline import scheduler
+from models.repaint import repaint_transitions, shifted
+from models.training import Optimisation, dit_trainer
+
+SHAPE = (4, 8, 8)
+
+
+def random_dit(seed: int = 0) -> DiT:
+    torch.manual_seed(seed)
+    dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)
+    for parameter in dit.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    return dit.eval()
+
+
+@pytest.mark.parametrize("steps", [1000, 250, 50, 7])
+def test_every_step_is_diffusers_ddpm(steps):
+    reference, walk = scheduler(), Walk(Diffusion(), steps)
+    reference.set_timesteps(steps)
+    assert reference.timesteps.tolist() == walk.timesteps[::-1].tolist()
+    latent, predicted = torch.randn(2, *SHAPE), torch.randn(2, *SHAPE)
+    for state, to in walk.plain()[:: max(1, steps // 25)] + [(0, -1)]:
+        assert to == state - 1
+        t = int(walk.timesteps[state])
+        noise = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(state))
+        want = reference.step(predicted, t, latent, generator=torch.Generator().manual_seed(state)).prev_sample
+        assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
+    assert walk.timesteps[-1] == (996 if steps == 250 else walk.timesteps[-1])
+
+
+def test_forward_noise_is_diffusers():
+    clean, noise, t = torch.randn(3, *SHAPE), torch.randn(3, *SHAPE), torch.tensor([0, 500, 999])
+    want = scheduler().add_noise(clean, noise, t)
+    assert torch.allclose(Diffusion().add_noise(clean, noise, t), want, atol=1e-5)
+    walk = Walk(Diffusion(), 1000)
+    for k, state in enumerate(t.tolist()):
+        assert torch.allclose(walk.to_state(clean[k], noise[k], state), want[k], atol=1e-5)
+    assert walk.to_state(clean, noise, -1) is clean
+
+
+def test_noising_in_two_steps_has_the_variance_of_one():
+    walk = Walk(Diffusion(), 250)
+    for low, high in ((0, 10), (100, 110), (239, 249)):
+        ratio = walk.alpha_bar[high] / walk.alpha_bar[low]
+        assert np.isclose(ratio * (1 - walk.alpha_bar[low]) + 1 - ratio, 1 - walk.alpha_bar[high])
+    zero, one = torch.zeros(1), torch.ones(1)
+    assert torch.isclose(walk.up(one, zero, 3, 9) ** 2 + walk.up(zero, one, 3, 9) ** 2, one)
+
+
+def test_a_scene_depends_on_its_seed_and_index_only():
+    dit, walk = random_dit(), Walk(Diffusion(), 20)
+    labels = torch.arange(8) % 3
+    together = sample(dit, walk, SceneNoise(5, range(8), SHAPE, "cpu"), labels)
+    alone = torch.cat([sample(dit, walk, SceneNoise(5, [i], SHAPE, "cpu"), labels[i : i + 1]) for i in range(8)])
+    assert torch.allclose(together, alone, atol=1e-4)
+    other = sample(dit, walk, SceneNoise(6, range(8), SHAPE, "cpu"), labels)
+    assert (together - other).abs().mean() > 0.1
+    assert (together[0] - together[1]).abs().mean() > 0.1
+
+
+def test_guidance_at_scale_one_costs_nothing():
+    calls = []
+
+    def model(latent, timestep, label):
+        calls.append(len(latent))
+        return latent * label[:, None, None, None].float()
+
+    latent, label = torch.randn(2, *SHAPE), torch.tensor([1, 2])
+    plain = guided(model, 3, 1.0)(latent, torch.zeros(2), label)
+    assert calls == [2] and torch.equal(plain, model(latent, None, label))
+    doubled = guided(model, 3, 4.0)(latent, torch.zeros(2), label)
+    assert torch.allclose(doubled, latent * (3 + 4 * (label[:, None, None, None] - 3.0)), atol=1e-5)
+
+
+def test_repaint_jumps_are_the_originals():
+    """diffusers' schedule, itself the authors' code: the sequence of timesteps, up and down."""
+    reference = RePaintScheduler(num_train_timesteps=250)
+    for jump, resamplings in ((10, 10), (5, 3), (10, 1), (1, 2)):
+        reference.set_timesteps(250, jump_length=jump, jump_n_sample=resamplings)
+        transitions = repaint_transitions(250, jump, resamplings)
+        walked = [transitions[0][0]] + [to for _, to in transitions[:-1]]
+        assert walked == reference.timesteps.tolist()
+        assert transitions[-1] == (0, -1)
+        assert all(a[1] == b[0] and abs(a[0] - a[1]) == 1 for a, b in zip(transitions, transitions[1:], strict=False))
+    assert sum(to < state for state, to in repaint_transitions(250)) == 2410
+    assert repaint_transitions(50, 10, 1) == Walk(Diffusion(), 50).plain()
+    with pytest.raises(ValueError, match="at least 1"):
+        repaint_transitions(10, 0)
+
+
+def test_the_known_part_comes_back_bit_for_bit():
+    dit, walk = random_dit(), Walk(Diffusion(), 20)
+    clean = torch.randn(2, *SHAPE)
+    mask = torch.zeros(2, *SHAPE)
+    mask[:, :, :4] = 1
+    known = Known(clean, mask)
+    transitions = repaint_transitions(20, 4, 3)
+    noise, label = SceneNoise(0, [0, 1], SHAPE, "cpu"), torch.tensor([0, 1])
+    out = sample(dit, walk, noise, label, transitions, known)
+    assert torch.equal(out[:, :, 4:], clean[:, :, 4:])
+    assert (out[:, :, :4] - clean[:, :, :4]).abs().mean() > 0.1
+
+
+def test_the_known_part_is_noised_to_the_state_just_reached():
+    walk, seen = Walk(Diffusion(), 50), []
+
+    def model(latent, timestep, label):
+        seen.append((int(timestep[0]), float(latent[:, :, 4:].std())))
+        return torch.zeros_like(latent)
+
+    shape = (64, 8, 8)
+    mask = torch.zeros(4, *shape)
+    mask[:, :, :4] = 1
+    sample(model, walk, SceneNoise(0, range(4), shape, "cpu"), torch.zeros(4, dtype=torch.long), None, Known(torch.zeros(4, *shape), mask))
+    for t, std in seen[1:]:
+        assert np.isclose(std, (1 - Diffusion().alpha_bar[t]) ** 0.5, rtol=0.05)
+
+
+def test_shifted_sees_the_overlap_where_the_block_lies():
+    canvas = torch.arange(16.0).view(1, 4, 4)
+    ahead = shifted(canvas, 2, 0)
+    assert torch.equal(ahead[:, 2:], canvas[:, :2]) and (ahead[:, :2] == 0).all()
+    right = shifted(canvas, 0, -1, fill=-1)
+    assert torch.equal(right[:, :, :3], canvas[:, :, 1:]) and (right[:, :, 3] == -1).all()
+
+
+def test_bad_step_counts_are_named():
+    with pytest.raises(ValueError, match="num_steps is 0, expected 1 to 1000"):
+        Walk(Diffusion(), 0)
+
+
+def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    mean = torch.randn(n, *SHAPE, generator=generator)
+    return {"mean": mean, "logvar": torch.full_like(mean, -6.0), "label": torch.arange(n) % 3}
+
+
+def new_trainer(**changes):
+    torch.manual_seed(0)
+    settings = Optimisation(**({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes))
+    return dit_trainer(DiT(channels=4, size=8, width=64, depth=2, heads=2), settings, 0.1, torch.device("cpu"))
+
+
+def test_dit_overfits_one_batch():
+    trainer, batch = new_trainer(), dit_batch(2)
+    losses = [float(trainer.step(batch, range(2))["loss"]) for _ in range(300)]
+    assert np.mean(losses[:5]) > 0.9 and np.mean(losses[-50:]) < 0.35
+
+
+def test_training_resumes_exactly(tmp_path):
+    batch = dit_batch()
+    straight = new_trainer()
+    curve = [float(straight.step(batch, range(8))["loss"]) for _ in range(8)]
+    first = new_trainer()
+    for _ in range(4):
+        first.step(batch, range(8))
+    first.save(tmp_path)
+    second = new_trainer()
+    second.load(tmp_path)
+    assert [float(second.step(batch, range(8))["loss"]) for _ in range(4)] == curve[4:]
+    for name, value in straight.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name
+    for name, value in straight.ema.items():
+        assert torch.equal(value, second.ema[name]), name
+    assert {p.suffix for p in tmp_path.iterdir()} == {".json", ".safetensors"}
+    with pytest.raises(ValueError, match=r"was trained with learning_rate=0.002, asked for 0.1"):
+        new_trainer(learning_rate=0.1).load(tmp_path)
+
+
+def test_half_batches_draw_what_the_whole_batch_draws():
+    """Two workers of 4 see the losses that one worker of 8 sees."""
+    batch = dit_batch()
+    whole = float(new_trainer().step(batch, range(8))["loss"])
+    halves = []
+    for rank in range(2):
+        here = slice(4 * rank, 4 * rank + 4)
+        halves.append(float(new_trainer().step({k: v[here] for k, v in batch.items()}, range(8)[here])["loss"]))
+    assert np.isclose(np.mean(halves), whole, rtol=1e-6)
+
+
+def test_a_loss_that_is_not_finite_stops_before_anything_changes():
+    trainer, batch = new_trainer(), dit_batch()
+    before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
+    batch["mean"][3] = float("nan")
+    with pytest.raises(ValueError, match="step 0: the loss is nan"):
+        trainer.step(batch, range(8))
+    assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
+
+
+def test_learning_rate_is_one_cycle_without_warm_up():
+    """torch's OneCycleLR with pct_start 0, the paper's cosine from 1e-4 to 1e-5."""
+    settings = Optimisation(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
+    rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
+    assert np.isclose(rates[0], 1e-4) and np.isclose(rates[-1], 1e-5) and np.isclose(betas[0], 0.85) and np.isclose(betas[-1], 0.95)
+    optimiser = torch.optim.AdamW([torch.zeros(1, requires_grad=True)], 1e-4)
+    reference = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, T_max=99, eta_min=1e-5)
+    for rate in rates:
+        assert np.isclose(rate, reference.get_last_lr()[0], rtol=1e-5)
+        optimiser.step()
+        reference.step()
