@@ -67,23 +67,22 @@ def height_loss(
 def object_losses(
     features: Float[Tensor, "b n 9"],
     existence_logit: Float[Tensor, "b n"],
-    truth: Float[Tensor, "b n 9"],
-    real: Bool[Tensor, "b n"],
+    truth: Float[Tensor, "b slots 9"],
+    real: Bool[Tensor, "b slots"],
     assignment: Int[Tensor, "b n"],
     spec: LayoutSpec,
+    proposals: tuple[int, ...],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Existence, centre and Cholesky terms after matching, weighted (supplement Eqs. "match", "line").
 
-    Sums over slots, divided per sample and category by max(n_c, 1), summed over categories, mean over the batch.
+    Sums over proposals, divided per sample and category by max(n_c, 1), summed over categories, mean over the batch.
     """
     matched = assignment >= 0
-    target = truth.gather(1, assignment.clamp(min=0)[..., None].expand_as(truth))
-    slot_weight = features.new_tensor([OBJECT_WEIGHTS[name] for name in spec.categories])
-    slot_weight = slot_weight[torch.as_tensor(spec.slot_category, device=features.device)]  # (n, 3)
-    count = torch.cat(
-        [group.sum(dim=1, keepdim=True).clamp(min=1).expand_as(group) for group in real.split(spec.slots, dim=1)], dim=1
-    )  # (b, n): real primitives of the slot's category
-    weight = slot_weight / count[..., None] / len(real)  # (b, n, 3)
+    target = truth.gather(1, assignment.clamp(min=0)[..., None].expand(-1, -1, truth.shape[-1]))
+    category = torch.repeat_interleave(torch.tensor(proposals)).to(features.device)  # (n,)
+    category_weight = features.new_tensor([OBJECT_WEIGHTS[name] for name in spec.categories])  # (c, 3)
+    count = torch.stack([group.sum(dim=1) for group in real.split(spec.slots, dim=1)], dim=1).clamp(min=1)  # (b, c)
+    weight = (category_weight / count[..., None] / len(real))[:, category]  # (b, n, 3)
     existence = F.binary_cross_entropy_with_logits(existence_logit, matched.to(features.dtype), reduction="none")
     distance = (features - target).abs() * matched[..., None]
     return (
@@ -104,9 +103,10 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
 
 def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec) -> LVAELoss:
     """The total objective of stage 1 and its parts."""
-    assignment = match(output.features, output.existence_logit, batch.features, batch.real, spec.slots)
+    proposed = (output.features, output.existence_logit)
+    assignment = match(*proposed, batch.features, batch.real, spec.slots, output.proposals)
     existence, center, cholesky = object_losses(
-        output.features, output.existence_logit, batch.features, batch.real, assignment, spec
+        *proposed, batch.features, batch.real, assignment, spec, output.proposals
     )
     return LVAELoss(
         occupancy=OCCUPANCY_WEIGHT * occupancy_loss(output.occupancy_logit, batch.occupied),

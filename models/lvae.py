@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from diffusers import ConfigMixin, ModelMixin
 from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float
 from torch import Tensor
 
+from models.cells import CellDecoder
 from models.ground import GroundDecoder, GroundEncoder
 from models.layout import LayoutBatch, LayoutSpec
 from models.objects import ObjectDecoder, ObjectEncoder
@@ -30,17 +32,22 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class LayoutOutput:
-    """What the decoders say, normalised as in LayoutBatch; logits where a probability is meant."""
+    """What the decoders say, normalised as in LayoutBatch; logits where a probability is meant.
+
+    The object decoder proposes `proposals[k]` primitives of category k: the spec's slots (DETR) or more (cells).
+    """
 
     height: Float[Tensor, "batch ground rows cols"]
     occupancy_logit: Float[Tensor, "batch ground rows cols"]
-    features: Float[Tensor, "batch slots 9"]
-    existence_logit: Float[Tensor, "batch slots"]
+    features: Float[Tensor, "batch proposals 9"]
+    existence_logit: Float[Tensor, "batch proposals"]
+    proposals: tuple[int, ...]
 
     def layouts(self) -> list[DecodedLayout]:
         """One numpy layout per sample, probabilities instead of logits."""
         parts = (self.occupancy_logit.sigmoid(), self.height, self.features, self.existence_logit.sigmoid())
-        return [DecodedLayout(*sample) for sample in zip(*(p.float().cpu().numpy() for p in parts), strict=True)]
+        category = np.repeat(np.arange(len(self.proposals)), self.proposals)
+        return [DecodedLayout(*sample, category) for sample in zip(*(p.float().cpu().numpy() for p in parts), strict=True)]
 
 
 # Posteriors start narrow (sigma 0.14): decoders see the latent, not noise, from the first step on. With sigma 1,
@@ -52,7 +59,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
     """Encodes layouts into a (2 c, h, w) latent and decodes them back.
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
-    (fold 2^(len(channels) - 1)).
+    (fold 2^(len(channels) - 1)). `decoder` is the paper's DETR or `cells`: proposals of each latent cell (cells.py).
     """
 
     @register_to_config
@@ -68,6 +75,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         heads: int = 8,
         hidden: int = 1024,
         head_hidden: int = 1024,
+        decoder: str = "detr",
     ) -> None:
         super().__init__()
         spec = LayoutSpec.from_dict(layout)
@@ -78,9 +86,14 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         ground = (num_classes, latent_channels, tuple(channels), norm_groups, fold)
         self.ground_encoder, self.ground_decoder = GroundEncoder(*ground), GroundDecoder(*ground)
         self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
-        self.object_decoder = ObjectDecoder(
-            spec.slots, latent_channels, size, width, layers, heads, hidden, head_hidden
-        )
+        if decoder == "detr":
+            self.object_decoder = ObjectDecoder(
+                spec.slots, latent_channels, size, width, layers, heads, hidden, head_hidden
+            )
+        elif decoder == "cells":
+            self.object_decoder = CellDecoder(spec.slots, latent_channels, size, width, layers)
+        else:
+            raise ValueError(f"LayoutVAE: decoder is {decoder!r}, expected 'detr' (the paper's) or 'cells'")
         with torch.no_grad():
             self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
             self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
@@ -107,7 +120,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         ground, objects = latent.chunk(2, dim=1)
         height, occupancy_logit = self.ground_decoder(ground).chunk(2, dim=1)
         features, existence_logit = self.object_decoder(objects)
-        return LayoutOutput(height, occupancy_logit, features, existence_logit)
+        return LayoutOutput(height, occupancy_logit, features, existence_logit, self.object_decoder.proposals)
 
     def forward(self, batch: LayoutBatch, noise: Float[Tensor, "batch c2 h w"]) -> tuple[LayoutOutput, Posterior]:
         """Reconstruction from a sampled latent, and the posterior it was sampled from."""

@@ -29,28 +29,28 @@ def match_cost(
 
 @torch.no_grad()
 def match(
-    features: Float[Tensor, "batch slots 9"],
-    existence_logit: Float[Tensor, "batch slots"],
+    features: Float[Tensor, "batch proposals 9"],
+    existence_logit: Float[Tensor, "batch proposals"],
     truth: Float[Tensor, "batch slots 9"],
     real: Bool[Tensor, "batch slots"],
     slots: tuple[int, ...],
-) -> Int[Tensor, "batch slots"]:
-    """For every predicted slot the index of the true slot it is matched with, -1 where with padding.
+    proposals: tuple[int, ...],
+) -> Int[Tensor, "batch proposals"]:
+    """For every proposal the index of the true slot it is matched with, -1 where with padding.
 
-    Real primitives come first in their category's slots (tensors.py). Raises ValueError on non-finite predictions.
+    Per category, `proposals[k]` >= `slots[k]`; real primitives come first in their category's slots (tensors.py).
     """
-    assignment = torch.full(real.shape, -1, dtype=torch.long)
-    start = 0
-    for capacity in slots:
-        here = slice(start, start + capacity)
-        counts = real[:, here].sum(dim=1).tolist()
-        most = max(counts)
-        if most:
-            cost = match_cost(features[:, here], existence_logit[:, here], truth[:, here][:, :most])
+    assignment = torch.full(existence_logit.shape, -1, dtype=torch.long)
+    first_slot, first_proposal = 0, 0
+    for capacity, offered in zip(slots, proposals, strict=True):
+        theirs, mine = slice(first_slot, first_slot + capacity), slice(first_proposal, first_proposal + offered)
+        counts = real[:, theirs].sum(dim=1).tolist()
+        if most := max(counts):
+            cost = match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs][:, :most])
             cost = cost.double().cpu().numpy()
             for sample, count in enumerate(counts):
                 if count:
                     rows, cols = linear_sum_assignment(cost[sample, :count])
-                    assignment[sample, start + cols] = torch.from_numpy(start + rows)
-        start += capacity
+                    assignment[sample, first_proposal + cols] = torch.from_numpy(first_slot + rows)
+        first_slot, first_proposal = theirs.stop, mine.stop
     return assignment.to(real.device)

@@ -178,7 +178,7 @@ class ObjectDecoder(nn.Module):
         head_hidden: int,
     ) -> None:
         super().__init__()
-        self.slots = tuple(slots)
+        self.proposals = tuple(slots)
         self.project_in = nn.Linear(latent_channels, width)  # patch size 1
         self.queries = nn.Parameter(torch.randn(sum(slots), width))
         self.layers = nn.ModuleList(DecoderLayer(width, heads, hidden) for _ in range(layers))
@@ -193,7 +193,7 @@ class ObjectDecoder(nn.Module):
         x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d), DETR's zero targets
         for layer in self.layers:
             x = layer(x, self.queries, memory, memory_key)
-        groups = list(zip(self.heads, x.split(self.slots, dim=1), strict=True))
+        groups = list(zip(self.heads, x.split(self.proposals, dim=1), strict=True))
         features = torch.cat([head.features(group) for head, group in groups], dim=1).sigmoid()
         existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence

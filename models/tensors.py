@@ -87,8 +87,9 @@ class DecodedLayout:
 
     occupancy: np.ndarray  # (G, H, W) probability
     height: np.ndarray  # (G, H, W) normalised
-    features: np.ndarray  # (N, 9) normalised
-    existence: np.ndarray  # (N,) probability
+    features: np.ndarray  # (n, 9) normalised
+    existence: np.ndarray  # (n,) probability
+    category: np.ndarray  # (n,) position in the spec's categories
 
 
 def scene_from_layout(
@@ -103,7 +104,7 @@ def scene_from_layout(
     kept = np.flatnonzero(layout.existence > threshold)
     rotation, size = boxes_from_cholesky(spec.cholesky_bounds.restore(layout.features[kept, 3:]))
     rotation, size = canonical_boxes(rotation, size)
-    category = np.array([CATEGORY_INDEX[name] for name in spec.categories], np.int8)[spec.slot_category[kept]]
+    category = np.array([CATEGORY_INDEX[name] for name in spec.categories], np.int8)[layout.category[kept]]
     return replace(
         identity,
         category=category,

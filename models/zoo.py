@@ -23,6 +23,7 @@ class LVAEPreset:
     head_hidden: int
     batch_size: int
     steps: int
+    decoder: str = "detr"  # the paper's, or "cells"
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-5
     weight_decay: float = 5e-4
@@ -32,8 +33,9 @@ class LVAEPreset:
 
     def architecture(self) -> dict:
         """Keyword arguments of `LayoutVAE` apart from the layout."""
-        names = ("latent_channels", "channels", "norm_groups", "fold", "width", "layers", "heads", "hidden", "head_hidden")
-        return {name: getattr(self, name) for name in names}
+        training = ("source", "raster_px", "batch_size", "steps", "learning_rate", "final_learning_rate")
+        training += ("weight_decay", "warmup_steps", "grad_clip", "ema_decay")
+        return {name: value for name, value in vars(self).items() if name not in training}
 
 
 # fmt: off

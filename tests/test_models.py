@@ -92,7 +92,7 @@ def test_matching_reaches_the_optimum_of_the_padded_square_problem():
         logit = 3 * torch.randn(1, n, generator=generator)
         counts = [int(torch.randint(0, s + 1, (), generator=generator)) for s in slots]
         real = torch.cat([torch.arange(s) < c for s, c in zip(slots, counts, strict=True)])[None]
-        assignment = match(features, logit, truth, real, slots)[0]
+        assignment = match(features, logit, truth, real, slots, slots)[0]
         start = 0
         for s, count in zip(slots, counts, strict=True):
             here = slice(start, start + s)
@@ -115,8 +115,8 @@ def test_losses_are_their_equations():
     features, truth = (torch.rand(b, n, 9, generator=generator) for _ in range(2))
     logit = torch.randn(b, n, generator=generator)
     real = torch.cat([torch.arange(3) < c for c in (3, 0, 1, 2, 0, 1, 3, 2, 1, 0, 2)])[None].repeat(b, 1)
-    assignment = match(features, logit, truth, real, spec.slots)
-    got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec)]
+    assignment = match(features, logit, truth, real, spec.slots, spec.slots)
+    got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
 
     from models.losses import OBJECT_WEIGHTS
 
@@ -149,9 +149,10 @@ def test_losses_are_their_equations():
     assert np.isclose(float(kl_loss(posterior)), float(want), rtol=1e-5)
 
 
-def test_lvae_overfits_one_batch():
+@pytest.mark.parametrize("decoder", ["detr", "cells"])
+def test_lvae_overfits_one_batch(decoder):
     spec = small_spec()
-    lvae = small_lvae(width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8)
+    lvae = small_lvae(decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8)
     batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
     generator = torch.Generator().manual_seed(0)

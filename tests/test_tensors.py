@@ -20,6 +20,7 @@ def round_trip(scene, spec):
         (layout["height"] / 65535).astype(np.float32),
         layout["features"],
         layout["real"].astype(np.float32),
+        spec.slot_category,
     )
     return scene_from_layout(decoded, spec, scene)
 
