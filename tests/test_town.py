@@ -127,7 +127,7 @@ def test_cars_stand_on_the_surface_and_near_roads(drives):
             top, ground_class = scene.surface()
             cars = scene.category == CATEGORY_INDEX["vehicle_small"]
             row, col = scene.grid.pixel(scene.center_m[cars, 0], scene.center_m[cars, 1])
-            keep = (ground_class[row, col] >= 0)
+            keep = ground_class[row, col] >= 0
             bottom = scene.center_m[cars, 2] - scene.size_m[cars, 2] / 2
             gaps.append((bottom - (top[row, col] - 0.3))[keep])
             lanes = scene.occupied[scene.ground_classes.index("road")]
@@ -309,7 +309,7 @@ def test_without_defects_every_object_is_written_once(tmp_path, drives):
 
 
 def test_importing_the_town_needs_numpy_only():
-    heavy = "ray pyarrow shapely trimesh torch scipy PIL".split()
+    heavy = ["ray", "pyarrow", "shapely", "trimesh", "torch", "scipy", "PIL"]
     code = f"import sys, pipelines.sources.town; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

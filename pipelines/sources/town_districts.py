@@ -42,15 +42,16 @@ class District:
     trucks_per_100m: float
 
 
-# Tuned on 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1).
+# Tuned on samples of 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1): over plan seeds 0..2 all means
+# lie within their tolerance, most within half of it.
 DISTRICTS = {
     "centre": District(
         house_scale=(1.16, 1.14, 1.03),
         setback_m=1.2,
         gap_m=(0.1, 1.0),
         garages=1.1,
-        terrain_front=0.75,
-        terrain_back=0.26,
+        terrain_front=0.72,
+        terrain_back=0.22,
         court_front=0.35,
         rough_drives=0.8,
         terrace=0.9,
@@ -80,14 +81,14 @@ DISTRICTS = {
         setback_m=2.7,
         gap_m=(0.3, 1.5),
         garages=1.2,
-        terrain_front=0.97,
-        terrain_back=0.93,
+        terrain_front=1.0,
+        terrain_back=0.96,
         court_front=0.25,
         rough_drives=0.08,
         terrace=1.0,
         sidewalks=0.92,
         bays=0.12,
-        curb_parking=0.5,
+        curb_parking=0.505,
         driveway_cars=0.4,
         parks=0.03,
         courts=0.15,
@@ -98,10 +99,10 @@ DISTRICTS = {
         trees_per_100m2=2.443,
         street_trees_per_100m=3.0,
         tree_scale=0.95,
-        lamps_per_100m=2.75,
+        lamps_per_100m=2.64,
         signs_per_100m=2.05,
         lights=0.1,
-        things_per_plot=0.684,
+        things_per_plot=0.629,
         bicycles_per_plot=0.02,
         people_per_100m=0.0,
         trucks_per_100m=0.1,
@@ -112,29 +113,29 @@ DISTRICTS = {
         gap_m=(1.5, 4.0),
         garages=0.78,
         terrain_front=0.95,
-        terrain_back=0.52,
+        terrain_back=0.42,
         court_front=0.05,
         rough_drives=0.2,
         terrace=0.5,
         sidewalks=0.92,
         bays=0.18,
-        curb_parking=0.258,
+        curb_parking=0.237,
         driveway_cars=0.3,
         parks=0.17,
         courts=0.08,
         hedges=0.9,
-        walls=1.031,
-        shrubs_per_100m2=3.934,
+        walls=0.959,
+        shrubs_per_100m2=3.855,
         bushes_per_100m2=2.0,
-        trees_per_100m2=2.014,
+        trees_per_100m2=1.954,
         street_trees_per_100m=4.0,
         tree_scale=1.12,
         lamps_per_100m=3.136,
         signs_per_100m=3.027,
         lights=0.05,
-        things_per_plot=2.501,
+        things_per_plot=2.376,
         bicycles_per_plot=0.54,
-        people_per_100m=0.743,
+        people_per_100m=0.706,
         trucks_per_100m=0.08,
     ),
 }
@@ -165,11 +166,10 @@ def random_mood(rng: np.random.Generator) -> Mood:
         return float(rng.gamma(shape) / shape)
 
     size, room = np.exp(rng.normal(0, [0.13, 0.16])).tolist()
-    if rng.random() < 0.22:  # a terrace of narrow houses
+    if rng.random() < 0.25:  # a terrace of narrow houses
         room = 0.46
     vacant = 0.6 if rng.random() < 0.13 else 0.02
     green = gamma(9)
-    outdoors = green**2  # where it is green, people are out and ride
     return Mood(
         room=room,
         vacant=vacant,
@@ -177,10 +177,11 @@ def random_mood(rng: np.random.Generator) -> Mood:
         green=green,
         trees=gamma(9),
         tree_size=size,
-        walls=gamma(6),
+        walls=gamma(8),
         cars=gamma(3),
         furniture=gamma(6),
         things=gamma(4),
-        bicycles=gamma(1.5) * outdoors,
-        people=gamma(1.2) * outdoors,
+        # Where it is green, people are out and ride.
+        bicycles=gamma(1.5) * green**2,
+        people=gamma(1.5) * green,
     )

@@ -13,6 +13,7 @@ import numpy as np
 
 SLAB_THICKNESS_M = 0.6  # KITTI-360's ground slabs; their mid-plane is the surface things stand on
 EDGE_STEP_M = 10.0  # longest slab edge: bends and hills are followed this closely
+MAX_CORNERS = 40  # of a slab, as in KITTI-360
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +199,17 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
 def subdivided(outline: np.ndarray) -> np.ndarray:
     """The outline (m, 2) with long edges cut at multiples of EDGE_STEP_M, so that neighbours share the cuts.
 
-    Edges parallel to a board axis are cut on the lattice, slanted ones are left alone. Counter-clockwise.
+    Edges parallel to a board axis are cut on the lattice, slanted ones are left alone. Counter-clockwise. Should
+    that give more than MAX_CORNERS corners, only every second cut is made, or every fourth.
     """
+    for step in (EDGE_STEP_M, 2 * EDGE_STEP_M, 4 * EDGE_STEP_M, 1e6):
+        cut = _cut(outline, step)
+        if len(cut) <= MAX_CORNERS:
+            break
+    return cut
+
+
+def _cut(outline: np.ndarray, step: float) -> np.ndarray:
     following = np.roll(outline, -1, axis=0)
     if (outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum() < 0:
         outline = outline[::-1]
@@ -209,9 +219,9 @@ def subdivided(outline: np.ndarray) -> np.ndarray:
         points.append((au, av))
         axis = 0 if abs(bu - au) > abs(bv - av) else 1
         low, high = sorted(((au, bu), (av, bv))[axis])
-        if high - low <= EDGE_STEP_M * 0.5 or min(abs(bu - au), abs(bv - av)) > 1e-6:
+        if high - low <= step * 0.5 or min(abs(bu - au), abs(bv - av)) > 1e-6:
             continue
-        cuts = np.arange(np.ceil((low + 0.8) / EDGE_STEP_M), np.floor((high - 0.8) / EDGE_STEP_M) + 1) * EDGE_STEP_M
+        cuts = np.arange(np.ceil((low + 0.8) / step), np.floor((high - 0.8) / step) + 1) * step
         if (bu, bv)[axis] < (au, av)[axis]:
             cuts = cuts[::-1]
         points += [(c, av) if axis == 0 else (au, c) for c in cuts.tolist()]
