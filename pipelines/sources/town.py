@@ -1,9 +1,9 @@
-"""A seeded procedural town: the built-in source, held to KITTI-360's statistics (FORMATS, section 3).
+"""A seeded procedural town: the built-in source, held to the statistics of KITTI-360 scenes (town_targets).
 
     drive = town_drive(7)          # one town and one drive through its streets
     scene = drive.scene(0)         # what lies ahead of the first pose
 
-numpy only. The same seed gives the same town on every machine; a change of what comes out raises TOWN_VERSION.
+numpy only. The same seed gives the same town (under one numpy); a change of what comes out raises TOWN_VERSION.
 """
 
 from __future__ import annotations
