@@ -55,7 +55,9 @@ def pair_of_pictures(scene: Scene, caption: str, tag: str) -> tuple[Picture, Pic
 def scene_pictures(title: str, note: str, scenes: list[Scene], tag: str) -> Pictures:
     """Two rows: 3D above, from above below."""
     pairs = [pair_of_pictures(s, f"{s.vegetation_density} vegetation · {len(s)} objects", tag) for s in scenes]
-    return Pictures(title, [first for first, _ in pairs] + [second for _, second in pairs], columns=len(pairs), note=note)
+    return Pictures(
+        title, [first for first, _ in pairs] + [second for _, second in pairs], columns=len(pairs), note=note
+    )
 
 
 def one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
@@ -112,20 +114,38 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
         KeyFigures(
             "In short",
             [
-                Figure(f"{total / 60:.1f} min", "from raw drives to generated scenes", f"{os.cpu_count()} cores, {platform.machine()}"),
+                Figure(
+                    f"{total / 60:.1f} min",
+                    "from raw drives to generated scenes",
+                    f"{os.cpu_count()} cores, {platform.machine()}",
+                ),
                 Figure(sum(1 for _ in real) + config.num_train, "town scenes"),
                 Figure(scores["reconstruction"]["ground_iou"], "ground IoU", "reconstruction of held-out scenes"),
                 Figure(scores["reconstruction"]["ap3d"], "AP3D", "reconstruction of held-out scenes"),
                 Figure(len(made), "generated scenes", f"{config.sampling_steps} denoising steps each"),
             ],
         ),
-        scene_pictures("Real scenes", "Held-out scenes of the town, 64 x 64 m, seen from above and from the side. The car stands at the bottom edge, looking up.", one_per_label(real, SHOWN), "real"),
-        scene_pictures("Generated scenes", "Sampled by the diffusion transformer for the vegetation label under each picture.", one_per_label(made, SHOWN), "generated"),
+        scene_pictures(
+            "Real scenes",
+            "Held-out scenes of the town, 64 x 64 m, seen from above and from the side. The car stands at the bottom edge, looking up.",
+            one_per_label(real, SHOWN),
+            "real",
+        ),
+        scene_pictures(
+            "Generated scenes",
+            "Sampled by the diffusion transformer for the vegetation label under each picture.",
+            one_per_label(made, SHOWN),
+            "generated",
+        ),
         Pictures(
             "An outpainted scene",
             [
                 Picture("128 x 128 m", picture_3d(outpainted, 960, 720), "generated"),
-                Picture("the middle quarter was there, four sides and four corners were added", bev_picture(outpainted, 720, supersample=2), "generated"),
+                Picture(
+                    "the middle quarter was there, four sides and four corners were added",
+                    bev_picture(outpainted, 720, supersample=2),
+                    "generated",
+                ),
             ],
             columns=2,
             note="One generated scene extended to all sides in two passes: four sides, then four corners, each overlapping what is known by half.",
@@ -133,9 +153,26 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
         Charts(
             "Training",
             [
-                Chart("Layout VAE: total loss", curves("pritti-lvae", {"loss": "training", "validation_loss": "held out"}), "step", "loss", log_y=True),
-                Chart("Layout VAE: held-out ground IoU", curves("pritti-lvae", {"validation_ground_iou": "held out"}), "step", "IoU"),
-                Chart("Diffusion transformer: noise error", curves("pritti-dit", {"loss": "training", "validation_loss": "held out"}), "step", "mean squared error", log_y=True),
+                Chart(
+                    "Layout VAE: total loss",
+                    curves("pritti-lvae", {"loss": "training", "validation_loss": "held out"}),
+                    "step",
+                    "loss",
+                    log_y=True,
+                ),
+                Chart(
+                    "Layout VAE: held-out ground IoU",
+                    curves("pritti-lvae", {"validation_ground_iou": "held out"}),
+                    "step",
+                    "IoU",
+                ),
+                Chart(
+                    "Diffusion transformer: noise error",
+                    curves("pritti-dit", {"loss": "training", "validation_loss": "held out"}),
+                    "step",
+                    "mean squared error",
+                    log_y=True,
+                ),
             ],
         ),
         Table(

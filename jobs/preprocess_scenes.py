@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
 import tyro
+
 from jobs.command import absolute, home, run, start_ray
 
 
@@ -94,7 +95,13 @@ def main(config: Town | Kitti360 | Av2) -> None:
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
 
     start_ray()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("shards"), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("shards"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns) as bar:
         shown = bar.add_task(f"preprocess {source}", total=len(tasks))
         result = ingest.ingest(

@@ -82,8 +82,11 @@ def train_worker(config: dict[str, Any]) -> None:
             }
             run.tracker.metrics(metrics, step)
             left = (run.settings.steps - step) * elapsed / done
-            print(f"{run.name}: step {step}/{run.settings.steps}  loss {metrics['loss']:.4g}  "
-                  f"{metrics['scenes_per_second']:.1f} scenes/s  {left / 60:.1f} min left", flush=True)
+            print(
+                f"{run.name}: step {step}/{run.settings.steps}  loss {metrics['loss']:.4g}  "
+                f"{metrics['scenes_per_second']:.1f} scenes/s  {left / 60:.1f} min left",
+                flush=True,
+            )
             started, logged, waited = time.perf_counter(), step, 0.0
         if step % run.checkpoint_every == 0 or last:
             report(run, trainer, rank, float(losses["loss"]))
@@ -169,10 +172,14 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
 def publish_directory(directory: str, output: str) -> None:
     """Copy a saved model or pipeline into place, file by file; what says that it is complete comes last."""
-    paths = [os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names]
+    paths = [
+        os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
+    ]
     for path in sorted(paths, key=lambda path: (path == "model_index.json", path.endswith("config.json"), path)):
         with open(os.path.join(directory, path), "rb") as source:
-            storage.write_whole(storage.join(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream))
+            storage.write_whole(
+                storage.join(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
+            )
 
 
 def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:

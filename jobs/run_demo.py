@@ -67,12 +67,23 @@ class Stages:
 def main(config: Config) -> None:
     output = absolute(config.output)
     os.environ["PRITTI_HOME"] = output
-    from jobs import encode_latents, evaluate_scenes, outpaint_scenes, preprocess_scenes, sample_scenes
-    from jobs import train_dit, train_lvae
+    from jobs import (
+        encode_latents,
+        evaluate_scenes,
+        outpaint_scenes,
+        preprocess_scenes,
+        sample_scenes,
+        train_dit,
+        train_lvae,
+    )
     from jobs.command import home
     from jobs.demo_report import write_demo_report
 
-    data, lvae, model = home("datasets", "town"), home("models", f"lvae-{config.preset}"), home("models", f"pritti-{config.preset}")
+    data, lvae, model = (
+        home("datasets", "town"),
+        home("models", f"lvae-{config.preset}"),
+        home("models", f"pritti-{config.preset}"),
+    )
     stages = Stages(home("stages.json"), total=8)
     start_ray()
     stages.run(
@@ -86,7 +97,8 @@ def main(config: Config) -> None:
         lambda: train_lvae.train(train_lvae.Config(config.preset, data, steps=config.lvae_steps, seed=config.seed)),
     )
     stages.run(
-        "encode latents", lambda: encode_latents.encode(encode_latents.Config(dataset=data, lvae=lvae, actors=config.actors))
+        "encode latents",
+        lambda: encode_latents.encode(encode_latents.Config(dataset=data, lvae=lvae, actors=config.actors)),
     )
     stages.run(
         "train the diffusion transformer",
@@ -122,7 +134,12 @@ def main(config: Config) -> None:
         "evaluate",
         lambda: evaluate_scenes.evaluate(
             evaluate_scenes.Config(
-                real=data, generated=home("generated"), run="samples", lvae=lvae, limit=config.num_test, actors=config.actors
+                real=data,
+                generated=home("generated"),
+                run="samples",
+                lvae=lvae,
+                limit=config.num_test,
+                actors=config.actors,
             )
         ),
     )

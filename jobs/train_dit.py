@@ -12,10 +12,14 @@ an sqlite file under $PRITTI_HOME).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
+
 from jobs.command import absolute, home, run, start_ray
+
+if TYPE_CHECKING:
+    from jobs.ray_training import TrainingRun
 
 
 @dataclass(frozen=True)
@@ -45,11 +49,11 @@ class Config:
     seed: int = 0
 
 
-def train(config: Config) -> str:
-    """Train and return the pipeline's directory. Ray must run."""
+def prepare(config: Config) -> tuple[TrainingRun, str]:
+    """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs. Ray must run."""
     from functools import partial
 
-    from jobs.ray_training import TrainingRun, fit, identity_of, settings_with
+    from jobs.ray_training import TrainingRun, identity_of, settings_with
     from jobs.smoke import smoke_dataset, smoke_latents
     from jobs.tracking import Tracker
     from jobs.validation import SamplingCheck
@@ -126,9 +130,18 @@ def train(config: Config) -> str:
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label),
     )
+    return training, latents["lvae"]
+
+
+def train(config: Config) -> str:
+    """Train and return the pipeline's directory. Ray must run."""
+    from jobs.ray_training import fit
+    from pipelines import storage
+
+    training, lvae = prepare(config)
     output = absolute(config.output) if config.output else home("models", f"pritti-{config.preset}")
     fit(training, config.workers, storage.join(output, "dit"))
-    return complete_pipeline(latents["lvae"], output)
+    return complete_pipeline(lvae, output)
 
 
 def build(architecture: dict, settings, label_dropout: float, device, wrap):

@@ -12,9 +12,14 @@ sqlite file under $PRITTI_HOME).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import tyro
+
 from jobs.command import absolute, home, run, start_ray
+
+if TYPE_CHECKING:
+    from jobs.ray_training import TrainingRun
 
 
 @dataclass(frozen=True)
@@ -40,11 +45,11 @@ class Config:
     seed: int = 0
 
 
-def train(config: Config) -> str:
-    """Train and return the model's directory. Ray must run."""
+def prepare(config: Config) -> TrainingRun:
+    """The run that the options mean; makes the smoke preset's data. Ray must run."""
     from functools import partial
 
-    from jobs.ray_training import TrainingRun, fit, identity_of, settings_with
+    from jobs.ray_training import TrainingRun, identity_of, settings_with
     from jobs.smoke import smoke_dataset
     from jobs.tracking import Tracker
     from jobs.validation import ReconstructionCheck
@@ -55,7 +60,11 @@ def train(config: Config) -> str:
     from pipelines.scenes.tables import find_shards
 
     row = preset(LVAE_PRESETS, config.preset)
-    root = absolute(config.dataset) if config.dataset else home("datasets", "smoke" if config.preset == "smoke" else row.source)
+    root = (
+        absolute(config.dataset)
+        if config.dataset
+        else home("datasets", "smoke" if config.preset == "smoke" else row.source)
+    )
     if config.preset == "smoke" and not config.dataset:
         smoke_dataset(root)
     dataset = Dataset.open(root)
@@ -79,9 +88,11 @@ def train(config: Config) -> str:
     batch_size = config.batch_size or row.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
-    identity = identity_of(settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root)
+    identity = identity_of(
+        settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root
+    )
     tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()})
-    training = TrainingRun(
+    return TrainingRun(
         name=name,
         storage_path=home("runs"),
         build=partial(build, row.architecture(), spec.to_dict(), settings),
@@ -94,8 +105,14 @@ def train(config: Config) -> str:
         log_every=max(1, min(50, settings.steps // 50)),
         validate=ReconstructionCheck(root, dataset.source),
     )
-    output = absolute(config.output) if config.output else home("models", name)
-    return fit(training, config.workers, output)
+
+
+def train(config: Config) -> str:
+    """Train and return the model's directory. Ray must run."""
+    from jobs.ray_training import fit
+
+    training = prepare(config)
+    return fit(training, config.workers, absolute(config.output) if config.output else home("models", training.name))
 
 
 def build(architecture: dict, layout: dict, settings, device, wrap):

@@ -57,7 +57,9 @@ class ReconstructionCheck:
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
             batch = layout_batch(chosen, spec).to(trainer.device)
-            noise = stacked_noise([keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device)
+            noise = stacked_noise(
+                [keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
+            )
             output, posterior = model(batch, noise)
             parts = lvae_loss(output, posterior, batch, spec).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
@@ -68,7 +70,9 @@ class ReconstructionCheck:
                 part = ground_sums(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
                 sums = part if sums is None else sums + part
         model.train()
-        scores = ground_scores(sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high]))
+        scores = ground_scores(
+            sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high])
+        )
         metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
         metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
         pictures = [bev_picture(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
@@ -98,7 +102,9 @@ class SamplingCheck:
 
         shape = (dit.config.channels, dit.config.size, dit.config.size)
         labels = torch.arange(SHOWN, device=device) % dit.config.num_labels
-        latents = sample(dit, Walk(Diffusion(), self.num_inference_steps), SceneNoise(0, range(SHOWN), shape, device), labels)
+        latents = sample(
+            dit, Walk(Diffusion(), self.num_inference_steps), SceneNoise(0, range(SHOWN), shape, device), labels
+        )
         shift, scale = (
             torch.tensor(v or [d] * shape[0], device=device)[:, None, None]
             for v, d in ((dit.config.shift, 0.0), (dit.config.scale, 1.0))
@@ -130,5 +136,3 @@ def held_out_latents(root: str, source: str, latents: str, label: str, count: in
         if left == 0:
             break
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-

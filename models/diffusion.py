@@ -38,7 +38,7 @@ class Diffusion:
         return np.arange(num_steps) * (self.num_timesteps // num_steps)
 
     def add_noise(
-        self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, "b"]
+        self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, b]
     ) -> Float[Tensor, "b c h w"]:
         """z_t = sqrt(alpha_bar_t) z_0 + sqrt(1 - alpha_bar_t) eps."""
         alpha_bar = torch.from_numpy(self.alpha_bar).to(clean.device)[timestep][:, None, None, None]
@@ -132,7 +132,7 @@ def sample(
     model: Denoiser,
     walk: Walk,
     noise: SceneNoise,
-    label: Int[Tensor, "b"],
+    label: Int[Tensor, b],
     transitions: list[tuple[int, int]] | None = None,
     known: Known | None = None,
     on_step: Callable[[int, int], None] | None = None,

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 FREQUENCIES = 256
 
 
-def timestep_frequencies(timestep: Float[Tensor, "batch"]) -> Float[Tensor, "batch 256"]:
+def timestep_frequencies(timestep: Float[Tensor, batch]) -> Float[Tensor, "batch 256"]:
     """Sinusoidal embedding of a timestep, cosines first."""
     half = FREQUENCIES // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
@@ -118,13 +118,13 @@ class DiT(ModelMixin, ConfigMixin):
     def null_label(self) -> int:
         return self.config.num_labels
 
-    def condition(self, timestep: Int[Tensor, "batch"], label: Int[Tensor, "batch"]) -> Float[Tensor, "batch d"]:
+    def condition(self, timestep: Int[Tensor, batch], label: Int[Tensor, batch]) -> Float[Tensor, "batch d"]:
         """One vector per sample that modulates every block: SiLU of timestep plus label embedding."""
         frequencies = timestep_frequencies(timestep).to(self.patch_out.weight.dtype)
         return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
 
     def forward(
-        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, "batch"], label: Int[Tensor, "batch"]
+        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, batch], label: Int[Tensor, batch]
     ) -> Float[Tensor, "batch c h w"]:
         """The noise in `latent`."""
         patch, tokens = self.config.patch, self.config.size // self.config.patch

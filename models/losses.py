@@ -104,7 +104,7 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
 def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec) -> LVAELoss:
     """The total objective of stage 1 and its parts."""
     proposed = (output.features, output.existence_logit)
-    assignment = match(*proposed, batch.features, batch.real, spec.slots, output.proposals)
+    assignment = match(*proposed, batch.features, batch.real, spec.slots, output.proposals, output.match_weights)
     existence, center, cholesky = object_losses(
         *proposed, batch.features, batch.real, assignment, spec, output.proposals
     )

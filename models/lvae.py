@@ -13,7 +13,8 @@ from torch import Tensor
 
 from models.cells import CellDecoder
 from models.ground import GroundDecoder, GroundEncoder
-from models.layout import LayoutBatch, LayoutSpec
+from models.layout import FEATURES, LayoutBatch, LayoutSpec
+from models.matching import MatchWeights
 from models.objects import ObjectDecoder, ObjectEncoder
 from models.tensors import DecodedLayout
 
@@ -42,17 +43,25 @@ class LayoutOutput:
     features: Float[Tensor, "batch proposals 9"]
     existence_logit: Float[Tensor, "batch proposals"]
     proposals: tuple[int, ...]
+    match_weights: MatchWeights
 
     def layouts(self) -> list[DecodedLayout]:
         """One numpy layout per sample, probabilities instead of logits."""
         parts = (self.occupancy_logit.sigmoid(), self.height, self.features, self.existence_logit.sigmoid())
         category = np.repeat(np.arange(len(self.proposals)), self.proposals)
-        return [DecodedLayout(*sample, category) for sample in zip(*(p.float().cpu().numpy() for p in parts), strict=True)]
+        return [
+            DecodedLayout(*sample, category) for sample in zip(*(p.float().cpu().numpy() for p in parts), strict=True)
+        ]
 
 
 # Posteriors start narrow (sigma 0.14): decoders see the latent, not noise, from the first step on. With sigma 1,
 # the default, the same number of steps ends at 1.5 times the loss (tests/test_models.py, one batch, 300 steps).
 INITIAL_LOGVAR = -4.0
+
+
+def logit(probability: Tensor) -> Tensor:
+    """Logit of a probability that may be 0 or 1."""
+    return probability.clamp(0.01, 0.99).logit()
 
 
 class LayoutVAE(ModelMixin, ConfigMixin):
@@ -98,6 +107,21 @@ class LayoutVAE(ModelMixin, ConfigMixin):
             self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
             self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
 
+    @torch.no_grad()
+    def start_at(self, batch: LayoutBatch) -> None:
+        """Set the last biases so that every output starts at its mean over `batch`, a sample of training layouts.
+
+        Adam moves a bias by about the learning rate per step: from zero, thousands of steps would go into learning
+        that a pole is thin and that most pixels are no road.
+        """
+        occupied = batch.occupied.mean(dim=(0, 2, 3))
+        height = (batch.height * batch.occupied).sum(dim=(0, 2, 3)) / batch.occupied.sum(dim=(0, 2, 3)).clamp(min=1)
+        self.ground_decoder.start_at(torch.cat([height, logit(occupied)]))
+        groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
+        features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
+        count = torch.stack([r.sum() / len(r) for _, r in groups])
+        self.object_decoder.start_at(logit(features), count)
+
     @property
     def spec(self) -> LayoutSpec:
         return LayoutSpec.from_dict(self.config.layout)
@@ -119,8 +143,9 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         """Each decoder reads its own half of the channels."""
         ground, objects = latent.chunk(2, dim=1)
         height, occupancy_logit = self.ground_decoder(ground).chunk(2, dim=1)
-        features, existence_logit = self.object_decoder(objects)
-        return LayoutOutput(height, occupancy_logit, features, existence_logit, self.object_decoder.proposals)
+        decoder = self.object_decoder
+        features, existence_logit = decoder(objects)
+        return LayoutOutput(height, occupancy_logit, features, existence_logit, decoder.proposals, decoder.match_weights)
 
     def forward(self, batch: LayoutBatch, noise: Float[Tensor, "batch c2 h w"]) -> tuple[LayoutOutput, Posterior]:
         """Reconstruction from a sampled latent, and the posterior it was sampled from."""

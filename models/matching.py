@@ -10,21 +10,33 @@ and a rectangular assignment over the n real rows is the square problem of the p
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-# Paper, supplement B.2: category-agnostic matching weights.
-MATCH_PROB, MATCH_CENTER, MATCH_CHOLESKY = 6.0, 3.0, 3.0
+
+
+class MatchWeights(NamedTuple):
+    """Category-agnostic weights of the matching cost; the defaults are the paper's (supplement B.2)."""
+
+    existence: float = 6.0
+    center: float = 3.0
+    cholesky: float = 3.0
+
 
 
 def match_cost(
-    features: Float[Tensor, "batch n 9"], existence_logit: Float[Tensor, "batch n"], truth: Float[Tensor, "batch m 9"]
+    features: Float[Tensor, "batch n 9"],
+    existence_logit: Float[Tensor, "batch n"],
+    truth: Float[Tensor, "batch m 9"],
+    weights: MatchWeights = MatchWeights(),
 ) -> Float[Tensor, "batch m n"]:
     """Cost of giving slot n to real primitive m, up to a constant per sample."""
-    weight = features.new_tensor([MATCH_CENTER] * 3 + [MATCH_CHOLESKY] * 6)
-    return torch.cdist(truth * weight, features * weight, p=1) - MATCH_PROB * existence_logit[:, None, :]
+    weight = features.new_tensor([weights.center] * 3 + [weights.cholesky] * 6)
+    return torch.cdist(truth * weight, features * weight, p=1) - weights.existence * existence_logit[:, None, :]
 
 
 @torch.no_grad()
@@ -35,6 +47,7 @@ def match(
     real: Bool[Tensor, "batch slots"],
     slots: tuple[int, ...],
     proposals: tuple[int, ...],
+    weights: MatchWeights = MatchWeights(),
 ) -> Int[Tensor, "batch proposals"]:
     """For every proposal the index of the true slot it is matched with, -1 where with padding.
 
@@ -46,7 +59,7 @@ def match(
         theirs, mine = slice(first_slot, first_slot + capacity), slice(first_proposal, first_proposal + offered)
         counts = real[:, theirs].sum(dim=1).tolist()
         if most := max(counts):
-            cost = match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs][:, :most])
+            cost = match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs][:, :most], weights)
             cost = cost.double().cpu().numpy()
             for sample, count in enumerate(counts):
                 if count:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from models.layout import FEATURES
+from models.matching import MatchWeights
 
 CATEGORY_EMBEDDING = 10  # paper, Sec. 3.2: 9 features + 10 + padding flag = 20
 
@@ -179,6 +180,7 @@ class ObjectDecoder(nn.Module):
     ) -> None:
         super().__init__()
         self.proposals = tuple(slots)
+        self.match_weights = MatchWeights()
         self.project_in = nn.Linear(latent_channels, width)  # patch size 1
         self.queries = nn.Parameter(torch.randn(sum(slots), width))
         self.layers = nn.ModuleList(DecoderLayer(width, heads, hidden) for _ in range(layers))
@@ -197,3 +199,9 @@ class ObjectDecoder(nn.Module):
         features = torch.cat([head.features(group) for head, group in groups], dim=1).sigmoid()
         existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence
+
+    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, "categories"]) -> None:
+        """Set the last biases: mean features per category, existence as often as `count` per scene."""
+        for head, mean, expected, offered in zip(self.heads, feature_logit, count, self.proposals, strict=True):
+            head.features[-1].bias.copy_(mean)
+            head.existence.bias.copy_((expected / offered).clamp(0.01, 0.99).logit())

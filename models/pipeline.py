@@ -252,7 +252,11 @@ class OutpaintCanvas:
         margin_m = step * grid.rows // size * grid.resolution_m
         pad = 2 * step * grid.rows // size
         large = replace(
-            grid, front_m=grid.front_m + margin_m, left_m=grid.left_m + margin_m, rows=grid.rows + pad, cols=grid.cols + pad
+            grid,
+            front_m=grid.front_m + margin_m,
+            left_m=grid.left_m + margin_m,
+            rows=grid.rows + pad,
+            cols=grid.cols + pad,
         )
         middle = slice(step, step + size)
         latent = torch.zeros(channels, size + 2 * step, size + 2 * step, device=pipeline.device)

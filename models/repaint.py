@@ -17,7 +17,9 @@ SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-def repaint_transitions(num_steps: int, jump_length: int = JUMP_LENGTH, resamplings: int = RESAMPLINGS) -> list[tuple[int, int]]:
+def repaint_transitions(
+    num_steps: int, jump_length: int = JUMP_LENGTH, resamplings: int = RESAMPLINGS
+) -> list[tuple[int, int]]:
     """(from, to) states of RePaint: at every jump_length-th state go jump_length back up, resamplings - 1 times.
 
     250 steps, J = R = 10: jumps at states 0, 10, ..., 230, nine times each, 2,410 denoising steps in all.

@@ -205,7 +205,16 @@ class Scene:
 
     def select(self, keep: np.ndarray) -> Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
-        per_primitive = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
+        per_primitive = (
+            "category",
+            "center_m",
+            "rotation",
+            "size_m",
+            "existence",
+            "heading_rad",
+            "instance_id",
+            "label",
+        )
         return replace(self, **{name: getattr(self, name)[keep] for name in per_primitive})
 
     def moved(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:

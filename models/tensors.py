@@ -71,7 +71,12 @@ def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     parameters = cholesky_parameters(scene.rotation[primitives], scene.size_m[primitives])
     features[slots, 3:] = spec.cholesky_bounds.normalise(parameters)
     real[slots] = True
-    return {"height": np.round(height * 65535).astype(np.uint16), "occupied": occupied, "features": features, "real": real}
+    return {
+        "height": np.round(height * 65535).astype(np.uint16),
+        "occupied": occupied,
+        "features": features,
+        "real": real,
+    }
 
 
 def layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:

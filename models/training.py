@@ -106,9 +106,20 @@ class Trainer:
     """
 
     def __init__(
-        self, model: ModelMixin, loss: LossFunction, settings: Optimisation, device: torch.device, wrapped: nn.Module | None = None
+        self,
+        model: ModelMixin,
+        loss: LossFunction,
+        settings: Optimisation,
+        device: torch.device,
+        wrapped: nn.Module | None = None,
     ) -> None:
-        self.model, self.wrapped, self.loss, self.settings, self.device = model, wrapped or model, loss, settings, device
+        self.model, self.wrapped, self.loss, self.settings, self.device = (
+            model,
+            wrapped or model,
+            loss,
+            settings,
+            device,
+        )
         self.parameters = dict(model.named_parameters())
         self.optimiser = torch.optim.AdamW(
             self.parameters.values(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
@@ -126,7 +137,9 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"], group["betas"] = rate, (beta1, self.settings.betas[1])
         generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
-        parts = self.loss(self.wrapped, {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}, generators)
+        parts = self.loss(
+            self.wrapped, {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}, generators
+        )
         if not torch.isfinite(parts["loss"]):
             raise ValueError(
                 f"step {self.steps_done}: the loss is {float(parts['loss'])}; lower the learning rate or look at this batch"
@@ -164,7 +177,9 @@ class Trainer:
         for name, parameter in self.parameters.items():
             for key, value in self.optimiser.state[parameter].items():
                 tensors[f"optimiser.{key}.{name}"] = value
-        save_file({name: value.contiguous().cpu() for name, value in tensors.items()}, directory / "training.safetensors")
+        save_file(
+            {name: value.contiguous().cpu() for name, value in tensors.items()}, directory / "training.safetensors"
+        )
         state = {"steps_done": self.steps_done, "settings": asdict(self.settings)}
         temporary = directory / "state.json.tmp"
         temporary.write_text(json.dumps(state, indent=1))

@@ -63,7 +63,9 @@ class Describer:
         torch.set_num_threads(1)
         self.chosen, self.dataset = chosen, dataset
         self.network = inception.load_inception(inception_weights) if inception_weights else None
-        self.slab_offset_m = validity.SLAB_OFFSET_M if dataset.spec.surface == "top" and dataset.source != "av2" else 0.0
+        self.slab_offset_m = (
+            validity.SLAB_OFFSET_M if dataset.spec.surface == "top" and dataset.source != "av2" else 0.0
+        )
 
     def __call__(self, row: dict) -> list[dict]:
         shard, rows = self.chosen[row["id"]]
@@ -95,7 +97,9 @@ class Describer:
 def scene_statistics(scene: Scene, ground_classes: tuple[str, ...]) -> np.ndarray:
     """`statistics.layout_statistics` over the dataset's own ground classes."""
     height, occupied = ground_on_grid(scene, ground_classes, scene.grid)
-    return statistics.layout_statistics(replace(scene, ground_classes=ground_classes, height_m=height, occupied=occupied))
+    return statistics.layout_statistics(
+        replace(scene, ground_classes=ground_classes, height_m=height, occupied=occupied)
+    )
 
 
 def describe(
@@ -125,7 +129,9 @@ def describe(
     return arrays
 
 
-def compare(real: dict[str, np.ndarray], generated: dict[str, np.ndarray], dataset: Dataset, k: tuple[int, ...] = (3,)) -> dict:
+def compare(
+    real: dict[str, np.ndarray], generated: dict[str, np.ndarray], dataset: Dataset, k: tuple[int, ...] = (3,)
+) -> dict:
     """Scores of `generated` against `real`, both from `describe`, as nested plain numbers.
 
     With Inception features: FID, IS, precision, recall. Without: distances of layout statistics and of a fixed
@@ -172,7 +178,11 @@ def neighbourhood(real: np.ndarray, generated: np.ndarray, k: tuple[int, ...], p
     if n <= max(k):
         return {}
     found = generation.precision_recall(real[:n], generated[:n], k)
-    return {f"{prefix}{name}_k{r.k}": value for r in found for name, value in (("precision", r.precision), ("recall", r.recall))}
+    return {
+        f"{prefix}{name}_k{r.k}": value
+        for r in found
+        for name, value in (("precision", r.precision), ("recall", r.recall))
+    }
 
 
 # ------------------------------------------------------------------------------------------------------ rebuild
@@ -194,7 +204,11 @@ class Rebuilder:
         for scene, layout in zip(scenes, output.layouts(), strict=True):
             height = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
             everywhere = replace(
-                scene, ground_classes=spec.ground_classes, grid=spec.grid, height_m=height, occupied=np.ones_like(height, bool)
+                scene,
+                ground_classes=spec.ground_classes,
+                grid=spec.grid,
+                height_m=height,
+                occupied=np.ones_like(height, bool),
             )
             fine_height, _ = ground_on_grid(everywhere, spec.ground_classes, scene.grid)
             masked = replace(everywhere, occupied=layout.occupancy > 0.5)
@@ -241,13 +255,16 @@ def rebuild(
             on_scenes(int(row["scenes"]))
     rows.sort(key=lambda row: row["id"])
     spec = load_lvae(lvae).spec
-    sums = GroundSums(*(np.sum([row[f"ground_{name}"] for row in rows], axis=0) for name in GroundSums.__dataclass_fields__))
+    sums = GroundSums(
+        *(np.sum([row[f"ground_{name}"] for row in rows], axis=0) for name in GroundSums.__dataclass_fields__)
+    )
     ground = ground_scores(sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high]))
     matches = join_matches(
         [
-            Matches(**{name: np.asarray(row[f"match_{name}"]) for name in Matches.__dataclass_fields__} | {
-                "hit": np.asarray(row["match_hit"]).reshape(-1, 10)
-            })
+            Matches(
+                **{name: np.asarray(row[f"match_{name}"]) for name in Matches.__dataclass_fields__}
+                | {"hit": np.asarray(row["match_hit"]).reshape(-1, 10)}
+            )
             for row in rows
         ]
     )

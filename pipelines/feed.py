@@ -84,7 +84,9 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
     return out
 
 
-def batches(stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1) -> Iterator[Arrays]:
+def batches(
+    stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
+) -> Iterator[Arrays]:
     """Local batches of steps start_step .. stop_step - 1 for one worker: a Ray Data pipeline that reads ahead.
 
     Raises ValueError if the global batch does not divide by the number of workers.

@@ -84,9 +84,13 @@ def sample_scenes(
     pipeline = load_pipeline(request.model)
     known = LABELS[pipeline.dit.config.label]
     if unknown := set(request.labels) - set(known):
-        raise ValueError(f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}")
+        raise ValueError(
+            f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}"
+        )
     record = storage.join(request.output, f"generated-{request.run}.json")
-    options = {name: value for name, value in asdict(request).items() if name != "output"} | {"labels": list(request.labels)}
+    options = {name: value for name, value in asdict(request).items() if name != "output"} | {
+        "labels": list(request.labels)
+    }
     if storage.exists(record):
         made = storage.read_json(record)
         differing = [name for name in options if made.get(name) != options[name]]

@@ -268,7 +268,9 @@ def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
     for name, group, thresholds in groups:
         labels = density(group_count(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
         column = f"{name}_density"
-        scenes = scenes.set_column(scenes.column_names.index(column), SCENES.field(column), pa.array(labels, pa.string()))
+        scenes = scenes.set_column(
+            scenes.column_names.index(column), SCENES.field(column), pa.array(labels, pa.string())
+        )
     return scenes.cast(SCENES)
 
 

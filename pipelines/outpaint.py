@@ -49,7 +49,9 @@ def label_of(scene: Scene, kind: str) -> str:
     names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
     names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
     if names[kind] not in LABELS[kind]:
-        raise ValueError(f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})")
+        raise ValueError(
+            f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
+        )
     return names[kind]
 
 

@@ -41,9 +41,7 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
     """
     for sequence, position_m in positions_by_sequence.items():
         if np.ndim(position_m) != 2 or np.shape(position_m)[1] != 3:
-            raise ValueError(
-                f"sequence {sequence}: positions have shape {np.shape(position_m)}, expected (p, 3)"
-            )
+            raise ValueError(f"sequence {sequence}: positions have shape {np.shape(position_m)}, expected (p, 3)")
         if not np.isfinite(position_m).all():
             raise ValueError(f"sequence {sequence}: positions are not finite; fix or drop those poses first")
     if not any(len(position_m) for position_m in positions_by_sequence.values()):

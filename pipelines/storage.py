@@ -36,7 +36,9 @@ def list_files(uri: str, suffix: str) -> list[str]:
     fs, path = resolve(uri)
     found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
     inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
-    shown = [name for name, _ in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))]
+    shown = [
+        name for name, _ in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))
+    ]
     return [join(uri, name) for name in sorted(shown)]
 
 
@@ -57,7 +59,9 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
-    write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=_dictionary(table)))
+    write_whole(
+        uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=_dictionary(table))
+    )
 
 
 def _dictionary(table: pa.Table) -> list[str]:
@@ -70,12 +74,16 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
     try:
         table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=None)
     except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
-        raise ValueError(f"{uri}: cannot be read as Parquet ({error}); delete it and run the job that wrote it again") from error
+        raise ValueError(
+            f"{uri}: cannot be read as Parquet ({error}); delete it and run the job that wrote it again"
+        ) from error
     if schema is not None:
         wanted = schema.names if columns is None else columns
         for name in wanted:
             if name not in table.column_names or table.schema.field(name).type != schema.field(name).type:
-                raise ValueError(f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another version")
+                raise ValueError(
+                    f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another version"
+                )
     return table
 
 

@@ -16,3 +16,36 @@ def real_data() -> Path:
             f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/"
         )
     return path
+
+
+@pytest.fixture(scope="session")
+def cluster():
+    """One small local Ray for all tests that need it."""
+    settings = {
+        "RAY_AUTH_MODE": "disabled",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_DATA_USE_DATASOURCE_V2": "0",
+        "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
+        "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
+        "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
+        "DO_NOT_TRACK": "true",
+        "OMP_WAIT_POLICY": "PASSIVE",
+    }
+    os.environ.update(settings)
+    import ray
+
+    ray.init(address="local", num_cpus=4, object_store_memory=300 * 2**20, logging_level="WARNING", log_to_driver=False)
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(scope="session")
+def home(tmp_path_factory, cluster) -> Path:
+    """A $PRITTI_HOME of its own, in which the smoke presets have run once: data, models, latents."""
+    path = tmp_path_factory.mktemp("home")
+    os.environ["PRITTI_HOME"] = str(path)
+    os.environ.pop("MLFLOW_TRACKING_URI", None)
+    from jobs.train_dit import Config, train
+
+    train(Config(preset="smoke"))
+    return path

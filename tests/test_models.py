@@ -10,7 +10,7 @@ from models.dit import DiT
 from models.layout import LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
-from models.matching import MATCH_CENTER, MATCH_CHOLESKY, MATCH_PROB, match
+from models.matching import MatchWeights, match
 from models.tensors import layout_batch
 from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
 
@@ -76,10 +76,10 @@ def literal_total(features, logit, truth, real, columns) -> float:
     total = 0.0
     for i, j in enumerate(columns):
         target = 1.0 if real[i] else 0.0
-        total += MATCH_PROB * float(-(target * p[j].log() + (1 - target) * (1 - p[j]).log()))
+        total += MatchWeights().existence * float(-(target * p[j].log() + (1 - target) * (1 - p[j]).log()))
         if real[i]:
-            total += MATCH_CENTER * float((truth[i, :3] - features[j, :3]).abs().sum())
-            total += MATCH_CHOLESKY * float((truth[i, 3:] - features[j, 3:]).abs().sum())
+            total += MatchWeights().center * float((truth[i, :3] - features[j, :3]).abs().sum())
+            total += MatchWeights().cholesky * float((truth[i, 3:] - features[j, 3:]).abs().sum())
     return total
 
 

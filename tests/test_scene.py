@@ -8,7 +8,6 @@ from models.cholesky import boxes_from_cholesky, cholesky_parameters, scatter_ma
 from models.scene import Grid, canonical_boxes, merge, yaw_of
 
 
-
 def same_corners(a, b):
     """Each corner of a has a corner of b within 1e-6."""
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2

@@ -1,5 +1,7 @@
 """Tables: what goes in comes out, and other people's tools can read it."""
 
+from pathlib import Path
+
 import duckdb
 import numpy as np
 import pyarrow.parquet as pq
@@ -71,8 +73,8 @@ def test_the_analysts_first_query(tmp_path, scenes):
 def test_the_readmes_decoder(tmp_path, scenes):
     """The ten lines that README gives to people without our code."""
     Shard(str(tmp_path), "town", "train", 0).write(scenes)
-    readme = (storage.os.path.dirname(__file__) + "/../README.md")
-    block = open(readme).read().split("<!-- decoder -->")[1].split("```python")[1].split("```")[0]
+    readme = Path(__file__).parents[1] / "README.md"
+    block = readme.read_text().split("<!-- decoder -->")[1].split("```python")[1].split("```")[0]
     assert len([line for line in block.splitlines() if line.strip()]) <= 10
     names = {}
     exec(block.replace("DIR", str(tmp_path)), names)

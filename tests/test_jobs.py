@@ -1,0 +1,247 @@
+"""The jobs, on a real Ray with the smoke presets: the chain, resume, two workers, bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+import trimesh
+from safetensors.torch import load_file
+
+from models.scene import DENSITIES
+from pipelines.scenes.tables import find_shards, read_scenes
+
+JOBS = sorted(p.name for p in (Path(__file__).parents[1] / "jobs").glob("*.py") if os.access(p, os.X_OK))
+
+
+def weights(directory: Path) -> dict:
+    return load_file(directory / "diffusion_pytorch_model.safetensors")
+
+
+def test_a_smoke_preset_makes_its_own_inputs(home):
+    assert (home / "datasets/smoke/dataset.json").exists()
+    rows = duckdb.sql(
+        f"select split, count(*), count(distinct vegetation_density) from '{home}/datasets/smoke/scenes/**/*.parquet' group by 1"
+    ).fetchall()
+    assert {split: count for split, count, _ in rows} == {"train": 32, "test": 16}
+    latents = json.loads((home / "datasets/smoke/latents.json").read_text())
+    assert latents["complete"] and latents["scenes"] == {"train": 32, "test": 16}
+    assert (home / "models/pritti-smoke/model_index.json").exists()
+    assert not list(home.rglob("*.pkl")) and not list(home.rglob("*.pt"))
+
+
+def test_latents_are_aligned_and_what_the_lvae_says(home):
+    from models.tensors import layout_batch
+    from pipelines.encode import load_lvae
+
+    shard = find_shards(str(home / "datasets/smoke"), split="test")[0]
+    table, scenes = shard.read("latents"), shard.scenes()
+    assert table["scene_id"].to_pylist() == [s.scene_id for s in scenes]
+    lvae = load_lvae(str(home / "models/lvae-smoke"))
+    want = lvae.encode(layout_batch(scenes, lvae.spec)).mean.numpy()
+    got = table["mean"].combine_chunks().to_numpy_ndarray()
+    assert got.dtype == np.float16 and np.allclose(got, want, atol=2e-3 * np.abs(want).max())
+
+
+def test_mlflow_has_parameters_losses_pictures_and_the_model(home):
+    from jobs.tracking import client
+
+    api = client(f"sqlite:///{home}/mlflow.db")
+    for experiment in ("pritti-lvae", "pritti-dit"):
+        run = api.search_runs([api.get_experiment_by_name(experiment).experiment_id])[0]
+        assert run.info.status == "FINISHED" and run.data.params["preset"] == "smoke"
+        assert {"loss", "learning_rate", "scenes_per_second", "validation_loss"} <= set(run.data.metrics)
+        assert len(api.get_metric_history(run.info.run_id, "loss")) == 8
+        artifacts = {a.path for a in api.list_artifacts(run.info.run_id)}
+        assert "model" in artifacts and artifacts & {"reconstruction", "samples"}
+
+
+def test_running_a_finished_job_again_changes_nothing(home):
+    from jobs.train_lvae import Config, train
+
+    before = weights(home / "models/lvae-smoke")
+    train(Config(preset="smoke"))
+    after = weights(home / "models/lvae-smoke")
+    assert all((before[k] == after[k]).all() for k in before)
+    with pytest.raises(ValueError, match=r"run 'lvae-smoke' was started with learning_rate=0.001, asked for 0.5"):
+        train(Config(preset="smoke", learning_rate=0.5))
+
+
+def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
+    """A worker dies by SIGKILL in the middle; Ray Train starts another from the last checkpoint."""
+    from jobs.ray_training import fit
+    from jobs.train_lvae import Config, prepare
+
+    marker = str(tmp_path / "died")
+    run = prepare(Config(preset="smoke", name="lvae-killed", checkpoint_every=3))
+    first = run.reader
+
+    class DieOnce:
+        def __call__(self, trainer):
+            if trainer.steps_done >= 6 and not os.path.exists(marker):
+                open(marker, "w").close()
+                os.kill(os.getpid(), 9)
+            return {}, {}
+
+    output = fit(replace(run, validate=DieOnce(), reader=first), 1, str(home / "models/lvae-killed"))
+    assert os.path.exists(marker)
+    whole, resumed = weights(home / "models/lvae-smoke"), weights(Path(output))
+    assert all((whole[k] == resumed[k]).all() for k in whole)
+
+
+def test_the_same_command_resumes_after_the_driver_died(home):
+    from jobs.ray_training import fit
+    from jobs.train_dit import Config, prepare
+
+    def stop_at_four(trainer):
+        if trainer.steps_done == 4:
+            raise KeyError("stopped")
+        return {}, {}
+
+    run, _ = prepare(Config(preset="smoke", name="dit-stopped", checkpoint_every=2))
+    with pytest.raises(Exception, match="stopped"):
+        fit(replace(run, validate=stop_at_four), 1, str(home / "models/stopped"))
+    fit(replace(run, validate=None), 1, str(home / "models/stopped"))
+    whole, resumed = weights(home / "models/pritti-smoke/dit"), weights(home / "models/stopped")
+    assert all((whole[k] == resumed[k]).all() for k in whole)
+    assert not list((home / "runs").rglob("*.pkl"))
+
+
+def test_two_workers_learn_what_one_does(home):
+    from jobs.train_dit import Config, prepare, train
+
+    assert prepare(Config(preset="smoke", name="dit-two", workers=2))[0].stream.batch_size == 8
+    train(Config(preset="smoke", name="dit-two", workers=2, output=str(home / "models/two")))
+    one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two/dit")
+    for name in one:
+        assert np.allclose(one[name], two[name], atol=1e-4), name
+
+
+@pytest.fixture(scope="session")
+def samples(home) -> Path:
+    from jobs.sample_scenes import Config, sample
+
+    model, output = str(home / "models/pritti-smoke"), home / "generated"
+    sample(Config(model=model, output=str(output), num_scenes=9, steps=10, batch_size=8, glb=1))
+    return output
+
+
+def test_scenes_do_not_depend_on_actors_or_batch(home, samples, tmp_path):
+    from jobs.sample_scenes import Config, sample
+    from models.tensors import EXISTENCE_THRESHOLD
+
+    model = str(home / "models/pritti-smoke")
+    sample(Config(model=model, output=str(tmp_path), num_scenes=9, steps=10, batch_size=1, actors=2))
+    a, b = list(read_scenes(str(samples))), list(read_scenes(str(tmp_path)))
+    assert [s.scene_id for s in a] == [s.scene_id for s in b] and len(a) == 9
+    assert [s.vegetation_density for s in a] == [*DENSITIES] * 3
+    for one, other in zip(a, b, strict=True):
+        sure = [s.select(np.abs(s.existence - EXISTENCE_THRESHOLD) > 1e-3) for s in (one, other)]
+        assert np.array_equal(sure[0].category, sure[1].category)
+        assert np.allclose(sure[0].center_m, sure[1].center_m, atol=0.01)
+        assert (one.occupied == other.occupied).mean() > 0.999
+
+
+def test_sampling_goes_on_where_it_stopped(home, samples):
+    from jobs.sample_scenes import Config, sample
+
+    shards = find_shards(str(samples))
+    before = [s.scene_id for s in read_scenes(str(samples))]
+    kept, lost = Path(shards[0].path("scenes")), Path(shards[1].path("rasters"))
+    stamp = kept.stat().st_mtime_ns
+    lost.unlink()
+    config = Config(model=str(home / "models/pritti-smoke"), output=str(samples), num_scenes=9, steps=10, batch_size=8)
+    sample(config)
+    assert kept.stat().st_mtime_ns == stamp and lost.exists()
+    assert [s.scene_id for s in read_scenes(str(samples))] == before
+    with pytest.raises(ValueError, match="with seed=0, asked for 5"):
+        sample(replace(config, seed=5))
+    with pytest.raises(ValueError, match="unknown to .*expected some of: low, medium, high"):
+        sample(replace(config, run="x", labels=("dense",)))
+
+
+def test_the_glb_has_a_named_node_per_primitive(samples):
+    scene = next(read_scenes(str(samples)))
+    path = samples / "glb/samples" / f"{scene.scene_id}.glb"
+    nodes = set(trimesh.load(path).graph.nodes)
+    for category in set(scene.label):
+        assert sum(node.startswith(category) for node in nodes) == (scene.label == category).sum()
+
+
+def test_outpainting_and_evaluation(home, samples, tmp_path):
+    from jobs.evaluate_scenes import Config, evaluate
+    from jobs.outpaint_scenes import Config as OutpaintConfig
+    from jobs.outpaint_scenes import outpaint
+
+    model = str(home / "models/pritti-smoke")
+    options = OutpaintConfig(
+        model=model, input=str(samples), source="generated-samples", output=str(tmp_path), steps=8, jump_length=2, resamplings=2
+    )
+    outpaint(options)
+    large, small = next(read_scenes(str(tmp_path))), next(read_scenes(str(samples), "generated-samples"))
+    assert large.grid.rows == 2 * small.grid.rows and large.occupied.shape[1:] == (64, 64)
+    middle = large.cropped(small.grid)
+    assert np.array_equal(middle.occupied, small.occupied) and len(middle) == len(small)
+    assert np.allclose(middle.height_m, small.height_m, atol=0.006)
+    assert (tmp_path / "glb/outpainted").is_dir()
+
+    scores = evaluate(
+        Config(real=str(home / "datasets/smoke"), generated=str(samples), lvae=str(home / "models/lvae-smoke"), output=str(tmp_path))
+    )
+    assert scores["generation"]["scenes"] == {"real": 16, "generated": 9}
+    assert 0 <= scores["reconstruction"]["ground_iou"] <= 1
+    written = duckdb.sql(f"select value from '{tmp_path}/metrics.parquet' where metric = 'generation.layout_frechet'").fetchall()
+    assert np.isclose(written[0][0], scores["generation"]["layout_frechet"])
+    assert "fid" not in scores["generation"]
+
+
+def test_real_against_real_is_near_perfect(home):
+    """Half of the training scenes scored against all of them: the evaluator's own floor."""
+    from pipelines.evaluate import Selection, compare, describe
+    from pipelines.ingest import Dataset
+
+    dataset = Dataset.open(str(home / "datasets/smoke"))
+    sides = [describe(Selection(dataset.root, "town", "train", limit), dataset) for limit in (None, None)]
+    scores = compare(*sides, dataset)
+    assert abs(scores["layout_frechet"]) < 1e-4 and abs(scores["random_frechet"]) < 1e-4
+    assert scores["random_precision_k3"] == scores["random_recall_k3"] == 1.0
+    assert scores["label_fidelity"]["joint_fidelity"] == 1.0
+
+
+def command(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    root = Path(__file__).parents[1]
+    return subprocess.run(
+        [sys.executable, *words], cwd=root, capture_output=True, text=True, env=os.environ | environment, timeout=120
+    )
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_help_explains(job):
+    done = command(f"jobs/{job}", "--help")
+    assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("train_lvae.py", "tiny"), "unknown preset 'tiny', expected one of: smoke, town, kitti360, av2"),
+        (("train_lvae.py",), "run jobs/preprocess_scenes.py"),
+        (("train_dit.py", "kitti360"), "run jobs/preprocess_scenes.py"),
+        (("encode_latents.py",), "run jobs/preprocess_scenes.py"),
+        (("sample_scenes.py",), "run jobs/train_dit.py first"),
+        (("sample_scenes.py", "--num-scenes", "0"), "--num-scenes is 0"),
+        (("preprocess_scenes.py", "kitti360", "--input", "nowhere"), "--input nowhere: no such directory"),
+        (("preprocess_scenes.py", "av2", "--input", "tests"), "tests"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(words, says, tmp_path):
+    done = command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=str(tmp_path))
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1 and says in lines[0], done.stderr
+    assert "Traceback" not in done.stderr
