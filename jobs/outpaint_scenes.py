@@ -26,7 +26,7 @@ class Config:
     """Source of the scenes (default: whatever is there)."""
     split: str = ""
     limit: int = 1
-    """How many scenes to extend."""
+    """How many scenes to extend, from the first on."""
     label: str = ""
     """Label of the new blocks (default: the scene's own)."""
     output: str = ""
@@ -65,7 +65,7 @@ def outpaint(config: Config) -> str:
         guidance_scale=config.guidance,
     )
     source = absolute(config.input) if config.input else home("generated")
-    selection = Selection(source, config.source or None, config.split or None, config.limit)
+    selection = Selection(source, config.source or None, config.split or None, config.limit, spread=False)
     with Progress() as bar:
         shown = bar.add_task("outpaint", total=config.limit)
         outpaint_scenes(request, selection, config.actors, lambda: bar.advance(shown))

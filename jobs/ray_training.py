@@ -50,7 +50,10 @@ class TrainingRun:
 
 
 def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in batch.items()}
+    return {
+        name: torch.from_numpy(np.array(value))  # a copy: Ray's are read-only
+        for name, value in batch.items()
+    }
 
 
 def train_worker(config: dict[str, Any]) -> None:

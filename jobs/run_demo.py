@@ -27,8 +27,8 @@ class Config:
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200
-    lvae_steps: int = 400
-    dit_steps: int = 600
+    lvae_steps: int = 900
+    dit_steps: int = 1200
     num_scenes: int = 48
     """Scenes to generate."""
     sampling_steps: int = 100

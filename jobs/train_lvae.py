@@ -95,7 +95,7 @@ def prepare(config: Config) -> TrainingRun:
     return TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, row.architecture(), spec.to_dict(), settings),
+        build=partial(build, row.architecture(), spec.to_dict(), settings, first_layouts(shards[0], counts[0], spec)),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LayoutReader(spec),
         settings=settings,
@@ -115,15 +115,28 @@ def train(config: Config) -> str:
     return fit(training, config.workers, absolute(config.output) if config.output else home("models", training.name))
 
 
-def build(architecture: dict, layout: dict, settings, device, wrap):
+def first_layouts(shard, count: int, spec) -> dict:
+    """Compact layouts of up to 64 training scenes, for the initial biases (LayoutVAE.start_at)."""
+    import numpy as np
+
+    from pipelines.feed import LayoutReader
+
+    return LayoutReader(spec)(shard, np.arange(min(count, 64)))
+
+
+def build(architecture: dict, layout: dict, settings, sample: dict, device, wrap):
     """The Trainer of stage 1, with the same initial weights on every worker."""
     import torch
 
+    from jobs.ray_training import as_tensors
+    from models.layout import LayoutBatch
     from models.lvae import LayoutVAE
     from models.training import lvae_trainer
 
     torch.manual_seed(settings.seed)
-    return lvae_trainer(LayoutVAE(layout=layout, **architecture), settings, device, wrap)
+    model = LayoutVAE(layout=layout, **architecture)
+    model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
+    return lvae_trainer(model, settings, device, wrap)
 
 
 def main(config: Config) -> None:

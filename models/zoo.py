@@ -43,8 +43,8 @@ LVAE_PRESETS = {
     #                       source      px   c   channels             groups fold width layers heads hidden head batch  steps
     "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     1,   32,   1,     2,    64,    32,  4,     8,
                            learning_rate=1e-3, final_learning_rate=1e-4),
-    "town":     LVAEPreset("town",      128, 16, (64, 128),           8,     4,   128,  2,     4,    256,   128, 16,    20_000,
-                           learning_rate=1e-3, final_learning_rate=1e-5, grad_clip=1.0),
+    "town":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   128, 8,     20_000,
+                           decoder="cells", learning_rate=4e-3, final_learning_rate=1e-5, warmup_steps=50, grad_clip=1.0),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
@@ -76,7 +76,7 @@ class DiTPreset:
 DIT_PRESETS = {
     #                         lvae       patch depth width heads batch steps
     "smoke":       DiTPreset("smoke",    2,    1,    32,   2,    8,    8, normalise_latents=True, learning_rate=1e-3),
-    "town":        DiTPreset("town",     2,    8,    256,  4,    32,   30_000, normalise_latents=True, learning_rate=5e-4, ema_decay=0.999),
+    "town":        DiTPreset("town",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999),
     # The paper gives three days on four A100s, not a number of steps.
     "kitti360":    DiTPreset("kitti360", 2,    12,   768,  12,   256,  400_000),
     "kitti360-l":  DiTPreset("kitti360", 2,    24,   1024, 16,   256,  400_000),

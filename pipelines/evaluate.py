@@ -38,20 +38,24 @@ READER_CPUS = 0.5
 
 @dataclass(frozen=True)
 class Selection:
-    """Which scenes of a dataset directory to score: a source, a split, and at most `limit` of them."""
+    """Which scenes of a dataset directory to take: a source, a split, and at most `limit` of them.
+
+    `spread` takes them evenly from the whole selection, else the first ones.
+    """
 
     root: str
     source: str | None = None
     split: str | None = None
     limit: int | None = None
+    spread: bool = True
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Shards with the rows to take: all of them, or `limit` rows spread evenly over the whole selection."""
+        """Shards with the rows to take."""
         shards = find_shards(self.root, "scenes", self.source, self.split)
         counts = np.array([shard.read("scenes", ["scene_id"]).num_rows for shard in shards])
         total, starts = int(counts.sum()), np.cumsum(counts) - counts
         wanted = min(total, self.limit or total)
-        chosen = np.floor((np.arange(wanted) + 0.5) * total / wanted).astype(int)
+        chosen = np.floor((np.arange(wanted) + 0.5) * total / wanted).astype(int) if self.spread else np.arange(wanted)
         rows = [chosen[(chosen >= s) & (chosen < s + n)] - s for s, n in zip(starts, counts, strict=True)]
         return [(shard, r.tolist()) for shard, r in zip(shards, rows, strict=True) if len(r)]
 

@@ -32,8 +32,13 @@ def cluster():
         "OMP_WAIT_POLICY": "PASSIVE",
     }
     os.environ.update(settings)
-    import ray
+    import logging
 
+    import ray
+    import ray.data
+
+    logging.getLogger("ray").setLevel(logging.WARNING)
+    logging.getLogger("ray.data").setLevel(logging.WARNING)
     ray.init(address="local", num_cpus=4, object_store_memory=300 * 2**20, logging_level="WARNING", log_to_driver=False)
     yield
     ray.shutdown()
