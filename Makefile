@@ -5,7 +5,6 @@ BIN := .venv/bin
 # Quiet and quick Ray on small machines; nothing calls home.
 export RAY_AUTH_MODE ?= disabled
 export RAY_USAGE_STATS_ENABLED ?= 0
-export RAY_DATA_DISABLE_PROGRESS_BARS ?= 1
 export DO_NOT_TRACK ?= true
 export MLFLOW_DISABLE_TELEMETRY ?= true
 # Threads that wait for each other give their core away: spinning ones slow torch fivefold beside a busy process.

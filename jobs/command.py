@@ -27,7 +27,6 @@ def absolute(path: str) -> str:
 def start_ray(num_cpus: int | None = None) -> None:
     """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_DATA_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     os.environ.setdefault("RAY_TRAIN_ENABLE_PRINT_PATCH", "0")
     os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")

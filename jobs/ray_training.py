@@ -5,6 +5,7 @@ Resume = the same command again: Ray Train finds the run of the same name and ha
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import tempfile
@@ -58,6 +59,8 @@ def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 def train_worker(config: dict[str, Any]) -> None:
     """What every worker runs: batches -> steps, with a log line, a checkpoint and a validation now and then."""
+    logging.getLogger("ray.train").setLevel(logging.WARNING)
+    logging.getLogger("ray.data").setLevel(logging.WARNING)
     run: TrainingRun = config["run"]
     context = ray.train.get_context()
     rank, world = context.get_world_rank(), context.get_world_size()

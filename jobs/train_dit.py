@@ -165,7 +165,9 @@ def complete_pipeline(lvae: str, output: str) -> str:
     from pipelines import storage
     from pipelines.encode import load_lvae
 
-    pipeline = PrITTIPipeline(load_lvae(lvae), DiT.from_pretrained(storage.join(output, "dit")), scheduler())
+    pipeline = PrITTIPipeline(
+        load_lvae(lvae), DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False), scheduler()
+    )
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)

@@ -69,7 +69,7 @@ class CellDecoder(nn.Module):
         # (b, k, h, w) in this order: category by category, since k is.
         return features.permute(0, 1, 3, 4, 2).flatten(1, 3), out[:, :, 0].flatten(1)
 
-    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, "categories"]) -> None:
+    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, categories]) -> None:
         """Set the last bias: the middle of the cell, mean height and shape per category, existence by `count`."""
         existence = (count / count.new_tensor(self.proposals)).clamp(0.001, 0.99).logit()
         bias = torch.cat([existence[:, None], torch.zeros_like(feature_logit[:, :2]), feature_logit[:, 2:]], dim=1)

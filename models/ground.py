@@ -53,6 +53,6 @@ class GroundDecoder(nn.Module):
     def forward(self, latent: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch maps rows cols"]:
         return self.unfold(self.net(latent))
 
-    def start_at(self, mean: Float[Tensor, "maps"]) -> None:
+    def start_at(self, mean: Float[Tensor, maps]) -> None:
         """Set the last bias: a channel of the output starts at its mean."""
         self.net.conv_out.bias.copy_(mean.repeat_interleave(self.unfold.upscale_factor**2))

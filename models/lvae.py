@@ -145,7 +145,9 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         height, occupancy_logit = self.ground_decoder(ground).chunk(2, dim=1)
         decoder = self.object_decoder
         features, existence_logit = decoder(objects)
-        return LayoutOutput(height, occupancy_logit, features, existence_logit, decoder.proposals, decoder.match_weights)
+        return LayoutOutput(
+            height, occupancy_logit, features, existence_logit, decoder.proposals, decoder.match_weights
+        )
 
     def forward(self, batch: LayoutBatch, noise: Float[Tensor, "batch c2 h w"]) -> tuple[LayoutOutput, Posterior]:
         """Reconstruction from a sampled latent, and the posterior it was sampled from."""

@@ -18,7 +18,6 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
-
 class MatchWeights(NamedTuple):
     """Category-agnostic weights of the matching cost; the defaults are the paper's (supplement B.2)."""
 
@@ -27,12 +26,14 @@ class MatchWeights(NamedTuple):
     cholesky: float = 3.0
 
 
+PAPER_WEIGHTS = MatchWeights()
+
 
 def match_cost(
     features: Float[Tensor, "batch n 9"],
     existence_logit: Float[Tensor, "batch n"],
     truth: Float[Tensor, "batch m 9"],
-    weights: MatchWeights = MatchWeights(),
+    weights: MatchWeights = PAPER_WEIGHTS,
 ) -> Float[Tensor, "batch m n"]:
     """Cost of giving slot n to real primitive m, up to a constant per sample."""
     weight = features.new_tensor([weights.center] * 3 + [weights.cholesky] * 6)
@@ -47,7 +48,7 @@ def match(
     real: Bool[Tensor, "batch slots"],
     slots: tuple[int, ...],
     proposals: tuple[int, ...],
-    weights: MatchWeights = MatchWeights(),
+    weights: MatchWeights = PAPER_WEIGHTS,
 ) -> Int[Tensor, "batch proposals"]:
     """For every proposal the index of the true slot it is matched with, -1 where with padding.
 

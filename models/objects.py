@@ -200,7 +200,7 @@ class ObjectDecoder(nn.Module):
         existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence
 
-    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, "categories"]) -> None:
+    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, categories]) -> None:
         """Set the last biases: mean features per category, existence as often as `count` per scene."""
         for head, mean, expected, offered in zip(self.heads, feature_logit, count, self.proposals, strict=True):
             head.features[-1].bias.copy_(mean)

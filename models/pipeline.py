@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from diffusers import DDPMScheduler, DiffusionPipeline
 from jaxtyping import Float
@@ -15,8 +14,9 @@ from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.repaint import CORNERS, SIDES, repaint_transitions
-from models.scene import DENSITIES, Scene, merge
+from models.outpaint import CORNERS, SIDES, OutpaintCanvas
+from models.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
+from models.scene import DENSITIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
 
 NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
@@ -56,8 +56,8 @@ class Resampling:
     """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps."""
 
     num_steps: int = NUM_INFERENCE_STEPS
-    jump_length: int = 10
-    resamplings: int = 10
+    jump_length: int = JUMP_LENGTH
+    resamplings: int = RESAMPLINGS
 
 
 class PrITTIPipeline(DiffusionPipeline):
@@ -199,7 +199,7 @@ class PrITTIPipeline(DiffusionPipeline):
         """
         if mode not in ("copy", "reencode"):
             raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
-        canvas = OutpaintCanvas.around(self, scene, overlap)
+        canvas = OutpaintCanvas.around(scene, self.spec, self.encode, overlap)
         passes = (SIDES, CORNERS)
         for number, offsets in enumerate(passes):
             blocks = [canvas.block(offset, mode) for offset in offsets]
@@ -217,101 +217,3 @@ class PrITTIPipeline(DiffusionPipeline):
             for offset, block, latent, generated in zip(offsets, blocks, latents, scenes, strict=True):
                 canvas.paste(offset, latent, generated, block.datum_m)
         return canvas.scene
-
-
-@dataclass(frozen=True, eq=False)
-class OutpaintBlock:
-    """What a block to be generated knows: latent (c, h, w), unknown (c, h, w) = 1 to generate, height datum."""
-
-    latent: Tensor
-    unknown: Tensor
-    datum_m: float
-
-
-class OutpaintCanvas:
-    """A growing scene and its latents on a cell grid around one first block.
-
-    Offsets are (forward, left) in block steps; a step is (1 - overlap) of a block.
-    """
-
-    def __init__(self, pipeline: PrITTIPipeline, scene: Scene, latent: Tensor, owned: np.ndarray, step: int) -> None:
-        self.pipeline, self.scene, self.latent, self.owned, self.step = pipeline, scene, latent, owned, step
-        self.size = pipeline.lvae.latent_shape[1]
-        self.pixels_per_cell = pipeline.spec.grid.rows // self.size
-        self.origin_height_m = self.height_near(0.0, 0.0)
-
-    @classmethod
-    def around(cls, pipeline: PrITTIPipeline, scene: Scene, overlap: float) -> OutpaintCanvas:
-        channels, size, _ = pipeline.lvae.latent_shape
-        step = round(size * (1 - overlap))
-        if not 0 < step < size or abs(step - size * (1 - overlap)) > 1e-6:
-            raise ValueError(f"overlap {overlap} is not a whole number of the {size} latent cells between 0 and 1")
-        grid = pipeline.spec.grid
-        if scene.grid != grid:
-            raise ValueError(f"scene {scene.scene_id} has grid {scene.grid}, the model needs {grid}")
-        margin_m = step * grid.rows // size * grid.resolution_m
-        pad = 2 * step * grid.rows // size
-        large = replace(
-            grid,
-            front_m=grid.front_m + margin_m,
-            left_m=grid.left_m + margin_m,
-            rows=grid.rows + pad,
-            cols=grid.cols + pad,
-        )
-        middle = slice(step, step + size)
-        latent = torch.zeros(channels, size + 2 * step, size + 2 * step, device=pipeline.device)
-        latent[:, middle, middle] = pipeline.encode([scene])[0]
-        owned = np.zeros(latent.shape[1:], bool)
-        owned[middle, middle] = True
-        return cls(pipeline, scene.cropped(large), latent, owned, step)
-
-    def cells(self, offset: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns of the canvas that a block covers."""
-        forward, left = offset
-        row, col = self.step * (1 - forward), self.step * (1 - left)
-        return slice(row, row + self.size), slice(col, col + self.size)
-
-    def shift_m(self, offset: tuple[int, int]) -> tuple[float, float]:
-        """Position of a block's origin in the canvas frame."""
-        meters = self.step * self.pixels_per_cell * self.scene.grid.resolution_m
-        return offset[0] * meters, offset[1] * meters
-
-    def height_near(self, x_m: float, y_m: float) -> float:
-        """Height of the known fused surface at the occupied pixel nearest to a point; 0 if there is none."""
-        height, ground_class = self.scene.surface()
-        row, col = np.nonzero(ground_class >= 0)
-        if len(row) == 0:
-            return 0.0
-        x, y = self.scene.grid.x_m()[row], self.scene.grid.y_m()[col]
-        nearest = ((x - x_m) ** 2 + (y - y_m) ** 2).argmin()
-        return float(height[row[nearest], col[nearest]])
-
-    def block(self, offset: tuple[int, int], mode: str) -> OutpaintBlock:
-        """What is known of a block before it is generated."""
-        rows, cols = self.cells(offset)
-        latent = self.latent[:, rows, cols]
-        unknown = torch.from_numpy(~self.owned[rows, cols]).to(latent).expand_as(latent)
-        if mode == "copy":
-            return OutpaintBlock(latent, unknown, 0.0)
-        x, y = self.shift_m(offset)
-        datum = self.height_near(x, y) - self.origin_height_m
-        grid = self.pipeline.spec.grid
-        there = replace(grid, front_m=grid.front_m + x, left_m=grid.left_m + y)
-        scene = replace(self.scene.cropped(there).moved(-x, -y, -datum), grid=grid)
-        return OutpaintBlock(self.pipeline.encode([scene])[0], unknown, datum)
-
-    def paste(self, offset: tuple[int, int], latent: Tensor, generated: Scene, datum_m: float) -> None:
-        """Take from a generated block what nobody owns yet."""
-        rows, cols = self.cells(offset)
-        new = np.zeros_like(self.owned)
-        new[rows, cols] = ~self.owned[rows, cols]
-        mask = torch.from_numpy(new[rows, cols]).to(latent.device)
-        self.latent[:, rows, cols] = torch.where(mask, latent, self.latent[:, rows, cols])
-        x, y = self.shift_m(offset)
-        moved = generated.moved(x, y, datum_m).cropped(self.scene.grid)
-        self.owned |= new
-
-        def pixels(cells: np.ndarray) -> np.ndarray:
-            return cells.repeat(self.pixels_per_cell, axis=0).repeat(self.pixels_per_cell, axis=1)
-
-        self.scene = merge([self.scene, moved], [pixels(self.owned & ~new), pixels(new)], self.scene)

@@ -1,20 +1,9 @@
-"""RePaint in latent space: what to keep, what to generate, and in which order (paper, supplement B.3, Applications).
-
-Latent grids lie like rasters: row 0 farthest ahead, column 0 leftmost. A mask is 1 where something is generated.
-"""
+"""RePaint: in which order an inpainting run visits its states (paper, supplement B.3, Applications)."""
 
 from __future__ import annotations
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 # Paper, supplement B.3: roll-back J and resamplings R.
 JUMP_LENGTH, RESAMPLINGS = 10, 10
-
-# Block offsets of outpainting in units of (forward, left), first the four sides, then the four corners.
-SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
-CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def repaint_transitions(
@@ -36,14 +25,3 @@ def repaint_transitions(
             transitions += [(state + i, state + i + 1) for i in range(jump_length)]
             state += jump_length
     return transitions
-
-
-def shifted(canvas: Float[Tensor, "c h w"], rows: int, cols: int, fill: float = 0.0) -> Float[Tensor, "c h w"]:
-    """The same content seen from a block that lies `rows` cells further ahead and `cols` cells further left."""
-    _, h, w = canvas.shape
-    out = torch.full_like(canvas, fill)
-    to_row, to_col = slice(max(rows, 0), min(h, h + rows)), slice(max(cols, 0), min(w, w + cols))
-    from_row, from_col = slice(max(-rows, 0), min(h, h - rows)), slice(max(-cols, 0), min(w, w - cols))
-    if to_row.start < to_row.stop and to_col.start < to_col.stop:
-        out[:, to_row, to_col] = canvas[:, from_row, from_col]
-    return out

@@ -29,7 +29,7 @@ def weights_digest(model: torch.nn.Module) -> str:
 def load_lvae(directory: str) -> LayoutVAE:
     """Raises ValueError if the directory holds no LVAE."""
     try:
-        return LayoutVAE.from_pretrained(directory).eval().requires_grad_(False)
+        return LayoutVAE.from_pretrained(directory, low_cpu_mem_usage=False).eval().requires_grad_(False)
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(f"{directory}: no layout VAE here ({error}); run jobs/train_lvae.py first") from error
 

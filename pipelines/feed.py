@@ -106,6 +106,7 @@ def batches(
 
     context = ray.data.DataContext.get_current()
     context.execution_options.preserve_order = True
+    context.enable_progress_bars = False
     dataset = ray.data.range(num_tasks, override_num_blocks=num_tasks)
     dataset = dataset.map_batches(read_task, batch_size=None, batch_format="numpy", num_cpus=READER_CPUS)
     yield from dataset.iter_batches(batch_size=batch // world, batch_format="numpy", prefetch_batches=2)

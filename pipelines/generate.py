@@ -40,7 +40,7 @@ class SampleRequest:
 def load_pipeline(directory: str) -> PrITTIPipeline:
     """Raises ValueError if the directory holds no complete pipeline."""
     try:
-        pipeline = PrITTIPipeline.from_pretrained(directory)
+        pipeline = PrITTIPipeline.from_pretrained(directory, low_cpu_mem_usage=False)
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
     pipeline.set_progress_bar_config(disable=True)

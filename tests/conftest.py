@@ -27,7 +27,6 @@ def cluster():
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
         "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
-        "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
         "DO_NOT_TRACK": "true",
         "OMP_WAIT_POLICY": "PASSIVE",
     }

@@ -8,7 +8,7 @@ from diffusers import RePaintScheduler
 from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
 from models.pipeline import scheduler
-from models.repaint import repaint_transitions, shifted
+from models.repaint import repaint_transitions
 from models.training import Optimisation, dit_trainer
 
 SHAPE = (4, 8, 8)
@@ -123,14 +123,6 @@ def test_the_known_part_is_noised_to_the_state_just_reached():
     sample(model, walk, SceneNoise(0, range(4), shape, "cpu"), torch.zeros(4, dtype=torch.long), None, Known(torch.zeros(4, *shape), mask))
     for t, std in seen[1:]:
         assert np.isclose(std, (1 - Diffusion().alpha_bar[t]) ** 0.5, rtol=0.05)
-
-
-def test_shifted_sees_the_overlap_where_the_block_lies():
-    canvas = torch.arange(16.0).view(1, 4, 4)
-    ahead = shifted(canvas, 2, 0)
-    assert torch.equal(ahead[:, 2:], canvas[:, :2]) and (ahead[:, :2] == 0).all()
-    right = shifted(canvas, 0, -1, fill=-1)
-    assert torch.equal(right[:, :, :3], canvas[:, :, 1:]) and (right[:, :, 3] == -1).all()
 
 
 def test_bad_step_counts_are_named():
