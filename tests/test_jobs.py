@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -211,6 +212,27 @@ def test_real_against_real_is_near_perfect(home):
     assert abs(scores["layout_frechet"]) < 1e-4 and abs(scores["random_frechet"]) < 1e-4
     assert scores["random_precision_k3"] == scores["random_recall_k3"] == 1.0
     assert scores["label_fidelity"]["joint_fidelity"] == 1.0
+
+
+def test_an_lvae_of_another_dataset_is_refused(home, tmp_path):
+    from jobs.encode_latents import Config, encode
+    from jobs.preprocess_scenes import Town, main
+
+    main(Town(output=str(tmp_path), num_train=8, num_test=8, seed=5))
+    with pytest.raises(ValueError, match=r"lvae-smoke has another LayoutSpec: \w+ is .*, expected .*; use the dataset"):
+        encode(Config(dataset=str(tmp_path), lvae=str(home / "models/lvae-smoke")))
+    assert not (tmp_path / "latents").exists()
+
+
+def test_a_truncated_shard_is_named(home, tmp_path):
+    from jobs.train_lvae import Config, train
+
+    shutil.copytree(home / "datasets/smoke", tmp_path / "data")
+    for shard in find_shards(str(tmp_path / "data"), split="train"):
+        path = Path(shard.path("rasters"))
+        path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(ValueError, match=r"rasters/.*parquet: cannot be read as Parquet"):
+        train(Config(preset="smoke", dataset=str(tmp_path / "data"), name="lvae-truncated"))
 
 
 def command(*words: str, **environment: str) -> subprocess.CompletedProcess:
