@@ -20,7 +20,7 @@ from pipelines.sources.town_targets import measure
 if TYPE_CHECKING:
     from jobs.run_demo import Config
 
-SHOWN = 6
+SHOWN = 4
 
 MEANINGS = {
     "reconstruction.ground_iou": "pixels on which truth and reconstruction agree that a ground class is there, over all that either claims; 1 is perfect (the paper on KITTI-360: 0.9996)",

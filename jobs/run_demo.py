@@ -19,6 +19,9 @@ from typing import Any
 from jobs.command import absolute, run, start_ray
 
 
+CHECKPOINTS = 8  # per training run: each also validates and draws
+
+
 @dataclass(frozen=True)
 class Config:
     output: str = "runs/demo"
@@ -27,8 +30,10 @@ class Config:
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200
-    lvae_steps: int = 900
-    dit_steps: int = 1200
+    lvae_steps: int = 450
+    dit_steps: int = 800
+    dit_batch_size: int = 8
+    """Many small steps show something sooner than few large ones."""
     num_scenes: int = 48
     """Scenes to generate."""
     sampling_steps: int = 100
@@ -37,7 +42,8 @@ class Config:
     """Denoising steps of outpainting (the paper: 250)."""
     resamplings: int = 2
     """Resamplings of outpainting (the paper: 10)."""
-    actors: int = 1
+    actors: int = 2
+    """Models at work at once when encoding, sampling and evaluating."""
     seed: int = 0
 
 
@@ -94,7 +100,15 @@ def main(config: Config) -> None:
     )
     stages.run(
         "train the layout VAE",
-        lambda: train_lvae.train(train_lvae.Config(config.preset, data, steps=config.lvae_steps, seed=config.seed)),
+        lambda: train_lvae.train(
+            train_lvae.Config(
+                config.preset,
+                data,
+                steps=config.lvae_steps,
+                checkpoint_every=-(-config.lvae_steps // CHECKPOINTS),
+                seed=config.seed,
+            )
+        ),
     )
     stages.run(
         "encode latents",
@@ -102,7 +116,16 @@ def main(config: Config) -> None:
     )
     stages.run(
         "train the diffusion transformer",
-        lambda: train_dit.train(train_dit.Config(config.preset, data, steps=config.dit_steps, seed=config.seed)),
+        lambda: train_dit.train(
+            train_dit.Config(
+                config.preset,
+                data,
+                steps=config.dit_steps,
+                batch_size=config.dit_batch_size,
+                checkpoint_every=-(-config.dit_steps // CHECKPOINTS),
+                seed=config.seed,
+            )
+        ),
     )
     stages.run(
         "sample scenes",
