@@ -24,7 +24,7 @@ def absolute(path: str) -> str:
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
-def start_ray(num_cpus: int | None = None) -> None:
+def start_ray() -> None:
     """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -36,20 +36,26 @@ def start_ray(num_cpus: int | None = None) -> None:
 
     if ray.is_initialized():
         return
-    options = {"num_cpus": num_cpus} if num_cpus and "RAY_ADDRESS" not in os.environ else {}
-    ray.init(logging_level=logging.WARNING, log_to_driver=True, **options)
+    ray.init(logging_level=logging.WARNING, log_to_driver=True)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False
+    context.raise_original_map_exception = True  # a worker's ValueError stays one: see `root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
 
 
 def root_cause(error: BaseException) -> BaseException:
-    """The exception that user-facing text should come from: Ray wraps a worker's error several times."""
-    seen = set()
+    """The exception that user-facing text should come from: Ray wraps a worker's error several times.
+
+    The first ValueError or OSError on the way down is ours, with file and fix; what caused it says less.
+    """
+    seen: set[int] = set()
     while id(error) not in seen:
         seen.add(id(error))
-        error = getattr(error, "cause", None) or error.__cause__ or error
+        inner = getattr(error, "cause", None)
+        if inner is None and isinstance(error, (ValueError, OSError)):
+            return error
+        error = inner or error.__cause__ or error
     return error
 
 
@@ -64,8 +70,7 @@ def run(main: Callable[[Any], None], config: Any, **tyro_options: Any) -> None:
         sys.exit("interrupted; the same command goes on where it stopped")
     except Exception as error:
         cause = root_cause(error)
-        if isinstance(error, ValueError) or isinstance(cause, ValueError):
-            message = cause if isinstance(cause, ValueError) else error
-            print(f"error: {message}", file=sys.stderr)
+        if isinstance(cause, (ValueError, OSError)):
+            print(f"error: {cause}", file=sys.stderr)
             sys.exit(2)
         raise

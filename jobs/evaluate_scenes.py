@@ -24,6 +24,8 @@ class Config:
     """Split to compare with; the paper takes train as its reference."""
     generated: str = ""
     """Dataset directory of the generated scenes (default with neither --lvae nor this: $PRITTI_HOME/generated)."""
+    generated_split: str = ""
+    """Only this split of them (default: whatever is there); --generated may be any dataset directory."""
     run: str = ""
     """Only source generated-<run> (default: whatever is there)."""
     lvae: str = ""
@@ -65,7 +67,7 @@ def evaluate(config: Config) -> dict:
             )
         if wanted:
             source = f"generated-{config.run}" if config.run else None
-            generated = Selection(absolute(wanted), source, "generated", config.limit)
+            generated = Selection(absolute(wanted), source, config.generated_split or None, config.limit)
             sides = described(real, "describe real"), described(generated, "describe generated")
             scores["generation"] = compare(*sides, dataset, config.k)
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")

@@ -48,7 +48,7 @@ class Kitti360:
     slots: Literal["p95", "paper"] = "p95"
     """Slots per category: 95th percentile of the training split, or the paper's 514."""
     skip_unreadable: bool = False
-    """Leave out sequences whose files cannot be read (they are listed in rejects) instead of stopping."""
+    """Leave out sequences whose XML cannot be read (they are listed in rejects) instead of stopping."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ def main(config: Town | Kitti360 | Av2) -> None:
 
     source = type(config).__name__.lower()
     options = asdict(config) | {"source": source}
-    output = absolute(options.pop("output")) if config.output else home("datasets", source)
+    del options["output"]
+    output = absolute(config.output) if config.output else home("datasets", source)
     skip = options.pop("skip_unreadable", False)
     if isinstance(config, Town):
         options["town_version"] = TOWN_VERSION

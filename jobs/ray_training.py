@@ -24,7 +24,7 @@ from jobs.command import root_cause
 from jobs.tracking import Tracker
 from models.training import Optimisation, Trainer
 from pipelines import storage
-from pipelines.feed import Reader, Stream, batches
+from pipelines.feed import READER_CPUS, Reader, Stream, batches
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
 
@@ -131,26 +131,14 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     """Train to the end and put the model (EMA weights if there are any) into `output`; returns `output`.
 
-    Raises ValueError if a run of this name exists with another identity, or for a loss that is not finite.
+    Raises ValueError for a number of workers that does not fit, or for a loss that is not finite.
     """
-    record = storage.join(run.storage_path, run.name, "identity.json")
-    if storage.exists(record):
-        made = storage.read_json(record)
-        if made != run.identity:
-            name = next(key for key in sorted(made | run.identity) if made.get(key) != run.identity.get(key))
-            raise ValueError(
-                f"run {run.name!r} was started with {name}={made.get(name)}, asked for {run.identity.get(name)}; "
-                "use the same options to resume, or another --name for a new run"
-            )
-    storage.write_json(run.identity, record)
     os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
-    gpus = ray.cluster_resources().get("GPU", 0) >= num_workers
-    cpus = float(ray.cluster_resources().get("CPU", 1))
-    per_worker = 1.0 if cpus > 2 * num_workers else 0.5
+    scaling = scaling_for(num_workers, run.stream.batch_size)
     trainer = ray.train.torch.TorchTrainer(
         train_worker,
-        train_loop_config={"run": run, "threads": max(1, int(cpus) // num_workers)},
-        scaling_config=ScalingConfig(num_workers=num_workers, use_gpu=gpus, resources_per_worker={"CPU": per_worker}),
+        train_loop_config={"run": run, "threads": max(1, int(ray.cluster_resources()["CPU"]) // num_workers)},
+        scaling_config=scaling,
         run_config=RunConfig(
             name=run.name,
             storage_path=run.storage_path,
@@ -176,6 +164,37 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     return output
 
 
+def scaling_for(num_workers: int, batch_size: int) -> ScalingConfig:
+    """Workers that fit the cluster and leave room for reading. Raises ValueError: too many would wait for ever."""
+    cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
+    per_worker = 1.0 if cpus > 2 * num_workers else 0.5
+    most = int((cpus - READER_CPUS) // per_worker)
+    if not 1 <= num_workers <= most:
+        raise ValueError(f"--workers is {num_workers}, this cluster of {cpus:.0f} CPUs has room for 1 to {most}")
+    if batch_size < 1 or batch_size % num_workers:
+        raise ValueError(f"--batch-size {batch_size} does not divide by --workers {num_workers}")
+    return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
+
+
+def claim(name: str, storage_path: str, identity: dict) -> str:
+    """Claim a run's name for one set of options; where its MLflow run is recorded.
+
+    Raises ValueError if it belongs to another set and has checkpoints already.
+    """
+    directory = storage.join(storage_path, name)
+    record = storage.join(directory, "identity.json")
+    if storage.exists(record) and (made := storage.read_json(record)) != identity:
+        if any("/checkpoint_" in path for path in storage.list_files(directory, ".json")):
+            key = next(key for key in sorted(made | identity) if made.get(key) != identity.get(key))
+            raise ValueError(
+                f"run {name!r} was started with {key}={made.get(key)}, asked for {identity.get(key)}; "
+                "use the same options to resume, or another --name for a new run"
+            )
+        storage.delete_directory(directory)  # nothing was trained yet
+    storage.write_json(identity, record)
+    return storage.join(directory, "mlflow.json")
+
+
 def publish_directory(directory: str, output: str) -> None:
     """Copy a saved model or pipeline into place, file by file; what says that it is complete comes last."""
     paths = [
@@ -189,8 +208,12 @@ def publish_directory(directory: str, output: str) -> None:
 
 
 def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:
-    """The settings with every change that is not None."""
-    return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+    """The settings with every change that is not None. Raises ValueError for a change that is not positive."""
+    changes = {name: value for name, value in changes.items() if value is not None}
+    for name, value in changes.items():
+        if value <= 0:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}, expected more than 0")
+    return replace(settings, **changes)
 
 
 def identity_of(settings: Optimisation, **more: Any) -> dict:

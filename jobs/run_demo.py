@@ -18,7 +18,6 @@ from typing import Any
 
 from jobs.command import absolute, run, start_ray
 
-
 CHECKPOINTS = 8  # per training run: each also validates and draws
 
 
@@ -73,6 +72,7 @@ class Stages:
 def main(config: Config) -> None:
     output = absolute(config.output)
     os.environ["PRITTI_HOME"] = output
+    os.environ.pop("MLFLOW_TRACKING_URI", None)  # everything stays under the output directory
     from jobs import (
         encode_latents,
         evaluate_scenes,

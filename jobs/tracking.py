@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from jobs.command import home
+from pipelines import storage
 
 
 def tracking_uri() -> str:
@@ -42,12 +43,15 @@ class Tracker:
         return self._client
 
     @classmethod
-    def start(cls, experiment: str, name: str, parameters: dict) -> Tracker:
-        """The experiment's unfinished or finished run of this name, or a new one.
+    def start(cls, experiment: str, name: str, parameters: dict, record: str) -> Tracker:
+        """The MLflow run that the file `record` names, so that a resumed run goes on in it, or a new one.
 
         Called once, in the driver: two processes creating the database at once would break it.
         """
         uri = tracking_uri()
+        if storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
+            client(uri).update_run(known["run_id"], status="RUNNING")
+            return cls(uri, known["run_id"])
         if uri.startswith("sqlite:///"):
             Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
         api = client(uri)
@@ -57,14 +61,10 @@ class Tracker:
             experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
         else:
             experiment_id = found.experiment_id
-        runs = api.search_runs([experiment_id], f"attributes.run_name = '{name}'", max_results=1)
-        if runs:
-            run_id = runs[0].info.run_id
-            api.update_run(run_id, status="RUNNING")
-        else:
-            run_id = api.create_run(experiment_id, run_name=name).info.run_id
-            for key, value in parameters.items():
-                api.log_param(run_id, key, value)
+        run_id = api.create_run(experiment_id, run_name=name).info.run_id
+        for key, value in parameters.items():
+            api.log_param(run_id, key, value)
+        storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
         return cls(uri, run_id)
 
     def metrics(self, values: dict[str, float], step: int) -> None:

@@ -37,7 +37,7 @@ class Config:
     name: str = ""
     """Name of the run (default: dit-<preset>). Another name is another run."""
     output: str = ""
-    """Where the trained pipeline goes (default: $PRITTI_HOME/models/pritti-<preset>)."""
+    """Where the trained pipeline goes (default: $PRITTI_HOME/models/pritti-<name or preset>)."""
     workers: int = 1
     """Ray Train workers; with GPUs, one each."""
     steps: int | None = None
@@ -53,7 +53,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs. Ray must run."""
     from functools import partial
 
-    from jobs.ray_training import TrainingRun, identity_of, settings_with
+    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.smoke import smoke_dataset, smoke_latents
     from jobs.tracking import Tracker
     from jobs.validation import SamplingCheck
@@ -61,6 +61,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     from models.training import Optimisation
     from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
     from pipelines import storage
+    from pipelines.encode import load_lvae, weights_digest
     from pipelines.feed import LatentReader, Stream
     from pipelines.ingest import Dataset
     from pipelines.scenes.tables import find_shards
@@ -79,7 +80,11 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     latents = storage.read_json(storage.join(latents_root, "latents.json"))
     if not latents["complete"]:
         raise ValueError(f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {root} again")
-    lvae_config = storage.read_json(storage.join(latents["lvae"], "config.json"))
+    lvae = load_lvae(latents["lvae"])
+    if weights_digest(lvae) != latents["lvae_digest"]:
+        raise ValueError(
+            f"{latents['lvae']} has changed since {latents_root} was encoded with it; encode anew into another --output"
+        )
 
     name = config.name or f"dit-{config.preset}"
     settings = settings_with(
@@ -101,11 +106,11 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         "size": size,
         "label": config.label,
         "num_labels": len(LABELS[config.label]),
-        "layout": lvae_config["layout"],
+        "layout": dict(lvae.config.layout),
         "shift": latents["channel_mean"] if row.normalise_latents else None,
         "scale": latents["channel_std"] if row.normalise_latents else None,
     }
-    batch_size = config.batch_size or row.batch_size
+    batch_size = row.batch_size if config.batch_size is None else config.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     identity = identity_of(
@@ -117,6 +122,8 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         lvae=latents["lvae_digest"],
         dataset=root,
     )
+    record = claim(name, home("runs"), identity)
+    tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     training = TrainingRun(
         name=name,
         storage_path=home("runs"),
@@ -125,7 +132,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         reader=LatentReader(latents_root, config.label),
         settings=settings,
         identity=identity,
-        tracker=Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}),
+        tracker=tracker,
         checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label),
@@ -139,7 +146,7 @@ def train(config: Config) -> str:
     from pipelines import storage
 
     training, lvae = prepare(config)
-    output = absolute(config.output) if config.output else home("models", f"pritti-{config.preset}")
+    output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
     fit(training, config.workers, storage.join(output, "dit"))
     return complete_pipeline(lvae, output)
 

@@ -49,7 +49,7 @@ def prepare(config: Config) -> TrainingRun:
     """The run that the options mean; makes the smoke preset's data. Ray must run."""
     from functools import partial
 
-    from jobs.ray_training import TrainingRun, identity_of, settings_with
+    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.smoke import smoke_dataset
     from jobs.tracking import Tracker
     from jobs.validation import ReconstructionCheck
@@ -85,13 +85,15 @@ def prepare(config: Config) -> TrainingRun:
         steps=config.steps,
         learning_rate=config.learning_rate,
     )
-    batch_size = config.batch_size or row.batch_size
+    batch_size = row.batch_size if config.batch_size is None else config.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     identity = identity_of(
         settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root
     )
-    tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()})
+    record = claim(name, home("runs"), identity)
+    parameters = identity | {"architecture": row.architecture()}
+    tracker = Tracker.start("pritti-lvae", name, parameters, record)
     return TrainingRun(
         name=name,
         storage_path=home("runs"),

@@ -32,14 +32,6 @@ def held_out_scenes(root: str, source: str, count: int) -> tuple[Scene, ...]:
         return tuple(read_scenes(root, source, "train", count))
 
 
-@torch.no_grad()
-def reconstruct(lvae: LayoutVAE, scenes: list[Scene], threshold: float | None = None) -> list[Scene]:
-    """Scenes through the latent mean and back, on the LVAE's grid."""
-    device, options = next(lvae.parameters()).device, {} if threshold is None else {"threshold": threshold}
-    output = lvae.decode(lvae.encode(layout_batch(scenes, lvae.spec).to(device)).mean)
-    return [scene_from_layout(x, lvae.spec, s, **options) for x, s in zip(output.layouts(), scenes, strict=True)]
-
-
 @dataclass(frozen=True)
 class ReconstructionCheck:
     """Validation of stage 1 on the first `count` held-out scenes."""

@@ -85,14 +85,25 @@ class Walk:
         return mean + ((1 - a_prev) / (1 - a) * beta) ** 0.5 * noise
 
 
+# What noise is drawn for: the same scene number must not start generation and outpainting from the same noise.
+GENERATE, OUTPAINT = 1, 2
+
+
 class SceneNoise:
-    """Standard normal noise keyed by (seed, scene index): each scene draws its own sequence.
+    """Standard normal noise keyed by (seed, scene index, purpose): each scene draws its own sequence.
 
     The same scene comes out whatever the batch size, the number of workers or the scenes beside it.
     """
 
-    def __init__(self, seed: int, indices: Sequence[int], shape: tuple[int, ...], device: torch.device | str) -> None:
-        self.generators = [keyed_generator(seed, index) for index in indices]
+    def __init__(
+        self,
+        seed: int,
+        indices: Sequence[int],
+        shape: tuple[int, ...],
+        device: torch.device | str,
+        purpose: int = GENERATE,
+    ) -> None:
+        self.generators = [keyed_generator(seed, index, purpose) for index in indices]
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:
@@ -102,7 +113,8 @@ class SceneNoise:
 
 def keyed_generator(*key: int) -> torch.Generator:
     """A CPU generator that depends on every number of the key, and on nothing else."""
-    state = np.random.SeedSequence([k & 0xFFFFFFFF for k in key]).generate_state(1, np.uint64)[0]
+    # SeedSequence takes [a] and [a, 0] for the same: the length goes in too.
+    state = np.random.SeedSequence([len(key), *(k & 0xFFFFFFFF for k in key)]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
 

@@ -10,7 +10,7 @@ from diffusers import DDPMScheduler, DiffusionPipeline
 from jaxtyping import Float
 from torch import Tensor
 
-from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
+from models.diffusion import GENERATE, OUTPAINT, Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -170,11 +170,12 @@ class PrITTIPipeline(DiffusionPipeline):
         resampling: Resampling,
         guidance_scale: float = 1.0,
         callback: Callable[[int, int], None] | None = None,
+        purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
         """RePaint: latents that keep `known` bit for bit where its mask is 0 (paper, Sec. 3.3)."""
         walk = Walk(self.diffusion, resampling.num_steps)
         transitions = repaint_transitions(resampling.num_steps, resampling.jump_length, resampling.resamplings)
-        noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device)
+        noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device, purpose)
         model = guided(self.dit, self.dit.null_label, guidance_scale)
         return sample(model, walk, noise, self.label_tensor(labels), transitions, known, callback)
 
@@ -211,7 +212,14 @@ class PrITTIPipeline(DiffusionPipeline):
 
             draws = [8 * index + 4 * number + k for k in range(len(offsets))]
             latents = self.complete(
-                known, [label] * len(offsets), seed, draws, resampling or Resampling(), guidance_scale, progress
+                known,
+                [label] * len(offsets),
+                seed,
+                draws,
+                resampling or Resampling(),
+                guidance_scale,
+                progress,
+                OUTPAINT,
             )
             scenes = self.decode(latents, [replace(scene, grid=self.spec.grid)] * len(offsets))
             for offset, block, latent, generated in zip(offsets, blocks, latents, scenes, strict=True):

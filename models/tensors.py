@@ -17,9 +17,12 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground.
 
-    Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
-    nearest. Classes that the scene does not have are empty. Raises ValueError for a ratio that is not whole.
+    Raises ValueError if the grids do not cover the same ground. Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
+    nearest. Classes that the scene does not have are empty. The ratio of pixels must be whole (ValueError).
     """
+    covers = [(g.front_m, g.left_m, g.back_m, g.right_m) for g in (scene.grid, grid)]
+    if not np.allclose(*covers):
+        raise ValueError(f"scene {scene.scene_id} covers {scene.grid}, wanted is {grid}")
     shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
     height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
     for k, name in enumerate(ground_classes):
@@ -38,7 +41,7 @@ def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) ->
         return np.where(keep, total / np.maximum(count, 1), 0).astype(np.float32), keep
     if grid.rows % scene.grid.rows == 0:
         f = grid.rows // scene.grid.rows
-        return (a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
+        return tuple(a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
     raise ValueError(f"scene {scene.scene_id}: {scene.grid.rows} pixels do not divide into {grid.rows}")
 
 
@@ -59,7 +62,7 @@ def slot_primitives(scene: Scene, spec: LayoutSpec) -> tuple[np.ndarray, np.ndar
 
 
 def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
-    """The layout of one scene as small arrays, cheap to send between processes: `LayoutBatch.from_arrays` unpacks.
+    """The layout of one scene as small arrays, cheap to send between processes: `LayoutBatch.from_compact` unpacks.
 
     height (G, H, W) uint16 in 65535ths of the bounds, occupied (G, H, W) bool, features (N, 9) float32, real (N,).
     """

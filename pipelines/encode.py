@@ -34,6 +34,11 @@ def load_lvae(directory: str) -> LayoutVAE:
         raise ValueError(f"{directory}: no layout VAE here ({error}); run jobs/train_lvae.py first") from error
 
 
+def gpus_per_actor() -> int:
+    """1 where the cluster has GPUs (the driver's machine need not have one), else 0."""
+    return int(ray.cluster_resources().get("GPU", 0) > 0)
+
+
 class Encoder:
     """Actor. Row in: number of a shard. Row out: per-channel sums of its latent means. Writes the shard's latents."""
 
@@ -104,7 +109,7 @@ def encode_latents(
         Encoder,
         fn_constructor_args=(lvae, output, shards, batch_size),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(shards))),
-        num_gpus=1 if torch.cuda.is_available() else 0,
+        num_gpus=gpus_per_actor(),
     )
     total, square, cells, counts = 0.0, 0.0, 0, {}
     for row in graph.iter_rows():

@@ -15,7 +15,7 @@ import torch
 
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, ground_on_grid, layout_batch, scene_from_layout
-from pipelines.encode import load_lvae
+from pipelines.encode import gpus_per_actor, load_lvae
 from pipelines.ingest import Dataset
 from pipelines.metrics import generation, inception, statistics, validity
 from pipelines.metrics.reconstruction import (
@@ -67,9 +67,7 @@ class Describer:
         torch.set_num_threads(1)
         self.chosen, self.dataset = chosen, dataset
         self.network = inception.load_inception(inception_weights) if inception_weights else None
-        self.slab_offset_m = (
-            validity.SLAB_OFFSET_M if dataset.spec.surface == "top" and dataset.source != "av2" else 0.0
-        )
+        self.slab_offset_m = validity.SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
 
     def __call__(self, row: dict) -> list[dict]:
         shard, rows = self.chosen[row["id"]]
@@ -156,7 +154,7 @@ def compare(
     )
     scores["count_divergence_bits"] = divergence
     scores["statistics"] = {
-        name: {"real": float(a), "generated": float(b)}
+        name: {"real": None if np.isnan(a) else float(a), "generated": None if np.isnan(b) else float(b)}
         for name, a, b in zip(names, _means(real["statistics"]), _means(generated["statistics"]), strict=True)
     }
     rates = [validity.validity_rates(side["validity"]) for side in (real, generated)]
@@ -177,11 +175,12 @@ def features_frechet(real: np.ndarray, generated: np.ndarray) -> float:
 
 
 def neighbourhood(real: np.ndarray, generated: np.ndarray, k: tuple[int, ...], prefix: str) -> dict[str, float]:
-    """Improved precision and recall at equal numbers on both sides."""
+    """Improved precision and recall at equal numbers on both sides, evenly spread over the larger one."""
     n = min(len(real), len(generated))
     if n <= max(k):
         return {}
-    found = generation.precision_recall(real[:n], generated[:n], k)
+    real, generated = (side[np.arange(n) * len(side) // n] for side in (real, generated))
+    found = generation.precision_recall(real, generated, k)
     return {
         f"{prefix}{name}_k{r.k}": value
         for r in found
@@ -251,6 +250,7 @@ def rebuild(
         Rebuilder,
         fn_constructor_args=(chosen, lvae, batch_size),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
+        num_gpus=gpus_per_actor(),
     )
     rows = []
     for row in graph.iter_rows():

@@ -11,6 +11,7 @@ import torch
 
 from models.pipeline import LABELS, PrITTIPipeline
 from pipelines import storage
+from pipelines.encode import gpus_per_actor, weights_digest
 from pipelines.scenes.tables import Shard
 
 
@@ -45,6 +46,11 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
         raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def pipeline_digest(pipeline: PrITTIPipeline) -> str:
+    """Digest of all weights: a run goes on only with the model that began it."""
+    return f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"
 
 
 class Sampler:
@@ -88,9 +94,8 @@ def sample_scenes(
             f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}"
         )
     record = storage.join(request.output, f"generated-{request.run}.json")
-    options = {name: value for name, value in asdict(request).items() if name != "output"} | {
-        "labels": list(request.labels)
-    }
+    options = {name: value for name, value in asdict(request).items() if name != "output"}
+    options |= {"labels": list(request.labels), "weights": pipeline_digest(pipeline)}
     if storage.exists(record):
         made = storage.read_json(record)
         differing = [name for name in options if made.get(name) != options[name]]
@@ -101,13 +106,15 @@ def sample_scenes(
                 "choose another --run or --output"
             )
     storage.write_json(options, record)
-    storage.clean_temporaries(request.output)
+    for shard in request.shards()[:1]:
+        for table in ("scenes", "primitives", "rasters"):
+            storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])
     shards = request.shards()
     graph = ray.data.range(len(shards), override_num_blocks=len(shards)).map(
         Sampler,
         fn_constructor_args=(request, batch_size),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(shards))),
-        num_gpus=1 if torch.cuda.is_available() else 0,
+        num_gpus=gpus_per_actor(),
     )
     total = 0
     for row in graph.iter_rows():

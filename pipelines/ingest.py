@@ -22,14 +22,16 @@ from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines import storage
 from pipelines.labels import DensityThresholds, density, density_thresholds
-from pipelines.scenes.tables import SCENES, Shard, rejects_table
+from pipelines.scenes.tables import SCENES, Shard, encode_ground, rejects_table
 from pipelines.sources import argoverse2, kitti360, town
 from pipelines.sources.drive import Drive
-from pipelines.splits import no_split, split_poses
+from pipelines.splits import ARGOVERSE2_SPLIT, no_split, split_poses
 
 SHARD_SCENES = 256
 LOGS_PER_SHARD = 2  # Argoverse 2: about 160 sweeps each
 STAGING = ".staging"
+# What ground heights are: tops of slabs, 0.3 m above what objects stand on, or that surface itself.
+SURFACE = {"town": "top", "kitti360": "top", "av2": "surface"}
 
 
 # --------------------------------------------------------------------------------------------------------- plan
@@ -86,9 +88,8 @@ def plan_kitti360(root: str, split: bool = True) -> list[Task]:
 
 def plan_argoverse2(root: str) -> list[Task]:
     """Tasks of a few logs each; AV2's own train is train, its val is test."""
-    sides = {"train": "train", "val": "test"}
     tasks = []
-    for theirs, side in sides.items():
+    for theirs, side in ARGOVERSE2_SPLIT.items():
         logs = [log for split, log in argoverse2.logs(root) if split == theirs]
         for number, start in enumerate(range(0, len(logs), LOGS_PER_SHARD)):
             parts = tuple(Part((root, theirs, log), log, None, None) for log in logs[start : start + LOGS_PER_SHARD])
@@ -137,6 +138,7 @@ def cut_scenes(task: Task, grid: Grid) -> tuple[list[Scene], list[dict], list[st
         for pose in poses:
             try:
                 scene = drive.scene(int(pose), task.split, grid)
+                encode_ground(scene)  # heights beyond what a table holds
             except ValueError as error:
                 rejects.append(_reject(part.sequence, int(drive.frame[pose]), task.source, str(error)))
                 continue
@@ -254,6 +256,7 @@ def training_statistics(manifests: list[dict], staging: str, grid: Grid, slots: 
         center_bounds_m=Bounds((grid.back_m, grid.right_m, *z.low), (grid.front_m, grid.left_m, *z.high)),
         cholesky_bounds=bounds("cholesky"),
         height_bounds_m=bounds("height"),
+        surface=SURFACE[training[0]["source"]],
     )
     thresholds = [
         density_thresholds(group_count(scenes, group), scenes[volume].to_numpy())

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import ray.data
-import torch
 
 from models.layout import LayoutSpec
 from models.pipeline import LABELS, PrITTIPipeline, Resampling
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
+from pipelines.encode import gpus_per_actor
 from pipelines.evaluate import Selection
-from pipelines.generate import load_pipeline
+from pipelines.generate import load_pipeline, pipeline_digest
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.tables import Shard
 
@@ -97,7 +97,8 @@ def outpaint_scenes(
     Raises ValueError if the output holds a run made with other options.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
-    options = asdict(request) | {"input": asdict(selection)}
+    pipeline = load_pipeline(request.model)
+    options = asdict(request) | {"input": asdict(selection), "weights": pipeline_digest(pipeline)}
     record = storage.join(request.output, f"{request.source}.json")
     if storage.exists(record) and (made := storage.read_json(record)) != options:
         name = next(key for key in options if made.get(key) != options[key])
@@ -110,7 +111,7 @@ def outpaint_scenes(
         Outpainter,
         fn_constructor_args=(request, chosen),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
-        num_gpus=1 if torch.cuda.is_available() else 0,
+        num_gpus=gpus_per_actor(),
     )
     for _ in graph.iter_rows():
         if on_scene:

@@ -88,7 +88,7 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
 
 
 def write_json(value: Any, uri: str) -> None:
-    write_whole(uri, lambda stream: stream.write(json.dumps(value, indent=1).encode()))
+    write_whole(uri, lambda stream: stream.write(json.dumps(value, indent=1, allow_nan=False).encode()))
 
 
 def read_json(uri: str) -> Any:

@@ -38,7 +38,7 @@ def cluster():
 
     logging.getLogger("ray").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    ray.init(address="local", num_cpus=4, object_store_memory=300 * 2**20, logging_level="WARNING", log_to_driver=False)
+    ray.init(address="local", num_cpus=2, object_store_memory=300 * 2**20, logging_level="WARNING", log_to_driver=False)
     yield
     ray.shutdown()
 

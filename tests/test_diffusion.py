@@ -120,7 +120,14 @@ def test_the_known_part_is_noised_to_the_state_just_reached():
     shape = (64, 8, 8)
     mask = torch.zeros(4, *shape)
     mask[:, :, :4] = 1
-    sample(model, walk, SceneNoise(0, range(4), shape, "cpu"), torch.zeros(4, dtype=torch.long), None, Known(torch.zeros(4, *shape), mask))
+    sample(
+        model,
+        walk,
+        SceneNoise(0, range(4), shape, "cpu"),
+        torch.zeros(4, dtype=torch.long),
+        None,
+        Known(torch.zeros(4, *shape), mask),
+    )
     for t, std in seen[1:]:
         assert np.isclose(std, (1 - Diffusion().alpha_bar[t]) ** 0.5, rtol=0.05)
 
@@ -188,11 +195,32 @@ def test_a_loss_that_is_not_finite_stops_before_anything_changes():
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 
 
+def test_labels_are_dropped_for_a_tenth_of_the_samples_and_whole_samples_only():
+    trainer, labels = new_trainer(), []
+    real = trainer.wrapped.forward
+
+    def spy(latent, timestep, label):
+        labels.extend(label.tolist())
+        return real(latent, timestep, label)
+
+    trainer.wrapped.forward = spy
+    batch = {name: value.repeat(16, *[1] * (value.ndim - 1)) for name, value in dit_batch().items()}
+    for _ in range(8):
+        trainer.step(batch, range(128))
+    dropped = np.mean(np.array(labels) == trainer.model.null_label)
+    assert len(labels) == 1024 and 0.06 < dropped < 0.14
+
+
 def test_learning_rate_is_one_cycle_without_warm_up():
-    """torch's OneCycleLR with pct_start 0, the paper's cosine from 1e-4 to 1e-5."""
+    """torch's cosine annealing from 1e-4 to 1e-5: what OneCycleLR does when there is no warm-up."""
     settings = Optimisation(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
     rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
-    assert np.isclose(rates[0], 1e-4) and np.isclose(rates[-1], 1e-5) and np.isclose(betas[0], 0.85) and np.isclose(betas[-1], 0.95)
+    assert (
+        np.isclose(rates[0], 1e-4)
+        and np.isclose(rates[-1], 1e-5)
+        and np.isclose(betas[0], 0.85)
+        and np.isclose(betas[-1], 0.95)
+    )
     optimiser = torch.optim.AdamW([torch.zeros(1, requires_grad=True)], 1e-4)
     reference = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, T_max=99, eta_min=1e-5)
     for rate in rates:

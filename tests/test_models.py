@@ -1,5 +1,7 @@
 """The networks: sizes, masks, permutations, and that they can learn."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -97,8 +99,12 @@ def test_matching_reaches_the_optimum_of_the_padded_square_problem():
         for s, count in zip(slots, counts, strict=True):
             here = slice(start, start + s)
             part = (features[0, here], logit[0, here], truth[0, here], real[0, here])
-            square = np.array([[literal_total(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
-                               for i in range(s)])
+            square = np.array(
+                [
+                    [literal_total(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
+                    for i in range(s)
+                ]
+            )
             rows, cols = linear_sum_assignment(square)
             mine = assignment[here]
             taken = [int((mine == start + i).nonzero()) for i in range(count)]
@@ -106,6 +112,56 @@ def test_matching_reaches_the_optimum_of_the_padded_square_problem():
             assert len(taken) + len(free) == s
             assert abs(literal_total(*part, taken + free) - square[rows, cols].sum()) < 1e-5, trial
             start += s
+
+
+def test_matching_more_proposals_than_slots_is_optimal_too():
+    """The cell decoder offers more than there are slots: brute force over the whole rectangular cost."""
+    generator = torch.Generator().manual_seed(3)
+    slots, proposals, weights = (3, 2), (7, 5), MatchWeights(1.0, 24.0, 3.0)
+    features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
+    logit = torch.randn(1, 12, generator=generator)
+    real = torch.tensor([[True, True, True, True, False]])
+    assignment = match(features, logit, truth, real, slots, proposals, weights)[0]
+    scale = torch.tensor([24.0] * 3 + [3.0] * 6)
+    for mine, theirs in ((range(7), (0, 1, 2)), (range(7, 12), (3,))):
+
+        def cost(chosen, theirs=theirs):
+            return sum(
+                float(((features[0, j] - truth[0, i]).abs() * scale).sum() - logit[0, j])
+                for i, j in zip(theirs, chosen, strict=True)
+            )
+
+        best = min(itertools.permutations(mine, len(theirs)), key=cost)
+        got = [int((assignment == i).nonzero()) for i in theirs]
+        assert np.isclose(cost(got), cost(best), atol=1e-5)
+    assert (assignment >= 0).sum() == 4
+    with pytest.raises(ValueError, match="not finite"):
+        match(features * float("nan"), logit, truth, real, slots, proposals)
+
+
+def test_cell_proposals_lie_in_and_around_their_cell():
+    decoder = small_lvae(decoder="cells").object_decoder
+    features, existence = decoder(torch.randn(1, 4, 8, 8) * 10)
+    assert features.shape == (1, sum(decoder.proposals), 9) and existence.shape == features.shape[:2]
+    first = features[0, : decoder.proposals[0]].view(-1, 8, 8, 9)  # k, row, col
+    middle = 1 - (torch.arange(8) + 0.5) / 8
+    assert (first[..., 0] - middle[:, None]).abs().max() <= 1 / 8 + 1e-6
+    assert (first[..., 1] - middle[None, :]).abs().max() <= 1 / 8 + 1e-6
+
+
+def test_outputs_start_at_the_means_of_the_data():
+    batch = layout_batch([random_scene(i) for i in range(8)], small_spec())
+    for decoder in ("detr", "cells"):
+        lvae = small_lvae(decoder=decoder)
+        before = lvae.decode(lvae.encode(batch).mean)
+        lvae.start_at(batch)
+        after = lvae.decode(lvae.encode(batch).mean)
+        mean = batch.occupied.mean(dim=(0, 2, 3))
+        errors = [(o.occupancy_logit.sigmoid().mean(dim=(0, 2, 3)) - mean).abs().mean() for o in (before, after)]
+        assert errors[1] < 0.5 * errors[0]
+        expected = batch.real.sum() / len(batch)
+        offered = [float(o.existence_logit.sigmoid().sum() / len(batch)) for o in (before, after)]
+        assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
 
 
 def test_losses_are_their_equations():
@@ -152,7 +208,9 @@ def test_losses_are_their_equations():
 @pytest.mark.parametrize("decoder", ["detr", "cells"])
 def test_lvae_overfits_one_batch(decoder):
     spec = small_spec()
-    lvae = small_lvae(decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8)
+    lvae = small_lvae(
+        decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
+    )
     batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
     generator = torch.Generator().manual_seed(0)

@@ -2,7 +2,7 @@
 
 Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
 hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
-same order, so a reader never joins. Units are in the names; see docs/tables.md.
+same order, so a reader never joins. Units are in the names; README describes every column.
 """
 
 from __future__ import annotations
