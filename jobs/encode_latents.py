@@ -28,7 +28,7 @@ class Config:
 
 
 def encode(config: Config) -> dict:
-    """Encode and return the content of latents.json. Ray must run."""
+    """Encode and return the content of latents.json."""
     from rich.progress import Progress
 
     from pipelines.encode import encode_latents
@@ -37,6 +37,7 @@ def encode(config: Config) -> dict:
     dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
     lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
     output = absolute(config.output) if config.output else dataset.root
+    start_ray()
     with Progress() as bar:
         shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))
         return encode_latents(
@@ -45,7 +46,6 @@ def encode(config: Config) -> dict:
 
 
 def main(config: Config) -> None:
-    start_ray()
     content = encode(config)
     print(f"latents of {sum(content['scenes'].values())} scenes, shape {content['shape']}")
 

@@ -42,7 +42,7 @@ class Config:
 
 
 def evaluate(config: Config) -> dict:
-    """Score, write and return the nested metrics. Ray must run."""
+    """Score, write and return the nested metrics."""
     import pyarrow as pa
     from rich.progress import Progress
 
@@ -54,6 +54,7 @@ def evaluate(config: Config) -> dict:
     real = Selection(dataset.root, dataset.source, config.real_split, config.limit)
     wanted = config.generated or ("" if config.lvae else home("generated"))
     scores: dict = {}
+    start_ray()
     with Progress() as bar:
 
         def described(selection: Selection, name: str) -> dict:
@@ -84,7 +85,6 @@ def main(config: Config) -> None:
 
     from pipelines.evaluate import flattened
 
-    start_ray()
     scores = evaluate(config)
     shown = Table("metric", "value")
     for name, value in flattened(scores).items():

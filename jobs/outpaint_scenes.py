@@ -45,10 +45,11 @@ class Config:
 
 
 def outpaint(config: Config) -> str:
-    """Extend and return the dataset directory. Ray must run."""
+    """Extend and return the dataset directory."""
     from rich.progress import Progress
 
     from models.pipeline import Resampling
+    from pipelines import storage
     from pipelines.evaluate import Selection
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes
 
@@ -66,6 +67,10 @@ def outpaint(config: Config) -> str:
     )
     source = absolute(config.input) if config.input else home("generated")
     selection = Selection(source, config.source or None, config.split or None, config.limit, spread=False)
+    selection.shards()
+    if not storage.exists(storage.join(request.model, "model_index.json")):
+        raise ValueError(f"{request.model}: no PrITTI pipeline here; run jobs/train_dit.py first")
+    start_ray()
     with Progress() as bar:
         shown = bar.add_task("outpaint", total=config.limit)
         outpaint_scenes(request, selection, config.actors, lambda: bar.advance(shown))
@@ -73,7 +78,6 @@ def outpaint(config: Config) -> str:
 
 
 def main(config: Config) -> None:
-    start_ray()
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {outpaint(config)}")
 
 

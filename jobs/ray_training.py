@@ -20,7 +20,7 @@ import ray.train.torch
 import torch
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 
-from jobs.command import root_cause
+from jobs.command import root_cause, start_ray
 from jobs.tracking import Tracker
 from models.training import Optimisation, Trainer
 from pipelines import storage
@@ -133,7 +133,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
     Raises ValueError for a number of workers that does not fit, or for a loss that is not finite.
     """
-    os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
+    start_ray()
     scaling = scaling_for(num_workers, run.stream.batch_size)
     trainer = ray.train.torch.TorchTrainer(
         train_worker,

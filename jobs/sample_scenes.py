@@ -40,7 +40,7 @@ class Config:
 
 
 def sample(config: Config) -> str:
-    """Generate and return the dataset directory. Ray must run."""
+    """Generate and return the dataset directory."""
     from rich.progress import Progress
 
     from models.pipeline import LABELS
@@ -67,6 +67,7 @@ def sample(config: Config) -> str:
         guidance_scale=config.guidance,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )
+    start_ray()
     with Progress() as bar:
         shown = bar.add_task("sample scenes", total=config.num_scenes)
         sample_scenes(request, config.actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
@@ -77,7 +78,6 @@ def sample(config: Config) -> str:
 
 
 def main(config: Config) -> None:
-    start_ray()
     print(f"{config.num_scenes} scenes of source generated-{config.run} in {sample(config)}")
 
 

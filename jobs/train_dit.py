@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, run
 
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
@@ -50,7 +50,7 @@ class Config:
 
 
 def prepare(config: Config) -> tuple[TrainingRun, str]:
-    """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs. Ray must run."""
+    """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs."""
     from functools import partial
 
     from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
@@ -141,7 +141,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
 
 
 def train(config: Config) -> str:
-    """Train and return the pipeline's directory. Ray must run."""
+    """Train and return the pipeline's directory."""
     from jobs.ray_training import fit
     from pipelines import storage
 
@@ -182,7 +182,6 @@ def complete_pipeline(lvae: str, output: str) -> str:
 
 
 def main(config: Config) -> None:
-    start_ray()
     print(f"trained: {train(config)}")
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, run
 
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
@@ -46,7 +46,7 @@ class Config:
 
 
 def prepare(config: Config) -> TrainingRun:
-    """The run that the options mean; makes the smoke preset's data. Ray must run."""
+    """The run that the options mean; makes the smoke preset's data."""
     from functools import partial
 
     from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
@@ -110,7 +110,7 @@ def prepare(config: Config) -> TrainingRun:
 
 
 def train(config: Config) -> str:
-    """Train and return the model's directory. Ray must run."""
+    """Train and return the model's directory."""
     from jobs.ray_training import fit
 
     training = prepare(config)
@@ -142,7 +142,6 @@ def build(architecture: dict, layout: dict, settings, sample: dict, device, wrap
 
 
 def main(config: Config) -> None:
-    start_ray()
     print(f"trained: {train(config)}")
 
 
