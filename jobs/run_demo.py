@@ -29,10 +29,11 @@ class Config:
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200
-    lvae_steps: int = 450
+    lvae_steps: int = 900
+    lvae_batch_size: int = 4
     dit_steps: int = 800
     dit_batch_size: int = 8
-    """Many small steps show something sooner than few large ones."""
+    """Many small steps show something sooner than few large ones; so for the LVAE."""
     num_scenes: int = 48
     """Scenes to generate."""
     sampling_steps: int = 100
@@ -105,6 +106,7 @@ def main(config: Config) -> None:
                 config.preset,
                 data,
                 steps=config.lvae_steps,
+                batch_size=config.lvae_batch_size,
                 checkpoint_every=-(-config.lvae_steps // CHECKPOINTS),
                 seed=config.seed,
             )
