@@ -31,8 +31,8 @@ def encode(config: Config) -> dict:
     """Encode and return the content of latents.json."""
     from rich.progress import Progress
 
+    from pipelines.dataset import Dataset
     from pipelines.encode import encode_latents
-    from pipelines.ingest import Dataset
 
     dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
     lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")

@@ -47,8 +47,8 @@ def evaluate(config: Config) -> dict:
     from rich.progress import Progress
 
     from pipelines import storage
+    from pipelines.dataset import Dataset
     from pipelines.evaluate import Selection, compare, describe, flattened, rebuild
-    from pipelines.ingest import Dataset
 
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     real = Selection(dataset.root, dataset.source, config.real_split, config.limit)

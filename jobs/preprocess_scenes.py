@@ -5,6 +5,7 @@
     jobs/preprocess_scenes.py town --num-train 500 --num-test 100
     jobs/preprocess_scenes.py kitti360 --input KITTI-360 --output DIR
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
+    jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/own_drives.md
 
 Run it again with the same options to go on after an interruption.
 """
@@ -63,18 +64,36 @@ class Av2:
     """Leave out logs whose files cannot be read (they are listed in rejects) instead of stopping."""
 
 
+@dataclass(frozen=True)
+class Own:
+    """Your own drives: boxes, polygons and poses as Parquet or JSON under --input/DRIVE (docs/own_drives.md)."""
+
+    input: str
+    """The directory that holds a directory per drive."""
+    output: str = ""
+    """Dataset directory or URI (default: $PRITTI_HOME/datasets/own)."""
+    split: bool = True
+    """The paper's split along the distance driven, unless there is a splits.json; --no-split trains on every pose."""
+    slots: Literal["p95", "paper"] = "p95"
+    """Slots per category: 95th percentile of the training split, or the paper's 514."""
+    skip_unreadable: bool = False
+    """Leave out drives that cannot be read (they are listed in rejects) instead of stopping."""
+
+
 Config = (
     Annotated[Town, tyro.conf.subcommand("town")]
     | Annotated[Kitti360, tyro.conf.subcommand("kitti360")]
     | Annotated[Av2, tyro.conf.subcommand("av2")]
+    | Annotated[Own, tyro.conf.subcommand("own")]
 )
 
 
-def main(config: Town | Kitti360 | Av2) -> None:
+def main(config: Town | Kitti360 | Av2 | Own) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from models.layout import PAPER_SLOTS
-    from pipelines import ingest
+    from pipelines import plan
+    from pipelines.ingest import ingest
     from pipelines.sources.town import TOWN_VERSION
 
     source = type(config).__name__.lower()
@@ -84,15 +103,16 @@ def main(config: Town | Kitti360 | Av2) -> None:
     skip = options.pop("skip_unreadable", False)
     if isinstance(config, Town):
         options["town_version"] = TOWN_VERSION
-        tasks = ingest.plan_town(config.num_train, config.num_test, config.seed)
+        tasks = plan.plan_town(config.num_train, config.num_test, config.seed)
     else:
         options["input"] = absolute(config.input)
         if "://" not in config.input and not os.path.isdir(options["input"]):
             raise ValueError(f"--input {config.input}: no such directory; give the dataset's root")
-        if isinstance(config, Kitti360):
-            tasks = ingest.plan_kitti360(options["input"], config.split)
+        if isinstance(config, Av2):
+            tasks = plan.plan_argoverse2(options["input"])
         else:
-            tasks = ingest.plan_argoverse2(options["input"])
+            plan_drives = plan.plan_kitti360 if isinstance(config, Kitti360) else plan.plan_own
+            tasks = plan_drives(options["input"], config.split, skip)
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
 
     start_ray()
@@ -105,17 +125,15 @@ def main(config: Town | Kitti360 | Av2) -> None:
     )
     with Progress(*columns) as bar:
         shown = bar.add_task(f"preprocess {source}", total=len(tasks))
-        result = ingest.ingest(
-            tasks, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown)
-        )
+        result = ingest(tasks, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown))
     if result.already_complete:
-        print(f"{output} is complete already: {result.scenes}")
+        print(f"{output} is complete already: {dict(result.scenes)}, {sum(result.rejects.values())} rejected")
         return
     total = sum(result.scenes.values())
     for reason, count in sorted(result.rejects.items(), key=lambda item: -item[1])[:10]:
         print(f"  rejected {count}: {reason}")
     print(
-        f"{output}: {total} scenes {result.scenes}, {sum(result.rejects.values())} rejected, "
+        f"{output}: {total} scenes {dict(result.scenes)}, {sum(result.rejects.values())} rejected, "
         f"{result.duplicates} duplicate objects dropped, {result.seconds:.1f} s ({total / result.seconds:.0f} scenes/s)"
     )
 

@@ -61,9 +61,9 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     from models.training import Optimisation
     from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
     from pipelines import storage
+    from pipelines.dataset import Dataset
     from pipelines.encode import load_lvae, weights_digest
     from pipelines.feed import LatentReader, Stream
-    from pipelines.ingest import Dataset
     from pipelines.scenes.tables import find_shards
 
     row = preset(DIT_PRESETS, config.preset)

@@ -21,6 +21,8 @@ from jobs.command import absolute, home, run
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
 
+START_SCENES, START_SHARDS = 96, 16  # the sample of training scenes that says where outputs start
+
 
 @dataclass(frozen=True)
 class Config:
@@ -55,8 +57,8 @@ def prepare(config: Config) -> TrainingRun:
     from jobs.validation import ReconstructionCheck
     from models.training import Optimisation
     from models.zoo import LVAE_PRESETS, preset
+    from pipelines.dataset import Dataset
     from pipelines.feed import LayoutReader, Stream
-    from pipelines.ingest import Dataset
     from pipelines.scenes.tables import find_shards
 
     row = preset(LVAE_PRESETS, config.preset)
@@ -97,7 +99,7 @@ def prepare(config: Config) -> TrainingRun:
     return TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, row.architecture(), spec.to_dict(), settings, first_layouts(shards[0], counts[0], spec)),
+        build=partial(build, row.architecture(), spec.to_dict(), settings, sample_layouts(shards, counts, spec)),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LayoutReader(spec),
         settings=settings,
@@ -117,13 +119,17 @@ def train(config: Config) -> str:
     return fit(training, config.workers, absolute(config.output) if config.output else home("models", training.name))
 
 
-def first_layouts(shard, count: int, spec) -> dict:
-    """Compact layouts of up to 64 training scenes, for the initial biases (LayoutVAE.start_at)."""
+def sample_layouts(shards: list, counts: list[int], spec) -> dict:
+    """Compact layouts of up to START_SCENES training scenes from all over the dataset (LayoutVAE.start_at)."""
     import numpy as np
 
     from pipelines.feed import LayoutReader
 
-    return LayoutReader(spec)(shard, np.arange(min(count, 64)))
+    read, parts = LayoutReader(spec), []
+    for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):
+        take = min(counts[k], START_SCENES // START_SHARDS)
+        parts.append(read(shards[k], np.linspace(0, counts[k] - 1, take).round().astype(int)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def build(architecture: dict, layout: dict, settings, sample: dict, device, wrap):

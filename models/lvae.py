@@ -13,6 +13,7 @@ from torch import Tensor
 
 from models.cells import CellDecoder
 from models.ground import GroundDecoder, GroundEncoder
+from models.ground import start_at as start_ground
 from models.layout import FEATURES, LayoutBatch, LayoutSpec
 from models.matching import MatchWeights
 from models.objects import ObjectDecoder, ObjectEncoder
@@ -68,7 +69,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
     """Encodes layouts into a (2 c, h, w) latent and decodes them back.
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
-    (fold 2^(len(channels) - 1)). `decoder` is the paper's DETR or `cells`: proposals of each latent cell (cells.py).
+    (fold 2^(len(channels) - 1)). `shortcut`: a linear way past the ground networks. `decoder` is the paper's DETR or `cells`: proposals of each latent cell (cells.py).
     """
 
     @register_to_config
@@ -85,6 +86,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         hidden: int = 1024,
         head_hidden: int = 1024,
         decoder: str = "detr",
+        shortcut: bool = False,
     ) -> None:
         super().__init__()
         spec = LayoutSpec.from_dict(layout)
@@ -92,7 +94,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % factor:
             raise ValueError(f"LayoutVAE needs a square grid divisible by {factor}, got {spec.grid}")
         size, num_classes = spec.grid.rows // factor, len(spec.ground_classes)
-        ground = (num_classes, latent_channels, tuple(channels), norm_groups, fold)
+        ground = (num_classes, latent_channels, tuple(channels), norm_groups, fold, shortcut)
         self.ground_encoder, self.ground_decoder = GroundEncoder(*ground), GroundDecoder(*ground)
         self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
         if decoder == "detr":
@@ -109,14 +111,12 @@ class LayoutVAE(ModelMixin, ConfigMixin):
 
     @torch.no_grad()
     def start_at(self, batch: LayoutBatch) -> None:
-        """Set the last biases so that every output starts at its mean over `batch`, a sample of training layouts.
+        """Start every output at its mean over `batch`, a sample of training layouts (shortcuts: models/ground.py).
 
         Adam moves a bias by about the learning rate per step: from zero, thousands of steps would go into learning
         that a pole is thin and that most pixels are no road.
         """
-        occupied = batch.occupied.mean(dim=(0, 2, 3))
-        height = (batch.height * batch.occupied).sum(dim=(0, 2, 3)) / batch.occupied.sum(dim=(0, 2, 3)).clamp(min=1)
-        self.ground_decoder.start_at(torch.cat([height, logit(occupied)]))
+        start_ground(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
         groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
         features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
         count = torch.stack([r.sum() / len(r) for _, r in groups])

@@ -24,6 +24,7 @@ class LVAEPreset:
     batch_size: int
     steps: int
     decoder: str = "detr"  # the paper's, or "cells"
+    shortcut: bool = False  # a linear way past the ground networks; not in the paper
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-5
     weight_decay: float = 5e-4
@@ -44,7 +45,7 @@ LVAE_PRESETS = {
     "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     1,   32,   1,     2,    64,    32,  4,     8,
                            learning_rate=1e-3, final_learning_rate=1e-4),
     "town":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   128, 8,     20_000,
-                           decoder="cells", learning_rate=4e-3, final_learning_rate=1e-5, warmup_steps=50, grad_clip=1.0),
+                           decoder="cells", shortcut=True, learning_rate=4e-3, final_learning_rate=1e-5, warmup_steps=50, grad_clip=1.0),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),

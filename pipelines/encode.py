@@ -13,7 +13,7 @@ import torch
 from models.lvae import LayoutVAE
 from models.tensors import layout_batch
 from pipelines import storage
-from pipelines.ingest import Dataset
+from pipelines.dataset import Dataset
 from pipelines.scenes.tables import Shard, find_shards, latents_schema
 
 

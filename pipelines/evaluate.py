@@ -15,8 +15,8 @@ import torch
 
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, ground_on_grid, layout_batch, scene_from_layout
+from pipelines.dataset import Dataset
 from pipelines.encode import gpus_per_actor, load_lvae
-from pipelines.ingest import Dataset
 from pipelines.metrics import generation, inception, statistics, validity
 from pipelines.metrics.reconstruction import (
     GroundSums,

@@ -12,9 +12,7 @@ def real_data() -> Path:
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     path = Path(os.environ.get("PRITTI_TEST_DATA") or beside)
     if not path.is_dir():
-        pytest.skip(
-            f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/"
-        )
+        pytest.skip(f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/")
     return path
 
 

@@ -60,9 +60,7 @@ def points(*xy: tuple[float, float]) -> list[dict]:
 def map_json() -> dict:
     """All is road 40 m around the origin; a crossing of 3 x 10 m whose edges run against each other."""
     return {
-        "drivable_areas": {
-            "1": {"id": 1, "area_boundary": points((-40, -40), (40, -40), (40, 40), (-40, 40))}
-        },
+        "drivable_areas": {"1": {"id": 1, "area_boundary": points((-40, -40), (40, -40), (40, 40), (-40, 40))}},
         "lane_segments": {},
         "pedestrian_crossings": {
             "2": {"id": 2, "edge1": points((10, 0), (10, 10)), "edge2": points((13, 10), (13, 0))}
@@ -175,9 +173,7 @@ def real(real_data, request):
 def surface_at(drive, points_m: np.ndarray) -> np.ndarray:
     """Height raster below world points, NaN where unknown."""
     ground = drive.ground
-    col, row = (
-        (points_m[:, :2] @ ground.raster_from_world[:2, :2].T + ground.raster_from_world[:2, 2]).astype(int).T
-    )
+    col, row = (points_m[:, :2] @ ground.raster_from_world[:2, :2].T + ground.raster_from_world[:2, 2]).astype(int).T
     rows, cols = ground.raster_m.shape
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
     return np.where(inside, ground.raster_m[row.clip(0, rows - 1), col.clip(0, cols - 1)], np.nan)

@@ -239,8 +239,8 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
 
 def test_real_against_real_is_near_perfect(home):
     """The training scenes scored against themselves: the evaluator's own floor."""
+    from pipelines.dataset import Dataset
     from pipelines.evaluate import Selection, compare, describe
-    from pipelines.ingest import Dataset
 
     dataset = Dataset.open(str(home / "datasets/smoke"))
     side = describe(Selection(dataset.root, "town", "train"), dataset)

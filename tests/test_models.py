@@ -9,6 +9,7 @@ from scenes import random_scene, small_spec
 from scipy.optimize import linear_sum_assignment
 
 from models.dit import DiT
+from models.ground import reduced_rank_regression
 from models.layout import LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
@@ -162,6 +163,33 @@ def test_outputs_start_at_the_means_of_the_data():
         expected = batch.real.sum() / len(batch)
         offered = [float(o.existence_logit.sigmoid().sum() / len(batch)) for o in (before, after)]
         assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
+
+
+def test_the_linear_start_is_the_best_of_its_rank():
+    generator = torch.Generator().manual_seed(0)
+    given = torch.randn(500, 12, generator=generator, dtype=torch.float64)
+    wanted = given @ torch.randn(12, 9, generator=generator, dtype=torch.float64)
+    given, wanted = given - given.mean(dim=0), wanted - wanted.mean(dim=0)
+    full = float((wanted**2).sum())
+    singular = torch.linalg.svdvals(wanted)
+    for rank in (1, 3, 9):
+        encode, decode = reduced_rank_regression(given, wanted, rank)
+        error = float(((given @ encode @ decode - wanted) ** 2).sum())
+        assert abs(error - float((singular[rank:] ** 2).sum())) < 1e-3 * full  # Eckart-Young: no rank does better
+        assert np.allclose((given @ encode).var(dim=0, correction=0), 1, atol=1e-6)
+
+
+def test_shortcuts_show_the_ground_before_the_first_step():
+    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    iou = []
+    for shortcut in (False, True):
+        lvae = small_lvae(shortcut=shortcut, latent_channels=16)
+        lvae.start_at(batch)
+        with torch.no_grad():
+            seen = lvae.decode(lvae.encode(batch).mean).occupancy_logit > 0
+        truth = batch.occupied > 0.5
+        iou.append(float((seen & truth).sum() / (seen | truth).sum()))
+    assert iou[1] > 0.7 > iou[0] + 0.2
 
 
 def test_losses_are_their_equations():

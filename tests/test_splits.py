@@ -28,9 +28,7 @@ def by_the_book(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[
         left = length - at % length if at < driven else 0.0
         label[key] = "train" if left > 25 else "unused" if left > 20 else "test" if left > 5 else "unused"
     where = {key: positions_by_sequence[key[0]][key[1]][:2] for key in label}
-    sides = {
-        s: np.array([where[k] for k in label if label[k] == s]).reshape(-1, 2) for s in ("train", "test")
-    }
+    sides = {s: np.array([where[k] for k in label if label[k] == s]).reshape(-1, 2) for s in ("train", "test")}
     other = {"train": "test", "test": "train"}
     close = [
         key
@@ -86,9 +84,7 @@ def test_a_car_that_waits_stays_in_its_segment():
     assert (split == split[:, :1]).all()
 
 
-@pytest.mark.parametrize(
-    ("total_m", "count"), [(10, 1), (99, 1), (100, 2), (320, 6), (5000, 100), (73_700, 100)]
-)
+@pytest.mark.parametrize(("total_m", "count"), [(10, 1), (99, 1), (100, 2), (320, 6), (5000, 100), (73_700, 100)])
 def test_short_drives_have_fewer_segments_and_say_so(total_m, count, caplog):
     with caplog.at_level(logging.WARNING):
         assert num_segments(total_m) == count

@@ -44,7 +44,9 @@ def test_round_trip(tmp_path, scenes):
     assert np.array_equal(back[2].world_from_imu, np.arange(12.0).reshape(3, 4)) and back[0].world_from_imu is None
     for row, scene in zip((3, 0), shard.scenes(rows=[3, 0]), strict=True):
         assert_same(scenes[row], scene)
-    assert pq.read_schema(shard.path("scenes")).equals(SCENES) and pq.read_schema(shard.path("primitives")).equals(PRIMITIVES)
+    assert pq.read_schema(shard.path("scenes")).equals(SCENES) and pq.read_schema(shard.path("primitives")).equals(
+        PRIMITIVES
+    )
     assert not [p for p in tmp_path.rglob("*") if p.name.startswith(storage.TEMPORARY)]
 
 
@@ -65,7 +67,9 @@ def test_the_analysts_first_query(tmp_path, scenes):
     assert joined == [("town", "train", None)]
     road = duckdb.sql(f"select road_area_m2 from {table} where scene_id = 'test-0000'").fetchall()[0][0]
     assert np.isclose(road, scenes[0].ground_area_m2()[0])
-    canonical = duckdb.sql(f"select min(length_m - width_m), min(yaw_rad), max(yaw_rad) from '{tmp_path}/primitives/**/*.parquet'")
+    canonical = duckdb.sql(
+        f"select min(length_m - width_m), min(yaw_rad), max(yaw_rad) from '{tmp_path}/primitives/**/*.parquet'"
+    )
     gap, low, high = canonical.fetchall()[0]
     assert gap >= 0 and low >= -np.pi / 2 - 1e-6 and high < np.pi / 2
 

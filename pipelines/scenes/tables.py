@@ -2,11 +2,13 @@
 
 Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
 hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
-same order, so a reader never joins. Units are in the names; README describes every column.
+same order, so a reader never joins. Units are in the names, and every file says itself what its columns mean:
+docs/tables.md, for people who never read this.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -17,80 +19,133 @@ from models.cholesky import cholesky_parameters
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines import storage
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
 HEIGHT_STEP_M = 0.01
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # what 16 bits hold
 
-_META = {"pritti_schema_version": SCHEMA_VERSION}
+# What the categories and ground classes hold, for people who look at columns and not at code.
+# fmt: off
+CATEGORY_MEANING = {
+    "vegetation_cuboid":    "trees, bushes and hedges annotated as boxes",
+    "vegetation_ellipsoid": "trees and bushes annotated as ellipsoids",
+    "vehicle_big":          "trucks, buses and trams",
+    "vehicle_small":        "cars and trailers",
+    "two_wheelers":         "bicycles and motorcycles",
+    "human":                "pedestrians and riders",
+    "construction_big":     "buildings and garages",
+    "construction_small":   "walls, fences, guard rails and gates",
+    "pole":                 "poles and bollards",
+    "traffic_control":      "traffic lights, traffic signs and street lamps",
+    "object":               "bins, boxes, cones and other things",
+}
+GROUND_MEANING = {
+    "road":     "carriageway, or drivable area (av2)",
+    "sidewalk": "sidewalks",
+    "parking":  "parking areas and driveways",
+    "terrain":  "grass, soil and the like",
+    "ground":   "ground of any other kind",
+    "crossing": "pedestrian crossings, lying on the road",
+}
+# fmt: on
 
-SCENES = pa.schema(
-    [
-        ("scene_id", pa.string()),
-        ("sequence", pa.string()),
-        ("frame", pa.int64()),
-        ("x_m", pa.float64()),
-        ("y_m", pa.float64()),
-        ("z_m", pa.float64()),
-        ("yaw_rad", pa.float64()),
-        ("world_from_imu", pa.list_(pa.float64())),  # 12 numbers or null: Parquet has no null of a fixed size
-        ("vegetation_density", pa.string()),
-        ("vehicle_density", pa.string()),
-        ("vegetation_volume_m3", pa.float64()),
-        ("vehicle_volume_m3", pa.float64()),
-        ("num_primitives", pa.int32()),
-        *[(f"num_{name}", pa.int32()) for name in CATEGORIES],
-        *[(f"{name}_area_m2", pa.float64()) for name in GROUND_CLASSES],
-        ("primitive_offset", pa.int64()),
-    ],
-    metadata=_META,
+
+def _schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
+    """A schema that explains itself, from rows of (name, type, unit, description); unit "" where none applies.
+
+    Every field carries `unit` and `description`. DuckDB does not show those, so the same rows stand once more, as
+    JSON, among the table's own key-values, under `pritti_columns`.
+    """
+    fields, rows = [], []
+    for name, kind, unit, meaning in columns:
+        fields.append(pa.field(name, kind, metadata={"description": meaning} | ({"unit": unit} if unit else {})))
+        rows.append({"name": name, "unit": unit or None, "description": meaning})
+    metadata = {
+        "pritti_schema_version": SCHEMA_VERSION,
+        "pritti_description": description,
+        "pritti_columns": json.dumps(rows, ensure_ascii=False),
+    }
+    return pa.schema(fields, metadata)
+
+
+# fmt: off
+_FRAME = "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles counter-clockwise from x, seen from above."
+_SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
+_SEQUENCE = ("sequence", pa.string(), "", "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
+
+SCENES = _schema(
+    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and totals. " + _FRAME,
+    _SCENE_ID,
+    _SEQUENCE,
+    ("frame",                pa.int64(),   "1; av2: ns", "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
+    ("x_m",                  pa.float64(), "m",   "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
+    ("y_m",                  pa.float64(), "m",   "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
+    ("z_m",                  pa.float64(), "m",   "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
+    ("yaw_rad",              pa.float64(), "rad", "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
+    # A variable list: Parquet has no null of a fixed size.
+    ("world_from_imu",       pa.list_(pa.float64()), "1; m", "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
+    ("vegetation_density",   pa.string(),  "",    "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing was."),
+    ("vehicle_density",      pa.string(),  "",    "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
+    ("vegetation_volume_m3", pa.float64(), "m3",  "Sum of the volumes of all vegetation primitives; overlaps count twice."),
+    ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all vehicles, big and small."),
+    ("num_primitives",       pa.int32(),   "1",   "Number of primitives of all categories."),
+    *[(f"num_{name}",        pa.int32(),   "1",   f"Number of {name} primitives: {CATEGORY_MEANING[name]}.") for name in CATEGORIES],
+    *[(f"{name}_area_m2",    pa.float64(), "m2",  f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.") for name in GROUND_CLASSES],
+    ("primitive_offset",     pa.int64(),   "1",   "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
 )
 
-PRIMITIVES = pa.schema(
-    [
-        ("scene_id", pa.string()),
-        ("category", pa.string()),
-        ("label", pa.string()),
-        ("kind", pa.string()),
-        ("instance_id", pa.int64()),
-        ("x_m", pa.float32()),
-        ("y_m", pa.float32()),
-        ("z_m", pa.float32()),
-        ("length_m", pa.float32()),
-        ("width_m", pa.float32()),
-        ("height_m", pa.float32()),
-        ("yaw_rad", pa.float32()),
-        ("heading_rad", pa.float32()),
-        ("rotation", pa.list_(pa.float32(), 9)),
-        ("cholesky", pa.list_(pa.float32(), 6)),
-        ("existence", pa.float32()),
-    ],
-    metadata=_META,
+PRIMITIVES = _schema(
+    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen from several poses has a row in each. " + _FRAME,
+    _SCENE_ID,
+    ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
+    ("label",       pa.string(),  "",    "Class name as the source dataset spells it; generated primitives: the category."),
+    ("kind",        pa.string(),  "",    "Shape that fills the box: cuboid or ellipsoid."),
+    ("instance_id", pa.int64(),   "",    "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects apart."),
+    ("x_m",         pa.float32(), "m",   "x of the centre in the scene frame: distance ahead of the ego vehicle."),
+    ("y_m",         pa.float32(), "m",   "y of the centre in the scene frame: distance to the left of the ego vehicle."),
+    ("z_m",         pa.float32(), "m",   "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
+    ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes that are not the height axis."),
+    ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
+    ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
+    ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
+    ("heading_rad", pa.float32(), "rad", "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
+    ("rotation",    pa.list_(pa.float32(), 9), "1", "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
+    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5", "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
+    ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
 )
 
-RASTERS = pa.schema(
-    [
-        ("scene_id", pa.string()),
-        ("height", pa.binary()),  # int16 differences of occupied pixels' heights, in steps of height_step_m
-        ("occupied", pa.binary()),  # numpy.packbits of (classes, rows, cols)
-        ("resolution_m", pa.float64()),
-        ("height_step_m", pa.float64()),
-        ("rows", pa.int32()),
-        ("cols", pa.int32()),
-        ("front_m", pa.float64()),
-        ("left_m", pa.float64()),
-        ("ground_classes", pa.list_(pa.string())),
-    ],
-    metadata=_META,
+RASTERS = _schema(
+    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from above. " + _FRAME,
+    _SCENE_ID,
+    ("height",         pa.binary(),  "height_step_m", "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
+    ("occupied",       pa.binary(),  "",    "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
+    ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
+    ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
+    ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is farthest ahead."),
+    ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is leftmost."),
+    ("front_m",        pa.float64(), "m",   "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
+    ("left_m",         pa.float64(), "m",   "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
+    ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
 )
 
-REJECTS = pa.schema(
-    [("scene_id", pa.string()), ("sequence", pa.string()), ("frame", pa.int64()), ("reason", pa.string())], metadata=_META
+REJECTS = _schema(
+    "One row per scene that was left out, or per drive that could not be read.",
+    ("scene_id", pa.string(), "", "Name that the scene would have; without a frame it names the drive."),
+    _SEQUENCE,
+    ("frame",    pa.int64(),  "1; av2: ns", "Frame number (av2: timestamp); null if the whole drive was left out."),
+    ("reason",   pa.string(), "", "Why it was left out."),
 )
 
 
 def latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """(C, h, w) posterior moments per scene; float16, channels first."""
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
-    return pa.schema([("scene_id", pa.string()), ("mean", tensor), ("logvar", tensor)], metadata=_META)
+    return _schema(
+        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the rasters.",
+        _SCENE_ID,
+        ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
+        ("logvar", tensor, "1", "Natural logarithm of its variance: float16 (channel, row, col) in C order."),
+    )
+# fmt: on
 
 
 # ---------------------------------------------------------------------------------------------------- to tables
@@ -104,7 +159,9 @@ def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
     return np.diff(steps.astype("<i2"), prepend=np.int16(0)).tobytes(), np.packbits(scene.occupied).tobytes()
 
 
-def decode_ground(height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float) -> tuple[np.ndarray, np.ndarray]:
+def decode_ground(
+    height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float
+) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
     mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).astype(bool).reshape(shape)
     height_m = np.zeros(shape, np.float32)
@@ -197,7 +254,12 @@ def scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
 
 
 def scenes_from_tables(
-    scenes: pa.Table, primitives: pa.Table, rasters: pa.Table, source: str, split: str, rows: Sequence[int] | None = None
+    scenes: pa.Table,
+    primitives: pa.Table,
+    rasters: pa.Table,
+    source: str,
+    split: str,
+    rows: Sequence[int] | None = None,
 ) -> list[Scene]:
     """The Scenes of one shard, or only those in `rows`, in that order."""
     primitives = primitives.combine_chunks()
@@ -302,7 +364,9 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
             shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
     if not shards:
         wanted = "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v)
-        raise ValueError(f"{storage.join(root, table)}: no shards of {wanted or 'any source'}; run jobs/preprocess_scenes.py first")
+        raise ValueError(
+            f"{storage.join(root, table)}: no shards of {wanted or 'any source'}; run jobs/preprocess_scenes.py first"
+        )
     return shards
 
 

@@ -93,9 +93,7 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
     Raises ValueError, naming the file, for anything missing, of the wrong type, or no finite sensible value.
     """
     if split == "test":
-        raise ValueError(
-            f"{Path(root, split, log)}: Argoverse 2's test split has no annotations; use train or val"
-        )
+        raise ValueError(f"{Path(root, split, log)}: Argoverse 2's test split has no annotations; use train or val")
     folder = Path(root, split, log)
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such log; check --input and that the log is unpacked")
@@ -112,8 +110,7 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
         source=SOURCE,
         sequence=log,
         category=np.array([CATEGORY_OF[label] for label in boxes["category"]], np.int8),
-        center_m=np.einsum("nij,nj->ni", city_from_ego_of_box[:, :, :3], center_ego_m)
-        + city_from_ego_of_box[:, :, 3],
+        center_m=np.einsum("nij,nj->ni", city_from_ego_of_box[:, :, :3], center_ego_m) + city_from_ego_of_box[:, :, 3],
         rotation=rotation,
         size_m=_columns(boxes, SIZE),
         heading_rad=np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
@@ -133,16 +130,12 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
 def _read_annotations(path: Path) -> dict[str, np.ndarray]:
     """The columns this reader needs, (n,) each, checked."""
     numbers = (*SIZE, *QUATERNION, *TRANSLATION)
-    columns = _read_feather(
-        path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers
-    )
+    columns = _read_feather(path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers)
     if len(columns["category"]) == 0:
         raise ValueError(f"{path}: holds no box; download the log again")
     unknown = sorted(set(columns["category"]) - set(CATEGORY_OF) - {EGO_LABEL})
     if unknown:
-        raise ValueError(
-            f"{path}: unknown category {unknown[0][:40]!r}; add it to CATEGORY_LABELS of {__name__}"
-        )
+        raise ValueError(f"{path}: unknown category {unknown[0][:40]!r}; add it to CATEGORY_LABELS of {__name__}")
     for name in SIZE:
         _check_range(path, name, columns[name], MIN_BOX_SIZE_M, MAX_BOX_SIZE_M)
     for name in TRANSLATION:
@@ -189,13 +182,9 @@ def _read_feather(
                 raise ValueError(f"{path}: column {name} is missing (or there twice); download the log again")
             column = table[name]
             if not is_kind(column.type):
-                raise ValueError(
-                    f"{path}: column {name} is {column.type}, expected {kind}; download the log again"
-                )
+                raise ValueError(f"{path}: column {name} is {column.type}, expected {kind}; download the log again")
             if column.null_count:
-                raise ValueError(
-                    f"{path}: column {name} has {column.null_count} nulls; download the log again"
-                )
+                raise ValueError(f"{path}: column {name} has {column.null_count} nulls; download the log again")
             if kind == "text":
                 columns[name] = np.array(pc.cast(column, pa.string()).to_pylist(), object)
             else:
@@ -203,9 +192,7 @@ def _read_feather(
     for name in numbers:
         bad = np.flatnonzero(~np.isfinite(columns[name]))
         if len(bad):
-            raise ValueError(
-                f"{path}: {name} of row {bad[0]} is {columns[name][bad[0]]}; fix or drop the row"
-            )
+            raise ValueError(f"{path}: {name} of row {bad[0]} is {columns[name][bad[0]]}; fix or drop the row")
     return columns
 
 
@@ -219,8 +206,7 @@ def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: fl
     bad = np.flatnonzero((values < low) | (values > high))
     if len(bad):
         raise ValueError(
-            f"{path}: {name} of row {bad[0]} is {values[bad[0]]:g}, expected {low:g}..{high:g};"
-            " fix or drop the row"
+            f"{path}: {name} of row {bad[0]} is {values[bad[0]]:g}, expected {low:g}..{high:g}; fix or drop the row"
         )
 
 
@@ -265,8 +251,7 @@ def _read_ground(folder: Path) -> MapGround:
     roads = [_points(path, area, "area_boundary", 3) for area in areas]
     quads = [_quad(_points(path, c, "edge1", 2, 2), _points(path, c, "edge2", 2, 2)) for c in crossings]
     return MapGround(
-        polygon_class=[GROUND_CLASSES.index("road")] * len(roads)
-        + [GROUND_CLASSES.index("crossing")] * len(quads),
+        polygon_class=[GROUND_CLASSES.index("road")] * len(roads) + [GROUND_CLASSES.index("crossing")] * len(quads),
         polygons_m=roads + quads,
         raster_m=_read_heights(_only(folder, "*_ground_height_surface____*.npy")),
         raster_from_world=_read_sim2(_only(folder, "*___img_Sim2_city.json")),
@@ -287,9 +272,7 @@ def _read_json(path: Path) -> dict:
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: broken JSON ({str(error)[:120]}); download the log again") from error
     if not isinstance(content, dict):
-        raise ValueError(
-            f"{path}: holds a {type(content).__name__}, expected an object; download the log again"
-        )
+        raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object; download the log again")
     return content
 
 
@@ -305,14 +288,10 @@ def _points(path: Path, entry: dict, name: str, least: int, most: int | None = N
     """(n, 2) x and y of the points entry[name], metres, city frame."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
-        raise ValueError(
-            f"{path}: {name} of {entry.get('id')} is no list of {least} points; download the log again"
-        )
+        raise ValueError(f"{path}: {name} of {entry.get('id')} is no list of {least} points; download the log again")
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
     if not _all_numbers(values, MAX_COORDINATE_M):
-        raise ValueError(
-            f"{path}: {name} of {entry.get('id')} has a point without sensible x, y; fix or drop it"
-        )
+        raise ValueError(f"{path}: {name} of {entry.get('id')} has a point without sensible x, y; fix or drop it")
     return np.array(values, np.float64).reshape(-1, 2)
 
 
@@ -353,10 +332,7 @@ def _read_sim2(path: Path) -> np.ndarray:
     content = _read_json(path)
     rotation, translation, scale = content.get("R"), content.get("t"), content.get("s")
     if not (
-        isinstance(rotation, list)
-        and len(rotation) == 4
-        and isinstance(translation, list)
-        and len(translation) == 2
+        isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
     ):
         raise ValueError(f"{path}: R or t is missing or not of 4 and 2 numbers; download the log again")
     if not _all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:

@@ -6,14 +6,16 @@ numpy only: the town is usable without ray or pyarrow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from models.scene import Grid, Scene, canonical_boxes, yaw_rotation
-from pipelines.scenes.rasters import cast_down, fill_polygon
+from pipelines.scenes.rasters import fill_polygon, height_map
 
 STATIC = -1
+EXTRUSION_M = 1e-3  # how far a slab's underside may be from a shifted copy of its top
 
 
 @dataclass(frozen=True)
@@ -41,21 +43,49 @@ class SlabGround:
     triangles: np.ndarray  # (t, 3) indices into vertices_m
     # a triangle's slab is its first vertex's
 
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SlabGround:
+        """The slabs with a vertex in a rectangle of the world, low_m (2,) to high_m (2,)."""
+        xy = self.vertices_m[:, :2]
+        kept = np.zeros(len(self.slab_class), bool)
+        kept[self.vertex_slab[((xy >= low_m) & (xy <= high_m)).all(axis=1)]] = True
+        vertex, triangle = kept[self.vertex_slab], kept[self.vertex_slab[self.triangles[:, 0]]]
+        return SlabGround(
+            slab_class=self.slab_class[kept],
+            vertices_m=self.vertices_m[vertex],
+            vertex_slab=(np.cumsum(kept) - 1)[self.vertex_slab[vertex]],
+            triangles=(np.cumsum(vertex) - 1)[self.triangles[triangle]],
+        )
+
+    @cached_property
+    def _upper(self) -> np.ndarray:
+        """The triangles without undersides: a vertical ray hits the top or a side of an extruded slab before them.
+
+        A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
+        """
+        count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
+        place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
+        half = (count // 2)[self.vertex_slab]
+        lower = place >= half
+        down_m = self.vertices_m[lower] - self.vertices_m[np.flatnonzero(lower) - half[lower]]
+        owner = self.vertex_slab[lower]
+        first_m = down_m[np.unique(owner, return_index=True)[1]]
+        same = np.abs(down_m - first_m[np.cumsum(np.diff(owner, prepend=owner[:1]) > 0)]).max(axis=1) < EXTRUSION_M
+        extruded = count % 2 == 0
+        extruded[owner[~same | (down_m[:, 2] >= 0)]] = False
+        underside = lower[self.triangles].all(axis=1) & extruded[self.vertex_slab[self.triangles[:, 0]]]
+        return self.triangles[~underside]
+
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
         """height_m and occupied (G, H, W): slab tops seen from above, of slabs with a vertex inside the grid.
 
         The paper keeps a ground polygon if at least one of its vertices lies in the crop (supplement A).
         """
-        reach_m = 2 * np.hypot(grid.rows, grid.cols) * grid.resolution_m
-        near = np.abs(self.vertices_m[:, :2] - pose.xyz_m[:2]).max(axis=1) < reach_m
-        local = pose.to_ego(self.vertices_m[near])
-        inside = grid.contains(local[:, 0], local[:, 1])
-        kept_slab = np.zeros(len(self.slab_class), bool)
-        kept_slab[self.vertex_slab[near][inside]] = True
-        triangles = self.triangles[kept_slab[self.vertex_slab[self.triangles[:, 0]]]]
-        layer = self.slab_class[self.vertex_slab[triangles[:, 0]]] if len(triangles) else None
-        height, _ = cast_down(pose.to_ego(self.vertices_m[triangles]), grid, layer, num_classes)
-        return _heights(height)
+        local = pose.to_ego(self.vertices_m)
+        inside = np.zeros(len(self.slab_class), bool)
+        inside[self.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
+        triangles = self._upper[inside[self.vertex_slab[self._upper[:, 0]]]]
+        layer = self.slab_class[self.vertex_slab[triangles[:, 0]]]
+        return _heights(height_map(local[triangles], grid, layer, num_classes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +96,15 @@ class MapGround:
     polygons_m: list[np.ndarray]  # (n, 2) outlines, world (city frame)
     raster_m: np.ndarray  # (rows, cols) heights, NaN where unknown
     raster_from_world: np.ndarray  # (3, 3) similarity: pixel coordinates (column, row) of a world point
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> MapGround:
+        """The polygons that reach into a rectangle of the world, low_m (2,) to high_m (2,); the raster whole."""
+        reach = [(p.max(axis=0) >= low_m).all() and (p.min(axis=0) <= high_m).all() for p in self.polygons_m]
+        return replace(
+            self,
+            polygon_class=[k for k, keep in zip(self.polygon_class, reach, strict=True) if keep],
+            polygons_m=[p for p, keep in zip(self.polygons_m, reach, strict=True) if keep],
+        )
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
         """height_m and occupied (G, H, W): polygon interiors at pixel centres, heights where the raster knows them."""
@@ -89,9 +128,39 @@ class MapGround:
         return _heights(height)
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceGround:
+    """Ground as triangles of the true surface (own drives), one class each."""
+
+    triangles_m: np.ndarray  # (t, 3, 3) float64 corners, world
+    triangle_class: np.ndarray  # (t,) index into the drive's ground_classes
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SurfaceGround:
+        """The triangles that reach into a rectangle of the world, low_m (2,) to high_m (2,)."""
+        xy = self.triangles_m[..., :2]
+        kept = ((xy.max(axis=1) >= low_m) & (xy.min(axis=1) <= high_m)).all(axis=1)
+        return SurfaceGround(self.triangles_m[kept], self.triangle_class[kept])
+
+    def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """height_m and occupied (G, H, W): the surface at pixel centres; where a class lies twice, its upper one.
+
+        Unlike a slab, a polygon counts wherever it covers a pixel, even if none of its vertices lies in the crop:
+        it may be a road of a kilometre.
+        """
+        middle_m = np.array([(grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2, 0.0])
+        center_m, reach_m = pose.to_world(middle_m)[:2], np.hypot(grid.rows, grid.cols) * grid.resolution_m / 2
+        seen = self.near(center_m - reach_m, center_m + reach_m)
+        return _heights(height_map(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes))
+
+
 def _heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     occupied = np.isfinite(height_m)
     return np.where(occupied, height_m, 0.0).astype(np.float32), occupied
+
+
+def _reach_m(grid: Grid) -> float:
+    """Distance from the ego vehicle to the farthest corner of its crop."""
+    return float(np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +182,28 @@ class Drive:
     label: np.ndarray  # (n,) str objects
     timestamp: np.ndarray  # (n,) int64
     ground_classes: tuple[str, ...]
-    ground: SlabGround | MapGround
+    ground: SlabGround | MapGround | SurfaceGround
     frame: np.ndarray  # (p,) int64
     world_from_imu: np.ndarray  # (p, 3, 4), x forward
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def at(self, poses: np.ndarray, grid: Grid | None = None) -> Drive:
+        """The drive with these poses only, and of its content what their crops can hold: scenes are cut faster."""
+        xy = self.world_from_imu[poses, :2, 3]
+        reach_m = _reach_m(grid or Grid())
+        low_m, high_m = xy.min(axis=0) - reach_m, xy.max(axis=0) + reach_m
+        near = ((self.center_m[:, :2] >= low_m) & (self.center_m[:, :2] <= high_m)).all(axis=1)
+        near &= (self.timestamp == STATIC) | np.isin(self.timestamp, self.frame[poses])
+        per_box = ("category", "center_m", "rotation", "size_m", "heading_rad", "instance_id", "label", "timestamp")
+        return replace(
+            self,
+            **{name: getattr(self, name)[near] for name in per_box},
+            ground=self.ground.near(low_m, high_m),
+            frame=self.frame[poses],
+            world_from_imu=self.world_from_imu[poses],
+        )
 
     def pose(self, index: int) -> Pose:
         """Position and yaw of pose `index`: differs from the paper, which keeps pitch and roll."""
@@ -129,8 +214,7 @@ class Drive:
         """The Scene ahead of pose `index`: primitives whose centre lies in the crop, static or of this very frame."""
         grid = grid or Grid()
         pose, frame = self.pose(index), int(self.frame[index])
-        reach_m = np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m)))
-        near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= reach_m
+        near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= _reach_m(grid)
         near = np.flatnonzero(near & ((self.timestamp == STATIC) | (self.timestamp == frame)))
         center = pose.to_ego(self.center_m[near])
         inside = grid.contains(center[:, 0], center[:, 1])

@@ -66,13 +66,16 @@ GROUND_CLASS_OF = {
     label: KITTI_GROUND_CLASSES.index(name) for name, labels in GROUND_LABELS.items() for label in labels
 }
 # Local +x is the direction of travel of these.
-HEADED_LABELS = {
-    label for name in ("vehicle_big", "vehicle_small", "two_wheelers") for label in CATEGORY_LABELS[name]
-}
+HEADED_LABELS = {label for name in ("vehicle_big", "vehicle_small", "two_wheelers") for label in CATEGORY_LABELS[name]}
 HEADED_LABELS |= {"rider"}
 
 SPHERE_VERTICES = 63
-DUPLICATE_M = 1e-3  # two objects whose vertices all agree to this are one object written twice
+# An object written twice, in two annotation windows that meet, keeps its size to micrometres, but the windows were
+# registered apart: in real data copies are shifted by up to 0.4 m and turned by up to 0.33 degrees. A copy shifted
+# further, or by more than half its size, is a neighbour.
+DUPLICATE_SIZE_M = 1e-3
+DUPLICATE_SHIFT_M = 0.5
+DUPLICATE_TURN_RAD = 0.01
 MAX_COORDINATE_M = 1e5  # the real world frame spans several km
 MAX_SIZE_M = 1e3
 MIN_SIZE_M = 1e-3
@@ -111,9 +114,7 @@ class ReadReport:
         parts += [f"unknown labels {_counts(self.unknown)}"] if self.unknown else []
         if self.defects:
             first = self.defects[0]
-            parts += [
-                f"{len(self.defects)} defective, first object {first.index} ({first.label}): {first.reason}"
-            ]
+            parts += [f"{len(self.defects)} defective, first object {first.index} ({first.label}): {first.reason}"]
         return "; ".join(parts)
 
 
@@ -187,9 +188,7 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
         else:
             (boxes if isinstance(parsed, _Box) else slabs).append(parsed)
     objects = len(boxes) + len(slabs) + dropped.total() + unknown.total() + duplicates + len(defects)
-    report = ReadReport(
-        objects, len(boxes), len(slabs), dict(dropped), dict(unknown), duplicates, tuple(defects)
-    )
+    report = ReadReport(objects, len(boxes), len(slabs), dict(dropped), dict(unknown), duplicates, tuple(defects))
     if objects == 0:
         raise ValueError(f"{path}: holds no <objectN>; unpack data_3d_bboxes.zip of KITTI-360 again")
     return boxes, slabs, report
@@ -213,27 +212,21 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     Raises ValueError, naming file and line, for a missing file, a bad line or a matrix that is no pose.
     """
     path = _poses_path(root, sequence)
-    lines = (
-        _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace").splitlines()
-    )
+    lines = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace").splitlines()
     frame, rows = [], []
     for number, line in enumerate(lines, 1):
         words = line.split()
         if not words:
             continue
         if len(words) != 13:
-            raise ValueError(
-                f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; is it cut off?"
-            )
+            raise ValueError(f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; is it cut off?")
         if not words[0].isdecimal() or len(words[0]) > 18:
             raise ValueError(f"{path}, line {number}: frame {words[0]!r} is not a whole number")
         row = _floats(words[1:])
         if row is None or np.abs(row).max() > MAX_COORDINATE_M:
             raise ValueError(f"{path}, line {number}: {line.strip()[:80]!r} is not a pose; restore the line")
         if frame and int(words[0]) <= frame[-1]:
-            raise ValueError(
-                f"{path}, line {number}: frame {words[0]} follows frame {frame[-1]}; sort the lines"
-            )
+            raise ValueError(f"{path}, line {number}: frame {words[0]} follows frame {frame[-1]}; sort the lines")
         frame.append(int(words[0]))
         rows.append(row)
     if not rows:
@@ -264,9 +257,7 @@ def _stream_objects(path: Path) -> Iterator[dict]:
                 if event == "start" and depth == 1:
                     root = element
                     if root.tag != "opencv_storage":
-                        raise ValueError(
-                            f"{path}: the root is <{root.tag[:40]}>, expected <opencv_storage>; {again}"
-                        )
+                        raise ValueError(f"{path}: the root is <{root.tag[:40]}>, expected <opencv_storage>; {again}")
                 elif event == "end" and depth == 1:
                     yield {child.tag: child for child in element}
                     root.clear()
@@ -275,9 +266,7 @@ def _stream_objects(path: Path) -> Iterator[dict]:
     except (ElementTree.ParseError, LookupError, UnicodeError) as error:
         raise ValueError(f"{path}: broken XML ({error}); {again}") from error
     except DefusedXmlException as error:
-        raise ValueError(
-            f"{path}: declares a document type or entities, which no real file does; {again}"
-        ) from error
+        raise ValueError(f"{path}: declares a document type or entities, which no real file does; {again}") from error
 
 
 class DefectiveObject(ValueError):
@@ -330,9 +319,7 @@ def _matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
     rows, stated_cols = _integer(parts, "rows"), _integer(parts, "cols")
     words = _text(parts, "data", " ").split()
     if stated_cols != cols or rows * cols != len(words):
-        raise DefectiveObject(
-            f"{tag} is {rows} x {stated_cols} with {len(words)} numbers, expected n x {cols}"
-        )
+        raise DefectiveObject(f"{tag} is {rows} x {stated_cols} with {len(words)} numbers, expected n x {cols}")
     values = _floats(words)
     if values is None:
         raise DefectiveObject(f"{tag} holds something that is not a finite number")
@@ -388,9 +375,7 @@ def _parse_box(fields: dict, label: str) -> _Box:
     return _Box(category, label, center_m, rotation, size_m, heading_rad, instance_id, timestamp, vertices_m)
 
 
-def box_geometry(
-    world_from_local: np.ndarray, vertices: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def box_geometry(world_from_local: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
 
     world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
@@ -409,9 +394,7 @@ def box_geometry(
         axes[:, 1] *= -1
     left, singular, right = np.linalg.svd(axes)
     if singular.min() < MIN_SINGULAR:
-        raise DefectiveObject(
-            f"sheared flat: smallest singular value of its unit axes is {singular.min():.2g}"
-        )
+        raise DefectiveObject(f"sheared flat: smallest singular value of its unit axes is {singular.min():.2g}")
     return center_m, left @ right, size_m
 
 
@@ -463,9 +446,7 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
         slab_class=np.array([slab.ground_class for slab in slabs], np.int64),
         vertices_m=np.concatenate([np.zeros((0, 3)), *[slab.vertices_m for slab in slabs]]),
         vertex_slab=np.repeat(np.arange(len(slabs)), counts),
-        triangles=np.concatenate(
-            [no_triangles, *[s.triangles + f for s, f in zip(slabs, first, strict=True)]]
-        ),
+        triangles=np.concatenate([no_triangles, *[s.triangles + f for s, f in zip(slabs, first, strict=True)]]),
     )
 
 
@@ -473,15 +454,31 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
 
 
 def _seen_before(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
-    """Whether an object of this key had these vertices (v, 3), within DUPLICATE_M; if not, remembers it."""
+    """Whether an object of this key had this shape (v, 3) nearly here; if not, remembers it."""
     center_m = vertices_m.mean(axis=0)
-    low, high = np.floor(center_m - DUPLICATE_M).tolist(), np.floor(center_m + DUPLICATE_M).tolist()
+    low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
     for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):
-        for other_m in seen.get((key, cell), ()):
-            if other_m.shape == vertices_m.shape and np.abs(other_m - vertices_m).max() <= DUPLICATE_M:
-                return True
+        if any(_is_copy(other_m, vertices_m) for other_m in seen.get((key, cell), ())):
+            return True
     seen.setdefault((key, tuple(np.floor(center_m).tolist())), []).append(vertices_m)
     return False
+
+
+def _is_copy(one_m: np.ndarray, other_m: np.ndarray) -> bool:
+    """Whether two vertex lists (v, 3) are one rigid shape, hardly moved."""
+    if one_m.shape != other_m.shape:
+        return False
+    center_m, other_center_m = one_m.mean(axis=0), other_m.mean(axis=0)
+    shift_m = other_center_m - center_m
+    one_m, other_m = one_m - center_m, other_m - other_center_m
+    radius_m, other_radius_m = np.linalg.norm(one_m, axis=1), np.linalg.norm(other_m, axis=1)
+    turn_m = np.linalg.norm(one_m - other_m, axis=1)
+    return bool(
+        (np.abs(radius_m - other_radius_m) <= DUPLICATE_SIZE_M).all()
+        and (turn_m <= DUPLICATE_TURN_RAD * radius_m + DUPLICATE_SIZE_M).all()
+        and np.linalg.norm(shift_m) <= DUPLICATE_SHIFT_M
+        and shift_m @ shift_m <= np.ptp(one_m @ shift_m) / 2
+    )
 
 
 def _plain(label: str) -> str:
