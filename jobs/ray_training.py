@@ -22,7 +22,7 @@ from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, Sc
 
 from jobs.command import root_cause, start_ray
 from jobs.tracking import Tracker
-from models.training import Optimisation, Trainer
+from models.training import NotFinite, Optimisation, Trainer
 from pipelines import storage
 from pipelines.feed import READER_CPUS, Reader, Stream, batches
 
@@ -77,7 +77,10 @@ def train_worker(config: dict[str, Any]) -> None:
     feed = timed(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds
-        losses = trainer.step(as_tensors(batch), positions)
+        try:
+            losses = trainer.step(as_tensors(batch), positions)
+        except NotFinite as error:
+            raise ValueError(with_scene_ids(error, run.stream)) from error
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
         if rank == 0 and (step % run.log_every == 0 or last):
             elapsed, done = time.perf_counter() - started, step - logged
@@ -97,6 +100,15 @@ def train_worker(config: dict[str, Any]) -> None:
         if step % run.checkpoint_every == 0 or last:
             report(run, trainer, rank, float(losses["loss"]))
             started, logged, waited = time.perf_counter(), step, 0.0
+
+
+def with_scene_ids(error: NotFinite, stream: Stream) -> str:
+    """The message of a loss that is not finite, with the scenes that are to blame."""
+    shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
+    ids = [
+        stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
+    ]
+    return f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
 
 
 def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:

@@ -44,6 +44,12 @@ class Config:
     batch_size: int | None = None
     """Global batch size over all workers."""
     learning_rate: float | None = None
+    accumulate: int = 1
+    """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
+    precision: str = "auto"
+    """fp32, bf16, or auto: bf16 where the GPU has it."""
+    compile: bool = False
+    """torch.compile the model: worth its minute on a GPU."""
     checkpoint_every: int | None = None
     """Steps between checkpoints (default: a twentieth of the run)."""
     seed: int = 0
@@ -58,7 +64,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     from jobs.tracking import Tracker
     from jobs.validation import SamplingCheck
     from models.pipeline import LABELS
-    from models.training import Optimisation
+    from models.training import Execution, Optimisation
     from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
     from pipelines import storage
     from pipelines.dataset import Dataset
@@ -110,6 +116,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         "shift": latents["channel_mean"] if row.normalise_latents else None,
         "scale": latents["channel_std"] if row.normalise_latents else None,
     }
+    execution = Execution(config.accumulate, config.precision, config.compile)
     batch_size = row.batch_size if config.batch_size is None else config.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
@@ -127,7 +134,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     training = TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, architecture, settings, row.label_dropout),
+        build=partial(build, architecture, settings, execution, row.label_dropout),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LatentReader(latents_root, config.label),
         settings=settings,
@@ -151,7 +158,7 @@ def train(config: Config) -> str:
     return complete_pipeline(lvae, output)
 
 
-def build(architecture: dict, settings, label_dropout: float, device, wrap):
+def build(architecture: dict, settings, execution, label_dropout: float, device, wrap):
     """The Trainer of stage 2, with the same initial weights on every worker."""
     import torch
 
@@ -159,7 +166,7 @@ def build(architecture: dict, settings, label_dropout: float, device, wrap):
     from models.training import dit_trainer
 
     torch.manual_seed(settings.seed)
-    return dit_trainer(DiT(**architecture), settings, label_dropout, device, wrap)
+    return dit_trainer(DiT(**architecture), settings, label_dropout, device, wrap, execution)
 
 
 def complete_pipeline(lvae: str, output: str) -> str:

@@ -42,20 +42,34 @@ class Config:
     batch_size: int | None = None
     """Global batch size over all workers."""
     learning_rate: float | None = None
+    accumulate: int = 1
+    """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
+    precision: str = "auto"
+    """fp32, bf16, or auto: bf16 where the GPU has it."""
+    compile: bool = False
+    """torch.compile the model: worth its minute on a GPU."""
     checkpoint_every: int | None = None
     """Steps between checkpoints (default: a twentieth of the run)."""
+    flip: bool = False
+    """Augmentation: mirror half of the scenes left to right."""
+    jitter: bool = False
+    """Augmentation: move the vehicle by up to 1 m and turn it by up to 2.5 degrees, as SLEDGE does."""
     seed: int = 0
 
 
 def prepare(config: Config) -> TrainingRun:
     """The run that the options mean; makes the smoke preset's data."""
+    from dataclasses import asdict
     from functools import partial
+
+    import numpy as np
 
     from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.smoke import smoke_dataset
     from jobs.tracking import Tracker
     from jobs.validation import ReconstructionCheck
-    from models.training import Optimisation
+    from models.augment import Augmentation
+    from models.training import Execution, Optimisation
     from models.zoo import LVAE_PRESETS, preset
     from pipelines.dataset import Dataset
     from pipelines.feed import LayoutReader, Stream
@@ -87,21 +101,25 @@ def prepare(config: Config) -> TrainingRun:
         steps=config.steps,
         learning_rate=config.learning_rate,
     )
+    execution = Execution(config.accumulate, config.precision, config.compile)
     batch_size = row.batch_size if config.batch_size is None else config.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
     identity = identity_of(
         settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root
-    )
+    ) | ({"augmentation": asdict(augment)} if config.flip or config.jitter else {})
     record = claim(name, home("runs"), identity)
     parameters = identity | {"architecture": row.architecture()}
     tracker = Tracker.start("pritti-lvae", name, parameters, record)
     return TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, row.architecture(), spec.to_dict(), settings, sample_layouts(shards, counts, spec)),
+        build=partial(
+            build, row.architecture(), spec.to_dict(), settings, execution, sample_layouts(shards, counts, spec)
+        ),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
-        reader=LayoutReader(spec),
+        reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
         settings=settings,
         identity=identity,
         tracker=tracker,
@@ -132,7 +150,7 @@ def sample_layouts(shards: list, counts: list[int], spec) -> dict:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def build(architecture: dict, layout: dict, settings, sample: dict, device, wrap):
+def build(architecture: dict, layout: dict, settings, execution, sample: dict, device, wrap):
     """The Trainer of stage 1, with the same initial weights on every worker."""
     import torch
 
@@ -144,7 +162,7 @@ def build(architecture: dict, layout: dict, settings, sample: dict, device, wrap
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
     model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
-    return lvae_trainer(model, settings, device, wrap)
+    return lvae_trainer(model, settings, device, wrap, execution)
 
 
 def main(config: Config) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -27,6 +28,10 @@ class Posterior:
     mean: Float[Tensor, "batch c2 h w"]
     logvar: Float[Tensor, "batch c2 h w"]
 
+    def float(self) -> Posterior:
+        """In single precision: losses are not for bf16."""
+        return Posterior(self.mean.float(), self.logvar.float())
+
     def sample(self, noise: Float[Tensor, "batch c2 h w"]) -> Float[Tensor, "batch c2 h w"]:
         """Reparameterised sample for standard normal noise."""
         return self.mean + (0.5 * self.logvar).exp() * noise
@@ -45,6 +50,12 @@ class LayoutOutput:
     existence_logit: Float[Tensor, "batch proposals"]
     proposals: tuple[int, ...]
     match_weights: MatchWeights
+    branches: str = "both"  # which of them were decoded; the other's values are placeholders
+
+    def float(self) -> LayoutOutput:
+        """In single precision: losses are not for bf16."""
+        names = ("height", "occupancy_logit", "features", "existence_logit")
+        return replace(self, **{name: getattr(self, name).float() for name in names})
 
     def layouts(self) -> list[DecodedLayout]:
         """One numpy layout per sample, probabilities instead of logits."""
@@ -59,6 +70,9 @@ class LayoutOutput:
 # the default, the same number of steps ends at 1.5 times the loss (tests/test_models.py, one batch, 300 steps).
 INITIAL_LOGVAR = -4.0
 
+BRANCHES = ("both", "ground", "objects")
+EMPTY_LOGIT = -6.0  # occupancy where there is no ground branch
+
 
 def logit(probability: Tensor) -> Tensor:
     """Logit of a probability that may be 0 or 1."""
@@ -70,6 +84,9 @@ class LayoutVAE(ModelMixin, ConfigMixin):
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
     (fold 2^(len(channels) - 1)). `shortcut`: a linear way past the ground networks. `decoder` is the paper's DETR or `cells`: proposals of each latent cell (cells.py).
+
+    The paper's ablations: without `split_latent` both decoders read the joint latent; with `branches` ground or
+    objects there is that branch alone, its latent has c channels, and the other side of a layout comes out empty.
     """
 
     @register_to_config
@@ -87,27 +104,36 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         head_hidden: int = 1024,
         decoder: str = "detr",
         shortcut: bool = False,
+        split_latent: bool = True,
+        branches: str = "both",
     ) -> None:
         super().__init__()
+        if branches not in BRANCHES:
+            raise ValueError(f"LayoutVAE: branches is {branches!r}, expected one of {BRANCHES}")
         spec = LayoutSpec.from_dict(layout)
         factor = fold * 2 ** (len(channels) - 1)
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % factor:
             raise ValueError(f"LayoutVAE needs a square grid divisible by {factor}, got {spec.grid}")
         size, num_classes = spec.grid.rows // factor, len(spec.ground_classes)
-        ground = (num_classes, latent_channels, tuple(channels), norm_groups, fold, shortcut)
-        self.ground_encoder, self.ground_decoder = GroundEncoder(*ground), GroundDecoder(*ground)
-        self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
-        if decoder == "detr":
-            self.object_decoder = ObjectDecoder(
-                spec.slots, latent_channels, size, width, layers, heads, hidden, head_hidden
-            )
-        elif decoder == "cells":
-            self.object_decoder = CellDecoder(spec.slots, latent_channels, size, width, layers)
-        else:
-            raise ValueError(f"LayoutVAE: decoder is {decoder!r}, expected 'detr' (the paper's) or 'cells'")
-        with torch.no_grad():
-            self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
-            self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
+        self.latent_shape = (latent_channels * (2 if branches == "both" else 1), size, size)  # of the joint latent
+        seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
+        self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
+        if branches != "objects":
+            ground = (tuple(channels), norm_groups, fold, shortcut)
+            self.ground_encoder = GroundEncoder(num_classes, latent_channels, *ground)
+            self.ground_decoder = GroundDecoder(num_classes, seen, *ground)
+            with torch.no_grad():
+                self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
+        if branches != "ground":
+            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
+            if decoder == "detr":
+                self.object_decoder = ObjectDecoder(spec.slots, seen, size, width, layers, heads, hidden, head_hidden)
+            elif decoder == "cells":
+                self.object_decoder = CellDecoder(spec.slots, seen, size, width, layers)
+            else:
+                raise ValueError(f"LayoutVAE: decoder is {decoder!r}, expected 'detr' (the paper's) or 'cells'")
+            with torch.no_grad():
+                self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
 
     @torch.no_grad()
     def start_at(self, batch: LayoutBatch) -> None:
@@ -116,7 +142,10 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         Adam moves a bias by about the learning rate per step: from zero, thousands of steps would go into learning
         that a pole is thin and that most pixels are no road.
         """
-        start_ground(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
+        if self.ground_encoder:
+            start_ground(self.ground_encoder, self.ground_reader, batch.height, batch.occupied)
+        if not self.object_encoder:
+            return
         groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
         features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
         count = torch.stack([r.sum() / len(r) for _, r in groups])
@@ -127,27 +156,46 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         return LayoutSpec.from_dict(self.config.layout)
 
     @property
-    def latent_shape(self) -> tuple[int, int, int]:
-        """(2 c, h, w) of the joint latent."""
-        moments, rows, cols = self.object_encoder.grid.shape
-        return moments, rows, cols
+    def ground_reader(self) -> GroundDecoder | SimpleNamespace:
+        """The ground decoder, as one of the ground's own channels where it reads the joint latent."""
+        decoder, own = self.ground_decoder, self.config.latent_channels
+        if decoder.shortcut is None or len(decoder.shortcut.weight) == own:
+            return decoder
+        decoder.shortcut.weight[own:] = 0
+        shortcut = SimpleNamespace(weight=decoder.shortcut.weight[:own], bias=decoder.shortcut.bias)
+        return SimpleNamespace(net=decoder.net, unfold=decoder.unfold, shortcut=shortcut)
 
     def encode(self, batch: LayoutBatch) -> Posterior:
         """Joint posterior: channel groups [ground; objects] of mean and of log-variance."""
-        ground_mean, ground_logvar = self.ground_encoder(torch.cat([batch.height, batch.occupied], dim=1)).chunk(2, 1)
-        object_mean, object_logvar = self.object_encoder(batch.features, batch.real).chunk(2, 1)
-        logvar = torch.cat([ground_logvar, object_logvar], dim=1).clamp(-30, 20)
-        return Posterior(torch.cat([ground_mean, object_mean], dim=1), logvar)
+        moments = []
+        if self.ground_encoder:
+            moments.append(self.ground_encoder(torch.cat([batch.height, batch.occupied], dim=1)).chunk(2, 1))
+        if self.object_encoder:
+            moments.append(self.object_encoder(batch.features, batch.real).chunk(2, 1))
+        mean, logvar = (torch.cat(part, dim=1) for part in zip(*moments, strict=True))
+        return Posterior(mean, logvar.clamp(-30, 20))
 
     def decode(self, latent: Float[Tensor, "batch c2 h w"]) -> LayoutOutput:
-        """Each decoder reads its own half of the channels."""
-        ground, objects = latent.chunk(2, dim=1)
-        height, occupancy_logit = self.ground_decoder(ground).chunk(2, dim=1)
-        decoder = self.object_decoder
-        features, existence_logit = decoder(objects)
-        return LayoutOutput(
-            height, occupancy_logit, features, existence_logit, decoder.proposals, decoder.match_weights
-        )
+        """Each decoder reads its own half of the channels, without `split_latent` all of them."""
+        split = self.config.split_latent and self.config.branches == "both"
+        ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
+        height, occupancy_logit = self.decode_ground(ground)
+        return LayoutOutput(height, occupancy_logit, *self.decode_objects(objects), self.config.branches)
+
+    def decode_ground(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor]:
+        """Heights and occupancy logits; nothing occupied where there is no ground branch."""
+        if self.ground_decoder:
+            return self.ground_decoder(latent).chunk(2, dim=1)
+        grid = self.spec.grid
+        height = latent.new_zeros(len(latent), len(self.spec.ground_classes), grid.rows, grid.cols)
+        return height, torch.full_like(height, EMPTY_LOGIT)
+
+    def decode_objects(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor, tuple, MatchWeights]:
+        """Features, existence logits, proposals and how to match them; no proposal where there is no object branch."""
+        if self.object_decoder:
+            return *self.object_decoder(latent), self.object_decoder.proposals, self.object_decoder.match_weights
+        features = latent.new_zeros(len(latent), 0, FEATURES)
+        return features, features[..., 0], (0,) * len(self.spec.slots), MatchWeights()
 
     def forward(self, batch: LayoutBatch, noise: Float[Tensor, "batch c2 h w"]) -> tuple[LayoutOutput, Posterior]:
         """Reconstruction from a sampled latent, and the posterior it was sampled from."""

@@ -18,6 +18,10 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
+class NotFiniteError(ValueError):
+    """Predictions that are not numbers cannot be matched."""
+
+
 class MatchWeights(NamedTuple):
     """Category-agnostic weights of the matching cost; the defaults are the paper's (supplement B.2)."""
 
@@ -53,11 +57,11 @@ def match(
     """For every proposal the index of the true slot it is matched with, -1 where with padding.
 
     Per category, `proposals[k]` >= `slots[k]`; real primitives come first in their category's slots (tensors.py).
-    Raises ValueError for predictions that are not finite.
+    Raises NotFiniteError, a ValueError, for predictions that are not finite.
     """
     assignment = torch.full(existence_logit.shape, -1, dtype=torch.long)
     if not (torch.isfinite(features).all() and torch.isfinite(existence_logit).all()):
-        raise ValueError("predicted primitives are not finite; lower the learning rate or look at this batch")
+        raise NotFiniteError("predicted primitives are not finite; lower the learning rate or look at this batch")
     first_slot, first_proposal = 0, 0
     for capacity, offered in zip(slots, proposals, strict=True):
         theirs, mine = slice(first_slot, first_slot + capacity), slice(first_proposal, first_proposal + offered)

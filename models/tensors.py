@@ -17,18 +17,22 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground.
 
-    Raises ValueError if the grids do not cover the same ground. Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
-    nearest. Classes that the scene does not have are empty. The ratio of pixels must be whole (ValueError).
+    Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
+    nearest. Classes that the scene does not have are empty. Raises ValueError if the grids do not cover the same
+    ground, or if the ratio of pixels is not whole.
     """
     covers = [(g.front_m, g.left_m, g.back_m, g.right_m) for g in (scene.grid, grid)]
     if not np.allclose(*covers):
         raise ValueError(f"scene {scene.scene_id} covers {scene.grid}, wanted is {grid}")
-    shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
-    height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
-    for k, name in enumerate(ground_classes):
-        if name in scene.ground_classes:
-            own = scene.ground_classes.index(name)
-            height[k], occupied[k] = scene.height_m[own], scene.occupied[own]
+    if ground_classes == scene.ground_classes:
+        height, occupied = scene.height_m, scene.occupied
+    else:
+        shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
+        height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        for k, name in enumerate(ground_classes):
+            if name in scene.ground_classes:
+                own = scene.ground_classes.index(name)
+                height[k], occupied[k] = scene.height_m[own], scene.occupied[own]
     if grid.rows == scene.grid.rows:
         return height, occupied
     if scene.grid.rows % grid.rows == 0:
@@ -45,20 +49,21 @@ def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) ->
     raise ValueError(f"scene {scene.scene_id}: {scene.grid.rows} pixels do not divide into {grid.rows}")
 
 
-def slot_primitives(scene: Scene, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
+def slot_primitives(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
     """Which primitive sits in which slot: (m,) slots and (m,) primitive indices.
 
     A category with more primitives than slots keeps those nearest to the ego vehicle (supplement A).
     """
-    distance = np.linalg.norm(scene.center_m, axis=1)
-    first = np.cumsum(spec.slots) - spec.slots
-    slots, primitives = [], []
-    for name, start, capacity in zip(spec.categories, first, spec.slots, strict=True):
-        members = np.flatnonzero(scene.category == CATEGORY_INDEX[name])
-        members = members[np.argsort(distance[members], kind="stable")][:capacity]
-        slots.append(start + np.arange(len(members)))
-        primitives.append(members)
-    return np.concatenate(slots), np.concatenate(primitives)
+    position = np.full(len(CATEGORY_INDEX), -1)
+    position[[CATEGORY_INDEX[name] for name in spec.categories]] = np.arange(len(spec.categories))
+    position = position[category]
+    order = np.lexsort((np.linalg.norm(center_m, axis=1), position))
+    order = order[np.searchsorted(position[order], 0) :]  # categories that the spec does not have
+    group = position[order]
+    rank = np.arange(len(order)) - np.searchsorted(group, group)
+    slots = np.array(spec.slots)
+    kept = rank < slots[group]
+    return ((np.cumsum(slots) - slots)[group] + rank)[kept], order[kept]
 
 
 def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
@@ -66,21 +71,31 @@ def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
     height (G, H, W) uint16 in 65535ths of the bounds, occupied (G, H, W) bool, features (N, 9) float32, real (N,).
     """
+    parameters = cholesky_parameters(scene.rotation, scene.size_m)
+    return compact_ground(scene, spec) | compact_primitives(scene.category, scene.center_m, parameters, spec)
+
+
+def compact_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
+    """height and occupied of `compact_layout`."""
     height_m, occupied = ground_on_grid(scene, spec.ground_classes, spec.grid)
-    height = spec.height_bounds_m.normalise(height_m[..., None])[..., 0] * occupied
+    (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
+    scaled = (height_m[occupied] - np.float32(low)) * np.float32(65535 / (high - low))
+    height = np.zeros(height_m.shape, np.uint16)
+    height[occupied] = np.rint(scaled.clip(0, 65535))
+    return {"height": height, "occupied": occupied}
+
+
+def compact_primitives(
+    category: np.ndarray, center_m: np.ndarray, parameters: np.ndarray, spec: LayoutSpec
+) -> dict[str, np.ndarray]:
+    """features and real of `compact_layout` from categories (n,), centres (n, 3) and Cholesky parameters (n, 6)."""
     features = np.zeros((spec.num_slots, FEATURES), np.float32)
     real = np.zeros(spec.num_slots, bool)
-    slots, primitives = slot_primitives(scene, spec)
-    features[slots, :3] = spec.center_bounds_m.normalise(scene.center_m[primitives])
-    parameters = cholesky_parameters(scene.rotation[primitives], scene.size_m[primitives])
-    features[slots, 3:] = spec.cholesky_bounds.normalise(parameters)
+    slots, primitives = slot_primitives(category, center_m, spec)
+    features[slots, :3] = spec.center_bounds_m.normalise(center_m[primitives])
+    features[slots, 3:] = spec.cholesky_bounds.normalise(parameters[primitives])
     real[slots] = True
-    return {
-        "height": np.round(height * 65535).astype(np.uint16),
-        "occupied": occupied,
-        "features": features,
-        "real": real,
-    }
+    return {"features": features, "real": real}
 
 
 def layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:

@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from models.dit import DiT
 from models.layout import LayoutBatch, LayoutSpec
 from models.losses import lvae_loss
 from models.lvae import LayoutVAE
+from models.matching import NotFiniteError
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,36 @@ class Optimisation:
         return rate, beta1
 
 
+@dataclass(frozen=True)
+class Execution:
+    """How steps are computed, not what: the same weights come out, up to rounding."""
+
+    accumulate: int = 1  # parts into which a batch is cut, one after another, where it does not fit memory
+    precision: str = "auto"  # fp32, bf16, or auto: bf16 where the device has it in hardware
+    compile: bool = False  # torch.compile
+
+    def __post_init__(self) -> None:
+        if self.accumulate < 1 or self.precision not in ("auto", "fp32", "bf16"):
+            raise ValueError(
+                f"accumulate is {self.accumulate}, precision {self.precision!r}; "
+                "expected 1 or more, and auto, fp32 or bf16"
+            )
+
+    def autocast(self, device: torch.device) -> torch.autocast:
+        fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+        wanted = self.precision == "bf16" or (self.precision == "auto" and fast)
+        return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
+
+
+class NotFinite(ValueError):
+    """A loss is not finite. `positions` are the samples of the global batch that are to blame, empty if all are."""
+
+    def __init__(self, step: int, positions: list[int]) -> None:
+        which = f"of samples {positions} of its batch" if positions else "of every sample: the weights are broken"
+        super().__init__(f"step {step}: the loss is not finite because {which}; lower the learning rate")
+        self.step, self.positions = step, positions
+
+
 LossFunction = Callable[[nn.Module, dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
 
 
@@ -69,6 +101,7 @@ def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int]) -> LossFun
         device = arrays["real"].device
         batch = LayoutBatch.from_compact(arrays)
         output, posterior = model(batch, stacked_noise(generators, latent_shape, device))
+        output, posterior = output.float(), posterior.float()
         parts = lvae_loss(output, posterior, batch, spec).items()
         return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
 
@@ -94,7 +127,7 @@ def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunc
         timestep = (uniform[:, 0] * diffusion.num_timesteps).long()
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
-        return {"loss": F.mse_loss(predicted, noise)}
+        return {"loss": F.mse_loss(predicted.float(), noise)}
 
     return loss
 
@@ -112,14 +145,10 @@ class Trainer:
         settings: Optimisation,
         device: torch.device,
         wrapped: nn.Module | None = None,
+        execution: Execution | None = None,
     ) -> None:
-        self.model, self.wrapped, self.loss, self.settings, self.device = (
-            model,
-            wrapped or model,
-            loss,
-            settings,
-            device,
-        )
+        self.model, self.wrapped, self.loss = model, wrapped or model, loss
+        self.settings, self.device, self.execution = settings, device, execution or Execution()
         self.parameters = dict(model.named_parameters())
         self.optimiser = torch.optim.AdamW(
             self.parameters.values(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
@@ -130,28 +159,54 @@ class Trainer:
     def step(self, arrays: dict[str, Tensor], positions: Iterable[int]) -> dict[str, Tensor]:
         """One optimisation step on a (local) batch; `positions` are its samples' places in the global batch.
 
-        Returns detached losses and the gradient norm. Raises ValueError if the loss is not finite, before
-        anything is changed.
+        Returns detached losses and the gradient norm. Raises NotFinite, a ValueError, if the loss is not finite,
+        before weights change.
         """
         rate, beta1 = self.settings.at(self.steps_done)
         for group in self.optimiser.param_groups:
             group["lr"], group["betas"] = rate, (beta1, self.settings.betas[1])
-        generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
-        parts = self.loss(
-            self.wrapped, {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}, generators
-        )
-        if not torch.isfinite(parts["loss"]):
-            raise ValueError(
-                f"step {self.steps_done}: the loss is {float(parts['loss'])}; lower the learning rate or look at this batch"
-            )
+        positions = list(positions)
+        arrays = {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}
         self.optimiser.zero_grad(set_to_none=True)
-        parts["loss"].backward()
+        totals: dict[str, Tensor] = {}
+        size = -(-len(positions) // self.execution.accumulate)
+        for first in range(0, len(positions), size):
+            part = slice(first, first + size)
+            share = len(positions[part]) / len(positions)
+            losses = self._losses({k: v[part] for k, v in arrays.items()}, positions[part])
+            if losses is None:
+                raise NotFinite(self.steps_done, self._to_blame(arrays, positions))
+            more = first + size < len(positions)
+            with self.wrapped.no_sync() if more and hasattr(self.wrapped, "no_sync") else nullcontext():
+                (share * losses["loss"]).backward()
+            for name, value in losses.items():
+                totals[name] = totals.get(name, 0) + share * value.detach()
         norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.grad_clip or math.inf)
         self.optimiser.step()
         self.steps_done += 1
         if self.ema:
             self.update_ema()
-        return {name: value.detach() for name, value in parts.items()} | {"grad_norm": norm}
+        return totals | {"grad_norm": norm}
+
+    def _losses(self, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
+        """The parts of the loss, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
+        generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
+        try:
+            with self.execution.autocast(self.device):
+                losses = self.loss(self.wrapped, arrays, generators)
+        except NotFiniteError:
+            return None
+        return losses if torch.isfinite(losses["loss"]) else None
+
+    @torch.no_grad()
+    def _to_blame(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
+        """The positions whose own loss is not finite; empty if that is all of them."""
+        bad = [
+            position
+            for k, position in enumerate(positions)
+            if self._losses({name: value[k : k + 1] for name, value in arrays.items()}, [position]) is None
+        ]
+        return bad if len(bad) < len(positions) else []
 
     @torch.no_grad()
     def update_ema(self) -> None:
@@ -213,11 +268,20 @@ class Trainer:
         self.steps_done = state["steps_done"]
 
 
+Wrap = Callable[[nn.Module], nn.Module]
+
+
 def lvae_trainer(
-    model: LayoutVAE, settings: Optimisation, device: torch.device, wrap: Callable[[nn.Module], nn.Module] = lambda m: m
+    model: LayoutVAE,
+    settings: Optimisation,
+    device: torch.device,
+    wrap: Wrap = lambda m: m,
+    execution: Execution | None = None,
 ) -> Trainer:
+    execution = execution or Execution()
     model = model.to(device)
-    return Trainer(model, layout_loss(model.spec, model.latent_shape), settings, device, wrap(model))
+    loss = layout_loss(model.spec, model.latent_shape)
+    return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
 
 
 def dit_trainer(
@@ -225,7 +289,14 @@ def dit_trainer(
     settings: Optimisation,
     label_dropout: float,
     device: torch.device,
-    wrap: Callable[[nn.Module], nn.Module] = lambda m: m,
+    wrap: Wrap = lambda m: m,
+    execution: Execution | None = None,
 ) -> Trainer:
+    execution = execution or Execution()
     model = model.to(device)
-    return Trainer(model, noise_loss(model, Diffusion(), label_dropout), settings, device, wrap(model))
+    loss = noise_loss(model, Diffusion(), label_dropout)
+    return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
+
+
+def _compiled(model: nn.Module, execution: Execution) -> nn.Module:
+    return torch.compile(model) if execution.compile else model

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import ray.data
 
+from models.augment import Augmentation
 from models.layout import LayoutSpec
 from models.pipeline import LABELS, label_index
 from models.tensors import compact_layout
@@ -25,7 +26,7 @@ SAMPLES_PER_TASK = 256
 READER_CPUS = 0.5  # leaves room beside a training worker on two cores: more would wait for each other for ever
 
 Arrays = dict[str, np.ndarray]
-Reader = Callable[[Shard, np.ndarray], Arrays]  # shard, rows -> stacked samples
+Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # shard, rows, their places in the stream -> stacked samples
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,11 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
     """The rank's share of `count` consecutive global batches from batch `first`, in order."""
     shard, row = stream.positions(first * batch, count * batch)
     mine = (np.arange(count * batch) % batch) // (batch // world) == rank
-    shard, row = shard[mine], row[mine]
+    shard, row, place = shard[mine], row[mine], first * batch + np.flatnonzero(mine)
     out: Arrays = {}
     for k in np.unique(shard):
         here = np.flatnonzero(shard == k)
-        for name, values in read(stream.shards[k], row[here]).items():
+        for name, values in read(stream.shards[k], row[here], place[here]).items():
             if name not in out:
                 out[name] = np.empty((len(shard), *values.shape[1:]), values.dtype)
             out[name][here] = values
@@ -119,14 +120,21 @@ def _scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
 
 @dataclass(frozen=True)
 class LayoutReader:
-    """Samples for stage 1: compact layouts (models/tensors.py) under a LayoutSpec."""
+    """Samples for stage 1: compact layouts (models/tensors.py) under a LayoutSpec, of augmented scenes if wanted."""
 
     spec: LayoutSpec
+    augment: Augmentation | None = None
 
-    def __call__(self, shard: Shard, rows: np.ndarray) -> Arrays:
+    def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
+        out: Arrays = {}
         scenes = scenes_from_tables(*_scene_tables(shard), shard.source, shard.split, rows.tolist())
-        layouts = [compact_layout(scene, self.spec) for scene in scenes]
-        return {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
+        for k, scene in enumerate(scenes):
+            scene = self.augment(scene, int(places[k])) if self.augment else scene
+            for name, value in compact_layout(scene, self.spec).items():
+                if name not in out:
+                    out[name] = np.empty((len(rows), *value.shape), value.dtype)
+                out[name][k] = value
+        return out
 
 
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
@@ -157,5 +165,5 @@ class LatentReader:
     latents_root: str
     label: str
 
-    def __call__(self, shard: Shard, rows: np.ndarray) -> Arrays:
+    def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
         return {name: values[rows] for name, values in _latents(shard, self.latents_root, self.label).items()}

@@ -9,7 +9,7 @@ from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
 from models.pipeline import scheduler
 from models.repaint import repaint_transitions
-from models.training import Optimisation, dit_trainer
+from models.training import Execution, NotFinite, Optimisation, dit_trainer
 
 SHAPE = (4, 8, 8)
 
@@ -143,10 +143,11 @@ def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
     return {"mean": mean, "logvar": torch.full_like(mean, -6.0), "label": torch.arange(n) % 3}
 
 
-def new_trainer(**changes):
+def new_trainer(execution: Execution | None = None, **changes):
     torch.manual_seed(0)
     settings = Optimisation(**({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes))
-    return dit_trainer(DiT(channels=4, size=8, width=64, depth=2, heads=2), settings, 0.1, torch.device("cpu"))
+    dit = DiT(channels=4, size=8, width=64, depth=2, heads=2)
+    return dit_trainer(dit, settings, 0.1, torch.device("cpu"), execution=execution)
 
 
 def test_dit_overfits_one_batch():
@@ -186,11 +187,37 @@ def test_half_batches_draw_what_the_whole_batch_draws():
     assert np.isclose(np.mean(halves), whole, rtol=1e-6)
 
 
+@pytest.mark.parametrize("parts", [2, 3, 8])
+def test_accumulated_parts_make_the_whole_step(parts):
+    batch = dit_batch()
+    whole, cut = new_trainer(), new_trainer(execution=Execution(accumulate=parts))
+    for _ in range(3):
+        losses = [trainer.step(batch, range(8)) for trainer in (whole, cut)]
+    assert np.isclose(*(float(part["loss"]) for part in losses), rtol=1e-5)
+    assert np.isclose(*(float(part["grad_norm"]) for part in losses), rtol=1e-4)
+    for name, value in whole.model.state_dict().items():
+        assert torch.allclose(value, cut.model.state_dict()[name], atol=2e-5), name
+
+
+def test_bf16_and_compile_compute_the_same_loss():
+    batch = dit_batch()
+    plain = float(new_trainer().step(batch, range(8))["loss"])
+    half = new_trainer(execution=Execution(precision="bf16"))
+    assert np.isclose(float(half.step(batch, range(8))["loss"]), plain, rtol=2e-2)
+    assert all(p.dtype == torch.float32 for p in half.model.parameters())
+    with pytest.raises(ValueError, match="expected 1 or more, and auto, fp32 or bf16"):
+        Execution(precision="fp16")
+
+
 def test_a_loss_that_is_not_finite_stops_before_anything_changes():
     trainer, batch = new_trainer(), dit_batch()
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
     batch["mean"][3] = float("nan")
-    with pytest.raises(ValueError, match="step 0: the loss is nan"):
+    with pytest.raises(NotFinite, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
+        trainer.step(batch, range(8, 16))
+    assert caught.value.positions == [11]
+    batch["mean"][:] = float("nan")
+    with pytest.raises(NotFinite, match="of every sample: the weights are broken"):
         trainer.step(batch, range(8))
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 

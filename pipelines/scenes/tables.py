@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from models.cholesky import cholesky_parameters
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines import storage
 
 SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
@@ -260,32 +261,10 @@ def scenes_from_tables(
     source: str,
     split: str,
     rows: Sequence[int] | None = None,
-) -> list[Scene]:
-    """The Scenes of one shard, or only those in `rows`, in that order."""
-    primitives = primitives.combine_chunks()
-
-    def column(name: str) -> np.ndarray:
-        return primitives[name].to_numpy()
-
-    def nested(name: str, *shape: int) -> np.ndarray:
-        flat = pa.concat_arrays(primitives[name].chunks).flatten() if len(primitives) else pa.array([], pa.float32())
-        return flat.to_numpy().reshape(-1, *shape)
-
-    category = np.array([CATEGORY_INDEX[name] for name in column("category")], np.int8)
-    center = np.stack([column(f"{axis}_m") for axis in "xyz"], axis=1)
-    size = np.stack([column(f"{axis}_m") for axis in ("length", "width", "height")], axis=1)
-    fields = {
-        "category": category,
-        "center_m": center,
-        "rotation": nested("rotation", 3, 3),
-        "size_m": size,
-        "existence": column("existence"),
-        "heading_rad": column("heading_rad").astype(np.float32),
-        "instance_id": column("instance_id"),
-        "label": column("label").astype(object),
-    }
+) -> Iterator[Scene]:
+    """The Scenes of one shard, or only those in `rows`, in that order; one at a time."""
+    fields = _primitive_fields(primitives)
     rows = list(range(len(scenes)) if rows is None else rows)
-    out = []
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
         if scene["scene_id"] != raster["scene_id"]:
             raise ValueError(f"shard is not aligned: scenes has {scene['scene_id']}, rasters has {raster['scene_id']}")
@@ -296,26 +275,49 @@ def scenes_from_tables(
             raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols), raster["height_step_m"]
         )
         pose = scene["world_from_imu"]
-        out.append(
-            Scene(
-                scene_id=scene["scene_id"],
-                source=source,
-                sequence=scene["sequence"],
-                frame=scene["frame"],
-                split=split,
-                ground_classes=classes,
-                height_m=height,
-                occupied=occupied,
-                grid=grid,
-                world_xyz_m=(scene["x_m"], scene["y_m"], scene["z_m"]),
-                world_yaw_rad=scene["yaw_rad"],
-                world_from_imu=None if pose is None else np.array(pose).reshape(3, 4),
-                vegetation_density=scene["vegetation_density"],
-                vehicle_density=scene["vehicle_density"],
-                **{name: value[here] for name, value in fields.items()},
-            )
+        yield Scene(
+            scene_id=scene["scene_id"],
+            source=source,
+            sequence=scene["sequence"],
+            frame=scene["frame"],
+            split=split,
+            ground_classes=classes,
+            height_m=height,
+            occupied=occupied,
+            grid=grid,
+            world_xyz_m=(scene["x_m"], scene["y_m"], scene["z_m"]),
+            world_yaw_rad=scene["yaw_rad"],
+            world_from_imu=None if pose is None else np.array(pose).reshape(3, 4),
+            vegetation_density=scene["vegetation_density"],
+            vehicle_density=scene["vehicle_density"],
+            **{name: value[here] for name, value in fields.items()},
         )
-    return out
+
+
+def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
+    """The per-primitive arrays of a Scene for all rows of a primitives table."""
+    primitives = primitives.combine_chunks()
+
+    def column(name: str) -> np.ndarray:
+        return primitives[name].to_numpy()
+
+    def stacked(*names: str) -> np.ndarray:
+        return np.stack([column(name) for name in names], axis=1)
+
+    rotation = pa.concat_arrays(primitives["rotation"].chunks).flatten() if len(primitives) else pa.array([], pa.float32())
+    category = pc.index_in(primitives["category"], pa.array(CATEGORIES))
+    if category.null_count:
+        raise ValueError("primitives hold a category of another version; preprocess again")
+    return {
+        "category": category.to_numpy().astype(np.int8),
+        "center_m": stacked("x_m", "y_m", "z_m"),
+        "rotation": rotation.to_numpy().reshape(-1, 3, 3),
+        "size_m": stacked("length_m", "width_m", "height_m"),
+        "existence": column("existence"),
+        "heading_rad": column("heading_rad").astype(np.float32),
+        "instance_id": column("instance_id"),
+        "label": column("label").astype(object),
+    }
 
 
 # ------------------------------------------------------------------------------------------------------- shards
@@ -342,7 +344,7 @@ class Shard:
         """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
         tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
         try:
-            return scenes_from_tables(*tables, self.source, self.split, rows)
+            return list(scenes_from_tables(*tables, self.source, self.split, rows))
         except ValueError as error:
             raise ValueError(f"{self.path('scenes')}: {error}") from error
 

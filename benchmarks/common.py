@@ -1,0 +1,67 @@
+"""What benchmarks share: the machine and commit in words, A against B interleaved, raw data to work on."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.sources.drive import Drive
+from pipelines.sources.town import town_drive, write_kitti360
+
+DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop
+
+
+def where() -> str:
+    """Machine, versions and commit in one line."""
+    model = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), platform.machine())  # fmt: skip
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    dirty = subprocess.run(["git", "status", "--porcelain"], capture_output=True, text=True).stdout.strip()
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}, commit {commit}{'+' if dirty else ''}"
+
+
+def interleaved(ways: dict[str, Callable[[int], object]], rounds: int) -> dict[str, list[float]]:
+    """CPU seconds of each way per round, in turn, so that a busy machine slows all alike. Each is called with the round."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for k in range(rounds):
+        for name, way in ways.items():
+            start = time.process_time()
+            way(k)
+            seconds[name].append(time.process_time() - start)
+    return seconds
+
+
+def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
+    """median (lowest to highest)."""
+    low, middle, high = (scale * f(values) for f in (min, statistics.median, max))
+    return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
+    """How many times longer `slow` took than `fast`, round by round."""
+    return spread([a / b for a, b in zip(slow, fast, strict=True)], digits=digits) + " x"
+
+
+def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
+    """The drive with poses every `spacing_m` along its path, as KITTI-360 has them (0.3 to 1.1 m)."""
+    xyz = drive.world_from_imu[:, :, 3]
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(xyz, axis=0), axis=1).cumsum()])
+    at = np.arange(0, along[-1], spacing_m)
+    nearest = np.abs(along[:, None] - at).argmin(axis=0)
+    matrix = drive.world_from_imu[nearest].copy()
+    matrix[:, :, 3] = np.stack([np.interp(at, along, xyz[:, k]) for k in range(3)], axis=1)
+    return replace(drive, frame=np.arange(len(at)), world_from_imu=matrix)
+
+
+def write_raw(root: Path, seeds: tuple[int, ...] = DENSE_SEEDS, spacing_m: float = 1.0) -> None:
+    """KITTI-360's own files of dense towns under ROOT, one sequence each; nothing is redone."""
+    for seed in seeds:
+        if not (root / f"data_poses/2013_05_28_drive_{seed:04d}_sync/poses.txt").exists():
+            write_kitti360(with_dense_poses(town_drive(seed), spacing_m), root)

@@ -1,0 +1,102 @@
+"""A training step of the layout VAE: where its time goes, and against the plain version of its objective.
+
+python benchmarks/lvae_step.py                   town, batch 8, and kitti360, batch 2; several minutes
+python benchmarks/lvae_step.py --presets town
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import plain
+import torch
+import tyro
+from common import ratios, spread, where
+from matching import town_batch
+
+from models import losses
+from models.layout import LayoutSpec
+from models.losses import lvae_loss
+from models.lvae import LayoutVAE
+from models.zoo import LVAE_PRESETS, preset
+
+
+@dataclass(frozen=True)
+class Config:
+    presets: tuple[str, ...] = ("town", "kitti360")
+    rounds: int = 5
+    threads: int = 2
+
+
+def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch.Tensor) -> dict[str, float]:
+    """Seconds of one step by part."""
+    clock = time.perf_counter()
+    seconds = {}
+
+    def lap(name: str) -> None:
+        nonlocal clock
+        now = time.perf_counter()
+        seconds[name] = seconds.get(name, 0.0) + now - clock
+        clock = now
+
+    output, posterior = model(batch, noise)
+    lap("forward")
+    matching = losses.match
+
+    def timed(*args):
+        lap("losses")
+        result = matching(*args)
+        lap("matching")
+        return result
+
+    losses.match = timed
+    try:
+        total = lvae_loss(output, posterior, batch, model.spec).total
+    finally:
+        losses.match = matching
+    lap("losses")
+    optimiser.zero_grad(set_to_none=True)
+    total.backward()
+    lap("backward")
+    optimiser.step()
+    lap("optimiser")
+    return seconds | {"loss": float(total)}
+
+
+def main(config: Config) -> None:
+    torch.set_num_threads(config.threads)
+    print(where(), f"torch {torch.__version__}, {config.threads} threads")
+    for name in config.presets:
+        row = preset(LVAE_PRESETS, name)
+        batch_size = 2 if name == "kitti360" else row.batch_size
+        spec = LayoutSpec().with_resolution(row.raster_px)
+        batch = town_batch(spec, max(4, batch_size))
+        batch = type(batch)(*(getattr(batch, field)[:batch_size] for field in batch.__dataclass_fields__))
+        models = {}
+        for way in ("ours", "plain"):
+            torch.manual_seed(0)
+            model = LayoutVAE(layout=spec.to_dict(), **row.architecture())
+            model.start_at(batch)
+            models[way] = (model, torch.optim.AdamW(model.parameters(), 1e-5))
+        noise = torch.randn(batch_size, *models["ours"][0].latent_shape)
+        rounds: dict[str, list[dict[str, float]]] = {"ours": [], "plain": []}
+        for k in range(config.rounds + 1):
+            rounds["ours"].append(step(*models["ours"], batch, noise))
+            with plain.in_place_of_ours():
+                rounds["plain"].append(step(*models["plain"], batch, noise))
+            assert abs(rounds["ours"][k]["loss"] / rounds["plain"][k]["loss"] - 1) < 1e-3, "not the same objective"
+        rounds = {way: found[1:] for way, found in rounds.items()}  # the first warms up
+        total = {
+            way: [sum(v for part, v in r.items() if part != "loss") for r in found] for way, found in rounds.items()
+        }
+        for way, found in rounds.items():
+            parts = ", ".join(
+                f"{part} {spread([r[part] for r in found], 1e3, 0)}" for part in found[0] if part != "loss"
+            )
+            print(f"{name}, batch {batch_size}, {way}: step {spread(total[way], 1e3, 0)} ms: {parts}")
+        print(f"{name}: plain takes {ratios(total['plain'], total['ours'], 2)} the time of ours")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))

@@ -1,0 +1,70 @@
+"""Matching: real primitives only, against padded squares with their cost tensors, on the same inputs.
+
+python benchmarks/matching.py
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import plain
+import torch
+from common import interleaved, ratios, spread, where
+
+from models.layout import LayoutSpec
+from models.matching import PAPER_WEIGHTS, match
+from models.scene import Grid
+from models.tensors import layout_batch
+from pipelines.sources.town import town_drive
+
+BATCH = 32
+
+
+def town_batch(spec: LayoutSpec, batch: int):
+    """Layouts of `batch` town scenes from several districts."""
+    scenes = []
+    for seed in range(4):
+        drive = town_drive(seed)
+        poses = np.linspace(0, len(drive) - 1, batch // 4).astype(int)
+        scenes += [drive.scene(int(k), "train", Grid()) for k in poses]
+    return layout_batch(scenes, spec)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    spec = LayoutSpec()
+    truth = town_batch(spec.with_resolution(32), BATCH)
+    print(where())
+    print(f"batch {BATCH}, {spec.num_slots} slots in {len(spec.slots)} categories, {float(truth.real.sum(1).float().mean()):.0f} real primitives a scene")  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(truth.features.shape, generator=generator)
+    for name, features in (
+        ("untrained", torch.rand(truth.features.shape, generator=generator)),
+        ("trained (truth, shuffled, noise of 0.02)", shuffled(truth.features + 0.02 * noise, spec, generator)),
+    ):
+        logit = torch.randn(truth.real.shape, generator=generator)
+        given = (features, logit, truth.features, truth.real, spec.slots, spec.slots, PAPER_WEIGHTS)
+        found: dict[str, torch.Tensor] = {}
+        seconds = interleaved(
+            {
+                "padded": lambda _, given=given, found=found: found.update(padded=plain.match(*given)),
+                "ours": lambda _, given=given, found=found: found.update(ours=match(*given)),
+            },
+            7,
+        )
+        cost = {k: plain.total_cost(*given[:4], a, *given[4:]) for k, a in found.items()}
+        difference = abs(cost["ours"] - cost["padded"]) / cost["padded"]
+        print(f"{name}: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}; total costs differ by {difference:.1e}")  # fmt: skip
+
+
+def shuffled(features: torch.Tensor, spec: LayoutSpec, generator: torch.Generator) -> torch.Tensor:
+    """Slots permuted within their categories."""
+    groups = features.split(spec.slots, dim=1)
+    return torch.cat([g[:, torch.randperm(g.shape[1], generator=generator)] for g in groups], dim=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""The layout VAE's objective as one would write it first from the paper: the yardstick of the other benchmarks.
+
+Matching pads the truth to as many rows as there are proposals and fills whole cost tensors; losses go sample by sample
+and category by category; the object encoder computes on padded slots too. Same values, more work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.optimize import linear_sum_assignment
+
+from models import losses
+from models.layout import LayoutSpec
+from models.objects import ObjectEncoder
+
+
+def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
+    """(n, n) cost of every pair of one sample and category, truth padded to n rows (supplement Eq. "match")."""
+    n, missing = len(features), len(features) - len(truth)
+    truth = F.pad(truth, (0, 0, 0, missing))
+    real = F.pad(real, (0, missing))
+    existence = F.binary_cross_entropy_with_logits(
+        logit[None, :].expand(n, n), real.float()[:, None].expand(n, n), reduction="none"
+    )
+    distance = (truth[:, None, :] - features[None, :, :]).abs() * real[:, None, None]
+    return (
+        weights.existence * existence
+        + weights.center * distance[..., :3].sum(-1)
+        + weights.cholesky * distance[..., 3:].sum(-1)
+    )
+
+
+@torch.no_grad()
+def match(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
+    """As models.matching.match."""
+    assignment = torch.full(logit.shape, -1, dtype=torch.long)
+    for sample in range(len(features)):
+        slot = proposal = 0
+        for capacity, offered in zip(slots, proposals, strict=True):
+            mine, theirs = slice(proposal, proposal + offered), slice(slot, slot + capacity)
+            flags = real[sample, theirs]
+            cost = square_cost(features[sample, mine], logit[sample, mine], truth[sample, theirs], flags, weights)
+            rows, cols = linear_sum_assignment(cost.numpy())
+            for row, col in zip(rows, cols, strict=True):
+                if row < capacity and flags[row]:
+                    assignment[sample, proposal + col] = slot + row
+            slot, proposal = theirs.stop, mine.stop
+    return assignment
+
+
+def object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
+    """As models.losses.object_losses."""
+    totals = [features.new_zeros(()) for _ in range(3)]
+    batch = len(features)
+    for sample in range(batch):
+        slot = proposal = 0
+        for name, capacity, offered in zip(spec.categories, spec.slots, proposals, strict=True):
+            weights = losses.OBJECT_WEIGHTS[name]
+            count = max(int(real[sample, slot : slot + capacity].sum()), 1)
+            chosen = assignment[sample, proposal : proposal + offered]
+            target = (chosen >= 0).float()
+            existence = F.binary_cross_entropy_with_logits(
+                logit[sample, proposal : proposal + offered], target, reduction="sum"
+            )
+            totals[0] = totals[0] + weights[0] * existence / count / batch
+            matched = torch.nonzero(chosen >= 0).flatten()
+            if len(matched):
+                error = (features[sample, proposal + matched] - truth[sample, chosen[matched]]).abs()
+                totals[1] = totals[1] + weights[1] * error[:, :3].sum() / count / batch
+                totals[2] = totals[2] + weights[2] * error[:, 3:].sum() / count / batch
+            slot, proposal = slot + capacity, proposal + offered
+    return tuple(totals)
+
+
+@contextlib.contextmanager
+def in_place_of_ours():
+    """Within, the objective and the object encoder are the plain ones."""
+    kept = losses.match, losses.object_losses, ObjectEncoder.without_padding
+    losses.match, losses.object_losses = match, object_losses
+    ObjectEncoder.without_padding = lambda self, features, real: (
+        features,
+        real,
+        self.slot_category.expand(len(features), -1),
+    )
+    try:
+        yield
+    finally:
+        losses.match, losses.object_losses, ObjectEncoder.without_padding = kept
+
+
+def total_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:
+    """The square problem's cost of an assignment, padding included, over all samples and categories; float64."""
+    total = 0.0
+    for sample in range(len(features)):
+        slot = proposal = 0
+        for capacity, offered in zip(slots, proposals, strict=True):
+            mine, theirs = slice(proposal, proposal + offered), slice(slot, slot + capacity)
+            cost = square_cost(
+                features[sample, mine].double(),
+                logit[sample, mine].double(),
+                truth[sample, theirs].double(),
+                real[sample, theirs],
+                weights,
+            ).numpy()
+            chosen = assignment[sample, mine].numpy()
+            cols = np.flatnonzero(chosen >= 0)
+            total += cost[chosen[cols] - slot, cols].sum()
+            padding = int(real[sample, theirs].sum())  # a padded row costs the same wherever the others are
+            rest = np.flatnonzero(chosen < 0)
+            total += cost[padding:, :][:1, rest].sum() if len(rest) else 0.0
+            slot, proposal = theirs.stop, mine.stop
+    return float(total)

@@ -1,0 +1,211 @@
+"""Preprocessing on one core: speed by stage, against ray casting per pose, agreement, size, memory, reading back.
+
+python benchmarks/preprocess.py                    about four minutes; raw data are written once
+python benchmarks/preprocess.py --raw KITTI-360    any directory in KITTI-360's layout
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import multiprocessing
+import resource
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import trimesh
+import tyro
+from common import interleaved, ratios, spread, where, with_dense_poses, write_raw
+
+from models.scene import Grid
+from pipelines import cut, storage
+from pipelines.dataset import training_statistics
+from pipelines.feed import LayoutReader
+from pipelines.plan import plan_kitti360
+from pipelines.scenes.tables import Shard, scene_tables
+from pipelines.sources import kitti360
+from pipelines.sources.drive import Drive
+from pipelines.sources.town import town_drive, write_kitti360
+
+pa.set_cpu_count(1)
+pa.set_io_thread_count(1)
+
+
+@dataclass(frozen=True)
+class Config:
+    raw: str = ""
+    """KITTI-360 root (default: dense towns, written once under the temporary directory)."""
+    scenes: int = 512
+    """Scenes to cut for the speed."""
+    rays: int = 8
+    """Scenes to cast rays for."""
+
+
+def density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
+    """Mean primitives and slabs in a crop."""
+    primitives, slabs = [], []
+    for k in poses:
+        local = drive.pose(int(k)).to_ego(drive.ground.vertices_m)
+        slabs.append(len(np.unique(drive.ground.vertex_slab[grid.contains(local[:, 0], local[:, 1])])))
+        primitives.append(len(drive.scene(int(k), "train", grid)))
+    return float(np.mean(primitives)), float(np.mean(slabs))
+
+
+def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
+    """(G, H, W) heights, -inf for none: one trimesh per class and pose, one vertical ray per pixel centre (embree)."""
+    pose, ground = drive.pose(index), drive.ground
+    local = pose.to_ego(ground.vertices_m)
+    inside = np.zeros(len(ground.slab_class), bool)
+    inside[ground.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
+    x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
+    origins = np.stack([x, y, np.full_like(x, 100.0)], -1).reshape(-1, 3)
+    down = np.tile([0.0, 0.0, -1.0], (len(origins), 1))
+    height = np.full((len(drive.ground_classes), len(origins)), -np.inf)
+    owner = ground.vertex_slab[ground.triangles[:, 0]]
+    for k in range(len(height)):
+        faces = ground.triangles[inside[owner] & (ground.slab_class[owner] == k)]
+        if len(faces):
+            mesh = trimesh.Trimesh(local, faces, process=False)
+            hits, ray, _ = mesh.ray.intersects_location(origins, down)
+            np.maximum.at(height[k], ray, hits[:, 2])
+    return height.reshape(-1, grid.rows, grid.cols)
+
+
+def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
+    """CPU milliseconds per scene by stage: shards of 256 as pass 1 writes them."""
+    spent = dict.fromkeys(("cut and rasterise", "to tables", "write Parquet"), 0.0)
+    for number, start in enumerate(range(0, len(poses), 256)):
+        clock = time.process_time()
+        near = drive.at(poses[start : start + 256], grid)
+        tables = []
+        for first in range(0, len(near), cut.BATCH_SCENES):
+            batch = [near.scene(k, "train", grid) for k in range(first, min(first + cut.BATCH_SCENES, len(near)))]
+            now = time.process_time()
+            spent["cut and rasterise"] += now - clock
+            tables.append(scene_tables(batch))
+            cut.extremes(batch)
+            clock = time.process_time()
+            spent["to tables"] += clock - now
+        shard = Shard(out, "kitti360", "train", number)
+        for name, table in cut.joined_tables(tables).items():
+            storage.write_parquet(table, shard.path(name))
+        spent["write Parquet"] += time.process_time() - clock
+    return {name: 1e3 * seconds / len(poses) for name, seconds in spent.items()}
+
+
+def agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
+    """Shares: of pixel and class decisions that agree with rays, of common pixels within 1 cm; worst metres."""
+    same, within, worst = [], [], 0.0
+    for index in indices:
+        scene = drive.scene(int(index), "train", grid)
+        rays = cast_rays(drive, int(index), grid)
+        hit = np.isfinite(rays)
+        both = hit & scene.occupied
+        error = np.abs(scene.height_m[both] - rays[both])
+        same.append((hit == scene.occupied).mean())
+        within.append((error < 0.01).mean())
+        worst = max(worst, float(error.max()))
+    return float(np.mean(same)), float(np.mean(within)), worst
+
+
+def stored_exactly(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
+    """Whether all masks come back from the tables as they were cut, and the largest height error in metres."""
+    stored = Shard(out, "kitti360", "train", 0).scenes()[: len(poses)]
+    masks, worst = True, 0.0
+    for scene, index in zip(stored, poses, strict=False):
+        fresh = drive.scene(int(index), "train", grid)
+        masks &= bool(np.array_equal(scene.occupied, fresh.occupied))
+        worst = max(worst, float(np.abs(scene.height_m - fresh.height_m).max()))
+    return masks, worst
+
+
+def peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
+    """In a process of its own: poses of a sequence, and its peak resident megabytes for reading it and one shard."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_kitti360(with_dense_poses(town_drive(4), spacing_m), folder + "/raw")
+        child = multiprocessing.get_context("spawn").Process(target=_one_shard, args=(folder, results))
+        child.start()
+        child.join()
+
+
+def _one_shard(folder: str, results: multiprocessing.Queue) -> None:
+    tasks = plan_kitti360(folder + "/raw", split=False)
+    cut.write_shard(tasks[0], folder + "/out", Grid())
+    poses = sum(len(task.parts[0].poses) for task in tasks)
+    results.put((poses, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+
+
+def main(config: Config) -> None:
+    grid = Grid()
+    raw = Path(config.raw or Path(tempfile.gettempdir()) / "pritti-benchmark-raw")
+    if not config.raw:
+        write_raw(raw)
+    sequence = kitti360.sequences(raw)[-1]
+    print(where())
+    xml = raw / f"data_3d_bboxes/train_full/2013_05_28_drive_{sequence}_sync.xml"
+    clock = time.process_time()
+    drive, report = kitti360.read_drive(raw, sequence)
+    parse = time.process_time() - clock
+    megabytes = xml.stat().st_size / 1e6
+    print(f"read      sequence {sequence}: {megabytes:.0f} MB of XML, {report.objects} objects in {parse:.1f} s, {megabytes / parse:.1f} MB/s")  # fmt: skip
+    poses = np.linspace(0, len(drive) - 1, min(config.scenes, len(drive))).astype(int)
+    primitives, slabs = density(drive, poses[:: max(1, len(poses) // 50)], grid)
+    print(f"density   {primitives:.0f} primitives and {slabs:.0f} slabs in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}")  # fmt: skip
+    with tempfile.TemporaryDirectory() as out:
+        rounds = [speed(drive, poses, grid, f"{out}/{k}") for k in range(3)]
+        for stage in rounds[0]:
+            print(f"speed     {stage}: {spread([r[stage] for r in rounds])} ms per scene")
+        reading = 1e3 * parse / len(drive)
+        total = [sum(r.values()) + reading for r in rounds]
+        print(f"speed     reading the XML, shared by {len(drive)} poses: {reading:.2f} ms per scene")
+        print(f"speed     all stages: {spread(total)} ms per scene, {spread([1e3 / t for t in total], digits=0)} scenes/s and core")  # fmt: skip
+
+        some = poses[:: max(1, len(poses) // config.rays)][: config.rays]
+        seconds = interleaved(
+            {
+                "rays": lambda k: cast_rays(drive, int(some[k]), grid),
+                "ours": lambda k: drive.ground.rasterise(drive.pose(int(some[k])), grid, len(drive.ground_classes)),
+            },
+            len(some),
+        )
+        print(f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}")  # fmt: skip
+        same, within, worst = agreement(drive, some, grid)
+        print(f"rays      agreement {100 * same:.4f} % of pixel and class decisions, {100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)")  # fmt: skip
+
+        masks, worst = stored_exactly(drive, poses[:64], grid, f"{out}/0")
+        sizes = {
+            name: sum(p.stat().st_size for p in Path(out, "0", name).rglob("*.parquet")) / len(poses) / 1e3
+            for name in ("scenes", "primitives", "rasters")
+        }
+        print(f"size      {sum(sizes.values()):.1f} kB per scene ({', '.join(f'{k} {v:.1f}' for k, v in sizes.items())}); masks exact: {masks}, heights within {1000 * worst:.1f} mm")  # fmt: skip
+
+        shards = [Shard(f"{out}/0", "kitti360", "train", k) for k in range(-(-len(poses) // 256))]
+        manifest = {"source": "kitti360", "split": "train", "number": 0, "scenes": 1, "ground_classes": list(drive.ground_classes)}  # fmt: skip
+        manifest["extremes"] = cut.extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
+        spec = training_statistics([manifest], f"{out}/0", grid, None).spec
+        for pixels in (256, 128):
+            reader, rates = LayoutReader(spec.with_resolution(pixels)), []
+            for _ in range(3):
+                clock = time.process_time()
+                for shard in shards:
+                    reader(shard, np.arange(min(256, len(poses) - 256 * shard.number)))
+                rates.append(len(poses) / (time.process_time() - clock))
+            print(f"read back training layouts of {pixels} x {pixels}: {spread(rates, digits=0)} scenes/s and core")
+
+    results = multiprocessing.get_context("spawn").Queue()
+    for spacing_m in (10.0, 0.5):
+        peak_memory(spacing_m, results)
+        count, peak = results.get()
+        print(
+            f"memory    sequence of {count} poses: peak {peak:.0f} MB in the process that reads it and writes a shard"
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
