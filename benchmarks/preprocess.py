@@ -11,7 +11,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import multiprocessing
-import resource
 import tempfile
 import time
 from dataclasses import dataclass
@@ -138,7 +137,8 @@ def _one_shard(folder: str, results: multiprocessing.Queue) -> None:
     tasks = plan_kitti360(folder + "/raw", split=False)
     cut.write_shard(tasks[0], folder + "/out", Grid())
     poses = sum(len(task.parts[0].poses) for task in tasks)
-    results.put((poses, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    results.put((poses, int(peak.split()[1]) / 1024))
 
 
 def main(config: Config) -> None:

@@ -15,38 +15,49 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
 
 def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground.
+    """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground (`resampled`)."""
+    return resampled(*ground_of_classes(scene, ground_classes), scene.grid, grid)
+
+
+def ground_of_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """height_m and occupied of the named classes; those that the scene does not have are empty."""
+    if ground_classes == scene.ground_classes:
+        return scene.height_m, scene.occupied
+    shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
+    height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    for k, name in enumerate(ground_classes):
+        if name in scene.ground_classes:
+            own = scene.ground_classes.index(name)
+            height[k], occupied[k] = scene.height_m[own], scene.occupied[own]
+    return height, occupied
+
+
+def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (G, H, W), metres or whole numbers, and masks on another grid over the same ground.
 
     Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
-    nearest. Classes that the scene does not have are empty. Raises ValueError if the grids do not cover the same
-    ground, or if the ratio of pixels is not whole.
+    nearest. Raises ValueError if the grids do not cover the same ground, or if the ratio of pixels is not whole.
     """
-    covers = [(g.front_m, g.left_m, g.back_m, g.right_m) for g in (scene.grid, grid)]
+    covers = [(g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid)]
     if not np.allclose(*covers):
-        raise ValueError(f"scene {scene.scene_id} covers {scene.grid}, wanted is {grid}")
-    if ground_classes == scene.ground_classes:
-        height, occupied = scene.height_m, scene.occupied
-    else:
-        shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
-        height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
-        for k, name in enumerate(ground_classes):
-            if name in scene.ground_classes:
-                own = scene.ground_classes.index(name)
-                height[k], occupied[k] = scene.height_m[own], scene.occupied[own]
-    if grid.rows == scene.grid.rows:
+        raise ValueError(f"the scene covers {own}, wanted is {grid}")
+    if grid.rows == own.rows:
         return height, occupied
-    if scene.grid.rows % grid.rows == 0:
-        f = scene.grid.rows // grid.rows
+    if own.rows % grid.rows == 0:
+        f = own.rows // grid.rows
         # Adding f x f strided views is six times as fast as one reduction over block axes.
         corners = [(slice(None), slice(i, None, f), slice(j, None, f)) for i in range(f) for j in range(f)]
-        count = sum(occupied[corner].astype(np.int16) for corner in corners)
-        total = sum(height[corner] for corner in corners)
-        keep = 2 * count >= f * f
-        return np.where(keep, total / np.maximum(count, 1), 0).astype(np.float32), keep
-    if grid.rows % scene.grid.rows == 0:
-        f = grid.rows // scene.grid.rows
+        wide = np.uint32 if height.dtype.kind == "u" else height.dtype
+        count = sum(occupied[corner].astype(np.uint8) for corner in corners)
+        total = sum(height[corner].astype(wide, copy=False) for corner in corners)
+        keep = 2 * count.astype(np.int16) >= f * f
+        mean = total / np.maximum(count, 1).astype(np.float32)
+        mean = np.rint(mean) if height.dtype.kind == "u" else mean
+        return np.where(keep, mean, 0).astype(height.dtype), keep
+    if grid.rows % own.rows == 0:
+        f = grid.rows // own.rows
         return tuple(a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
-    raise ValueError(f"scene {scene.scene_id}: {scene.grid.rows} pixels do not divide into {grid.rows}")
+    raise ValueError(f"{own.rows} pixels do not divide into {grid.rows}")
 
 
 def slot_primitives(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -77,12 +88,18 @@ def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
 def compact_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     """height and occupied of `compact_layout`."""
-    height_m, occupied = ground_on_grid(scene, spec.ground_classes, spec.grid)
-    (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
-    scaled = (height_m[occupied] - np.float32(low)) * np.float32(65535 / (high - low))
+    height_m, occupied = ground_of_classes(scene, spec.ground_classes)
     height = np.zeros(height_m.shape, np.uint16)
-    height[occupied] = np.rint(scaled.clip(0, 65535))
+    height[occupied] = compact_height(height_m[occupied], spec)
+    height, occupied = resampled(height, occupied, scene.grid, spec.grid)
     return {"height": height, "occupied": occupied}
+
+
+def compact_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
+    """Heights in 65535ths of the spec's bounds, uint16, clipped."""
+    (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
+    scaled = (height_m - np.float32(low)) * np.float32(65535 / (high - low))
+    return np.rint(scaled.clip(0, 65535)).astype(np.uint16)
 
 
 def compact_primitives(

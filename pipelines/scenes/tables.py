@@ -164,10 +164,16 @@ def decode_ground(
     height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
-    mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).astype(bool).reshape(shape)
+    steps, mask = ground_steps(height, occupied, shape)
     height_m = np.zeros(shape, np.float32)
-    height_m[mask] = np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16) * np.float32(step_m)
+    height_m[mask] = steps * np.float32(step_m)
     return height_m, mask
+
+
+def ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Heights of the occupied pixels (m,) int16, in steps, and occupied (G, H, W) bool from one row of `rasters`."""
+    mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
+    return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
 
 
 def _scenes_table(scenes: Sequence[Scene]) -> pa.Table:
@@ -294,6 +300,20 @@ def scenes_from_tables(
         )
 
 
+def category_indices(names: pa.ChunkedArray) -> np.ndarray:
+    """(n,) int8 index into CATEGORIES. Raises ValueError for a name that is none."""
+    category = pc.index_in(names, pa.array(CATEGORIES))
+    if category.null_count:
+        raise ValueError("primitives hold a category of another version; preprocess again")
+    return category.to_numpy().astype(np.int8)
+
+
+def fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
+    """(n, width) float32 of a column of fixed-size lists."""
+    flat = pa.concat_arrays(column.chunks).flatten() if len(column) else pa.array([], pa.float32())
+    return flat.to_numpy().reshape(-1, width)
+
+
 def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
     """The per-primitive arrays of a Scene for all rows of a primitives table."""
     primitives = primitives.combine_chunks()
@@ -304,14 +324,10 @@ def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
     def stacked(*names: str) -> np.ndarray:
         return np.stack([column(name) for name in names], axis=1)
 
-    rotation = pa.concat_arrays(primitives["rotation"].chunks).flatten() if len(primitives) else pa.array([], pa.float32())
-    category = pc.index_in(primitives["category"], pa.array(CATEGORIES))
-    if category.null_count:
-        raise ValueError("primitives hold a category of another version; preprocess again")
     return {
-        "category": category.to_numpy().astype(np.int8),
+        "category": category_indices(primitives["category"]),
         "center_m": stacked("x_m", "y_m", "z_m"),
-        "rotation": rotation.to_numpy().reshape(-1, 3, 3),
+        "rotation": fixed_lists(primitives["rotation"], 9).reshape(-1, 3, 3),
         "size_m": stacked("length_m", "width_m", "height_m"),
         "existence": column("existence"),
         "heading_rad": column("heading_rad").astype(np.float32),
