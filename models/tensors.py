@@ -45,11 +45,8 @@ def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -
         return height, occupied
     if own.rows % grid.rows == 0:
         f = own.rows // grid.rows
-        # Adding f x f strided views is six times as fast as one reduction over block axes.
-        corners = [(slice(None), slice(i, None, f), slice(j, None, f)) for i in range(f) for j in range(f)]
         wide = np.uint32 if height.dtype.kind == "u" else height.dtype
-        count = sum(occupied[corner].astype(np.uint8) for corner in corners)
-        total = sum(height[corner].astype(wide, copy=False) for corner in corners)
+        count, total = _block_sums(occupied.view(np.uint8), f, np.uint8), _block_sums(height, f, wide)
         keep = 2 * count.astype(np.int16) >= f * f
         mean = total / np.maximum(count, 1).astype(np.float32)
         mean = np.rint(mean) if height.dtype.kind == "u" else mean
@@ -58,6 +55,14 @@ def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -
         f = grid.rows // own.rows
         return tuple(a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
     raise ValueError(f"{own.rows} pixels do not divide into {grid.rows}")
+
+
+def _block_sums(values: np.ndarray, f: int, dtype: type) -> np.ndarray:
+    """(G, H / f, W / f) sums over f x f blocks: whole rows first, then strided columns of what is left."""
+    rows = sum(
+        (values[:, i::f].astype(dtype, copy=False) for i in range(1, f)), values[:, ::f].astype(dtype, copy=False)
+    )
+    return sum((rows[:, :, j::f] for j in range(1, f)), rows[:, :, ::f])
 
 
 def slot_primitives(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ A worker holds a few scenes at a time, whatever the length of the drive.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -58,6 +59,13 @@ def cut(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
     return scene
 
 
+def _planned(drive: Drive, part: Part) -> Drive:
+    """The drive, if it still has the poses that were planned. Raises ValueError."""
+    if drive.frame.take(part.poses, mode="clip").tolist() != list(part.frames):
+        raise ValueError(f"{part.sequence}: its poses changed after this run began; run the same command again")
+    return drive
+
+
 class ShardCut:
     """Cuts the scenes of a task, one after another; what went wrong is listed beside."""
 
@@ -71,13 +79,13 @@ class ShardCut:
         for part in self.task.parts:
             try:
                 drive, self.reports[part.sequence] = self.read(self.task.source, part.key)
+                if part.poses is not None:
+                    drive = _planned(drive, part).at(np.array(part.poses), self.grid)
             except ValueError as error:
                 self.unreadable.append(str(error))
                 for frame in part.frames or [None]:
                     self._reject(part, frame, str(error))
                 continue
-            if part.poses is not None:
-                drive = drive.at(np.array(part.poses), self.grid)
             for pose, frame in enumerate(drive.frame.tolist()):
                 try:
                     yield cut(drive, pose, self.task.split, self.grid)
@@ -129,10 +137,16 @@ def manifest_path(staging: str, task: Task) -> str:
 
 
 def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
-    """Row in: a task. Row out: its manifest. One shard per task; a finished one is not redone."""
+    """Row in: a task. Row out: its manifest. One shard per task; a finished one is not redone.
+
+    It is redone if it was cut from other parts: a drive was added, or its poses repaired, since the run began.
+    """
     path, shard = manifest_path(staging, task), task.shard(staging)
+    parts = hashlib.blake2b(repr(task.parts).encode(), digest_size=16).hexdigest()
     if storage.exists(path):
-        return storage.read_json(path)
+        finished = storage.read_json(path)
+        if finished.get("parts") == parts:
+            return finished
     started = time.perf_counter()
     cuts = ShardCut(task, grid, read)
     scenes, tables, measured, classes = iter(cuts), [], [], ()
@@ -151,6 +165,7 @@ def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_dri
         "source": task.source,
         "split": task.split,
         "number": task.number,
+        "parts": parts,
         "scenes": num_scenes,
         "rejects": dict(Counter(row["reason"] for row in cuts.rejects)),
         "unreadable": cuts.unreadable,

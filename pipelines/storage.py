@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import pyarrow as pa
@@ -43,19 +44,30 @@ def list_files(uri: str, suffix: str) -> list[str]:
 
 
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
-    """Create or replace a file by `write(stream)`: readers see the old file or the new one, never a part."""
+    """Create or replace a file by `write(stream)`: readers see the old file or the new one, never a part.
+
+    What killed writers of the same file left is deleted. Raises OSError naming the file and what to do.
+    """
     fs, path = resolve(uri)
     parent, name = path.rsplit("/", 1)
-    fs.create_dir(parent, recursive=True)
-    temporary = f"{parent}/{TEMPORARY}{os.getpid()}-{name}"
+    # Does not end as the file does: what globs for *.parquet takes hidden files too (DuckDB).
+    temporary = f"{parent}/{TEMPORARY}{name}-{os.getpid()}"
     try:
+        fs.create_dir(parent, recursive=True)
         with fs.open_output_stream(temporary) as stream:
             write(stream)
         fs.move(temporary, path)
-    except BaseException:
+    except BaseException as error:
         if fs.get_file_info(temporary).is_file:
             fs.delete_file(temporary)
+        if isinstance(error, OSError):
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            raise OSError(
+                f"{uri}: cannot be written ({reason}); make room there or give write permission, then run the same"
+                " command again"
+            ) from error
         raise
+    _delete_files(fs, pafs.FileSelector(parent), f"{TEMPORARY}{name}-")
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
@@ -104,10 +116,15 @@ def read_json(uri: str) -> Any:
 def clean_temporaries(uri: str) -> int:
     """Delete what killed writers left behind; how many there were."""
     fs, path = resolve(uri)
-    found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
-    stale = [info.path for info in found if info.is_file and info.base_name.startswith(TEMPORARY)]
+    return _delete_files(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
+
+
+def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) -> int:
+    """Delete the files whose names begin with `prefix`; how many there were."""
+    stale = [info.path for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
     for name in stale:
-        fs.delete_file(name)
+        with suppress(FileNotFoundError):  # its writer was alive after all, and is done
+            fs.delete_file(name)
     return len(stale)
 
 

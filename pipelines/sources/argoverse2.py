@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 import pyarrow as pa
@@ -288,10 +287,14 @@ def _points(path: Path, entry: dict, name: str, least: int, most: int | None = N
     """(n, 2) x and y of the points entry[name], metres, city frame."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
-        raise ValueError(f"{path}: {name} of {entry.get('id')} is no list of {least} points; download the log again")
+        raise ValueError(
+            f"{path}: {name} of {ascii(entry.get('id'))[:40]} is no list of {least} points; download the log again"
+        )
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
     if not _all_numbers(values, MAX_COORDINATE_M):
-        raise ValueError(f"{path}: {name} of {entry.get('id')} has a point without sensible x, y; fix or drop it")
+        raise ValueError(
+            f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without sensible x, y; fix or drop it"
+        )
     return np.array(values, np.float64).reshape(-1, 2)
 
 
@@ -311,16 +314,16 @@ def _read_heights(path: Path) -> np.ndarray:
     """(rows, cols) float heights in metres, city frame, NaN where unknown."""
     _check_file(path)
     try:
-        # Mapped, so that a header that promises too much asks for no memory; it is parsed as Python, hence
-        # the errors below.
+        # Mapped, so that a header that promises too much asks for no memory.
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, OverflowError, TokenError) as error:
+    except Exception as error:  # numpy evaluates the header as Python, and a broken one fails in as many ways
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise ValueError(f"{path}: broken npy file ({reason}); download the log again") from error
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
         kind = f"{mapped.dtype} {mapped.shape}" if isinstance(mapped, np.ndarray) else type(mapped).__name__
         raise ValueError(f"{path}: is {kind}, expected a 2D float array; download the log again")
-    height_m = np.array(mapped, np.float32)
+    with np.errstate(over="ignore"):  # infinite, so refused below
+        height_m = np.array(mapped, np.float32)
     known = height_m[~np.isnan(height_m)]
     if len(known) == 0 or np.abs(known).max() > MAX_HEIGHT_M:
         raise ValueError(f"{path}: {len(known)} heights, not all sensible; download the log again")

@@ -121,7 +121,7 @@ class ReadReport:
 def sequences(root: str | Path) -> list[str]:
     """The annotated sequences under ROOT, by their four digits.
 
-    Raises ValueError if there is none, or if one of them has no poses.
+    Raises ValueError if there is none, or none that has poses: `read_poses` names a single one that has not.
     """
     folder = Path(root) / "data_3d_bboxes" / "train_full"
     names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
@@ -130,12 +130,11 @@ def sequences(root: str | Path) -> list[str]:
             f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that"
             " holds data_3d_bboxes and data_poses"
         )
-    for name in names:
-        if not _poses_path(root, name).is_file():
-            raise ValueError(
-                f"{_poses_path(root, name)}: missing, but sequence {name} is annotated; unpack KITTI-360's"
-                " data_poses.zip here, or take the sequence's XML away"
-            )
+    if not any(_poses_path(root, name).is_file() for name in names):
+        raise ValueError(
+            f"{_poses_path(root, names[0])}: missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
+            " data_poses.zip here"
+        )
     return names
 
 
@@ -212,9 +211,9 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     Raises ValueError, naming file and line, for a missing file, a bad line or a matrix that is no pose.
     """
     path = _poses_path(root, sequence)
-    lines = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace").splitlines()
+    text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
     frame, rows = [], []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words:
             continue
@@ -237,6 +236,8 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     bad = np.flatnonzero((skew > 1e-2) | (np.linalg.det(rotation) < 0))
     if len(bad):
         raise ValueError(f"{path}: the matrix of frame {frame[bad[0]]} is no rotation; restore the line")
+    if not text.endswith(("\n", "\r")):  # cut off within its last number, that is a wrong pose
+        raise ValueError(f"{path}: line {number} does not end; is the file cut off? Unpack data_poses.zip again")
     return np.array(frame, np.int64), world_from_imu
 
 
@@ -257,16 +258,16 @@ def _stream_objects(path: Path) -> Iterator[dict]:
                 if event == "start" and depth == 1:
                     root = element
                     if root.tag != "opencv_storage":
-                        raise ValueError(f"{path}: the root is <{root.tag[:40]}>, expected <opencv_storage>; {again}")
+                        raise ElementTree.ParseError(f"the root is <{root.tag[:40]}>, expected <opencv_storage>")
                 elif event == "end" and depth == 1:
                     yield {child.tag: child for child in element}
                     root.clear()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {again}") from error
-    except (ElementTree.ParseError, LookupError, UnicodeError) as error:
-        raise ValueError(f"{path}: broken XML ({error}); {again}") from error
     except DefusedXmlException as error:
         raise ValueError(f"{path}: declares a document type or entities, which no real file does; {again}") from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of encodings
+        raise ValueError(f"{path}: broken XML ({error}); {again}") from error
 
 
 class DefectiveObject(ValueError):

@@ -206,7 +206,7 @@ class _Table:
         for row, value in enumerate(values):
             if value is None and optional:
                 continue
-            if type(value) is not str:
+            if not _is_text(value):
                 raise ValueError(f"{self.path}: {name} of row {row} is {_show(value)}, expected a text")
             if allowed and value not in allowed:
                 raise ValueError(
@@ -392,6 +392,11 @@ def _matrices(table: _Table) -> np.ndarray:
     return world_from_ego
 
 
+def _is_text(value: object) -> bool:
+    """Whether this is a str that files can hold: JSON may escape half a character."""
+    return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
+
+
 def _is_whole(value: object) -> bool:
     """Whether this is an integer of 0 or more; a float will do, pandas makes them of integers beside a null."""
     return type(value) in (int, float) and 0 <= value <= MAX_WHOLE and value == value // 1
@@ -438,7 +443,7 @@ def _instance_ids(table: _Table) -> np.ndarray:
     """(rows,) int64: numbers as they are, texts by the first 63 bits of their BLAKE2 hash, -1 where there is none."""
     ids = []
     for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
-        if type(value) is str:
+        if _is_text(value):
             value = int.from_bytes(hashlib.blake2b(value.encode(), digest_size=8).digest(), "big") >> 1
         elif value is not None and not _is_whole(value):
             raise ValueError(
