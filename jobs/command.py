@@ -43,6 +43,8 @@ def start_ray() -> None:
     context.print_on_execution_start = False
     context.raise_original_map_exception = True  # a worker's ValueError stays one: see `root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
+    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # tracebacks of what reaches us anyway
+        logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
 
 def root_cause(error: BaseException) -> BaseException:

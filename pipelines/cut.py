@@ -156,9 +156,10 @@ def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_dri
         classes = batch[0].ground_classes
     num_scenes = 0
     if tables:
-        for name, table in joined_tables(tables).items():
-            storage.write_parquet(table, shard.path(name))
-            num_scenes = len(table) if name == "scenes" else num_scenes
+        joined = joined_tables(tables)
+        num_scenes = len(joined["scenes"])
+        for name in ("primitives", "rasters", "scenes"):  # a shard is there when its scenes are
+            storage.write_parquet(joined[name], shard.path(name))
     if cuts.rejects:
         storage.write_parquet(rejects_table(cuts.rejects), shard.path("rejects"))
     manifest = {

@@ -125,6 +125,7 @@ def ingest(
     description, staging = storage.join(root, DESCRIPTION), storage.join(root, STAGING)
     _refuse_other_options(root, options)
     if storage.exists(description):
+        storage.delete_directory(staging)  # of a run that was killed while it tidied up
         made = storage.read_json(description)
         rejects, duplicates = made.get("rejects", {}), made.get("duplicates", 0)
         return IngestResult(made["scenes"], rejects, duplicates, time.perf_counter() - started, already_complete=True)

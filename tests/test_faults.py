@@ -62,6 +62,42 @@ def assert_same(root: Path, undisturbed: Path) -> None:
     assert [name for name in ours if ours[name] != theirs[name]] == []
 
 
+def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
+    """What is wrong with what a query over the tables finds at this moment."""
+    wrong = []
+    for path in [path for table in TABLES for path in (root / table).rglob("*.parquet")]:
+        with suppress(FileNotFoundError):
+            if (state := (str(path), path.stat().st_mtime_ns)) not in seen:
+                seen.add(state)
+                try:
+                    pq.read_table(path, partitioning=None)
+                except (OSError, pa.ArrowException) as error:
+                    wrong.append(f"{path}: {error}")
+                if path.parts[len(root.parts)] == "scenes":
+                    others = [Path(str(path).replace("/scenes/", f"/{name}/")) for name in ("primitives", "rasters")]
+                    wrong += [f"{path} without {other}" for other in others if not other.exists()]
+    return wrong
+
+
+@contextmanager
+def watched(root: Path) -> Iterator[None]:
+    """Asserts that at no moment half a shard is visible."""
+    wrong, seen, stop = [], set(), threading.Event()
+
+    def watch() -> None:
+        while not stop.wait(0.02):
+            wrong.extend(half_shards(root, seen))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    assert wrong + half_shards(root, set()) == []
+
+
 @pytest.fixture(scope="module")
 def town(cluster, tmp_path_factory) -> Path:
     """A run that nothing disturbs."""
@@ -152,7 +188,7 @@ def test_workers_that_die_in_the_middle_of_a_file_change_nothing(shards, tmp_pat
 
     def armed(function: Callable) -> Callable:
         def call(*arguments: Any) -> Any:
-            whole = storage.write_whole
+            whole, at_once = storage.write_whole, storage.move
 
             def write_whole(uri: str, write: Callable) -> None:
                 marker = died / str(len(uri))
@@ -165,56 +201,25 @@ def test_workers_that_die_in_the_middle_of_a_file_change_nothing(shards, tmp_pat
 
                 whole(uri, die if uri.endswith(doomed) and not marker.exists() else write)
 
+            def move(source: str, target: str) -> None:
+                time.sleep(0.1 * target.startswith(str(root)))  # a half shard would be seen
+                at_once(source, target)
+
             if not hasattr(storage, "armed"):
-                storage.write_whole, storage.armed = write_whole, True
+                storage.write_whole, storage.move, storage.armed = write_whole, move, True
             return function(*arguments)
 
         return call
 
     monkeypatch.setattr(ingest, "write_shard", armed(ingest.write_shard))
     monkeypatch.setattr(ingest, "label_scenes", armed(ingest.label_scenes))
-    ingest.ingest(tasks, str(root), {}, grid=CROP)
+    with watched(root):
+        ingest.ingest(tasks, str(root), {}, grid=CROP)
     assert len(list(died.iterdir())) == len(doomed)
     assert_same(root, undisturbed)
 
 
 # ------------------------------------------------------------------------------------------------- killed drivers
-
-
-def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
-    """What is wrong with what a query over the tables finds at this moment."""
-    wrong = []
-    for path in [path for table in TABLES for path in (root / table).rglob("*.parquet")]:
-        with suppress(FileNotFoundError):
-            if (state := (str(path), path.stat().st_mtime_ns)) not in seen:
-                seen.add(state)
-                try:
-                    pq.read_table(path, partitioning=None)
-                except (OSError, pa.ArrowException) as error:
-                    wrong.append(f"{path}: {error}")
-                if path.parts[len(root.parts)] == "scenes":
-                    others = [Path(str(path).replace("/scenes/", f"/{name}/")) for name in ("primitives", "rasters")]
-                    wrong += [f"{path} without {other}" for other in others if not other.exists()]
-    return wrong
-
-
-@contextmanager
-def watched(root: Path) -> Iterator[None]:
-    """Asserts that at no moment half a shard is visible."""
-    wrong, seen, stop = [], set(), threading.Event()
-
-    def watch() -> None:
-        while not stop.wait(0.02):
-            wrong.extend(half_shards(root, seen))
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-    assert wrong + half_shards(root, set()) == []
 
 
 def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
@@ -227,18 +232,20 @@ def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             stderr=output,
             start_new_session=True,
         )
-    while not when():
-        assert job.poll() is None, log.read_text()
-        time.sleep(0.01)
-    job.send_signal(signal.SIGSTOP)
-    family = psutil.Process(job.pid).children(recursive=True)
-    job.kill()
-    job.wait()
-    _, alive = psutil.wait_procs(family, timeout=2)
-    for process in alive:
-        with suppress(psutil.NoSuchProcess):
-            process.kill()
-    psutil.wait_procs(alive, timeout=5)
+    try:
+        while not when():
+            assert job.poll() is None, log.read_text()
+            time.sleep(0.01)
+    finally:
+        with suppress(psutil.NoSuchProcess):  # it ended by itself: the assertion says how
+            family = psutil.Process(job.pid).children(recursive=True)
+            job.kill()
+            job.wait()
+            _, alive = psutil.wait_procs(family, timeout=2)
+            for process in alive:
+                with suppress(psutil.NoSuchProcess):
+                    process.kill()
+            psutil.wait_procs(alive, timeout=5)
 
 
 def test_a_driver_killed_while_shards_are_staged_and_again_while_they_are_published_goes_on(town, tmp_path):
@@ -259,7 +266,6 @@ def test_a_driver_killed_while_shards_are_staged_and_again_while_they_are_publis
     assert_same(root, town)
 
 
-@pytest.mark.xfail(strict=True, reason="ingest leaves .staging if it was killed after dataset.json was written")
 def test_a_driver_killed_before_it_tidies_up_leaves_nothing_in_the_end(town, tmp_path):
     shutil.copytree(town, tmp_path / "out")
     storage.write_json({}, str(tmp_path / "out/.staging/manifest/town-train-00000.json"))
@@ -293,7 +299,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_goes_on(town, tmp_path):
         pytest.skip("no tmpfs can be mounted here")
     script = f'{mount} && {{ "$@"; code=$?; cp -a "$0" "{left}"; exit $code; }}'
     words = ["unshare", "-rm", "sh", "-c", script, str(full), sys.executable, *TOWN_WORDS, str(full)]
-    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-3000:]
     assert re.fullmatch(
@@ -303,7 +309,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_goes_on(town, tmp_path):
     preprocess(replace(TOWN, output=str(left)))
     assert_same(left, town)
     if "Traceback" in done.stderr:
-        pytest.xfail("jobs/command.py lets ray.data log the worker's traceback above that line")
+        pytest.xfail("a worker's traceback is still logged above that line")
     assert done.stderr.rstrip().endswith(lines[0])
 
 
