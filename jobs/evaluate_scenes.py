@@ -5,26 +5,15 @@
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
-Writes metrics.json and metrics.parquet, and with --lvae also reconstruction.html, with the best and worst scenes, and
-reconstruction.parquet, a row per scene; all of it goes to MLflow too. FID, IS, precision and recall need local
-Inception weights; without them distances of layout statistics and of a fixed random network are given, under their own
-names.
+Writes metrics.json and metrics.parquet. FID, IS, precision and recall need local Inception weights; without them
+distances of layout statistics and of a fixed random network are given, under their own names.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from jobs.command import absolute, home, run, start_ray
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
-
-    from pipelines.rebuild import Rebuilt
-
-METRICS_PER_CALL = 1000  # MLflow's limit
-DETAILS = (".statistics.", "category_", "class_", "ap3d_at", ".truths.")  # in the files, not on the screen
 
 
 @dataclass(frozen=True)
@@ -41,10 +30,6 @@ class Config:
     """Only source generated-<run> (default: whatever is there)."""
     lvae: str = ""
     """Also score this LVAE's reconstruction of the real scenes."""
-    voxel_range_m: tuple[float, float] = (-1.5, 6.5)
-    """Lowest and highest z of the 256 x 256 x 32 voxels."""
-    pictures: int = 3
-    """So many of the best and of the worst reconstructed scenes to show."""
     limit: int | None = None
     """At most so many scenes on each side, spread evenly."""
     inception: str = ""
@@ -63,15 +48,11 @@ def evaluate(config: Config) -> dict:
 
     from pipelines import storage
     from pipelines.dataset import Dataset
-    from pipelines.evaluate import Selection, compare, describe, flattened
-    from pipelines.rebuild import rebuild
+    from pipelines.evaluate import Selection, compare, describe, flattened, rebuild
 
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     real = Selection(dataset.root, dataset.source, config.real_split, config.limit)
     wanted = config.generated or ("" if config.lvae else home("generated"))
-    output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
-    if config.pictures < 0:
-        raise ValueError(f"--pictures is {config.pictures}, expected 0 or more")
     scores: dict = {}
     start_ray()
     with Progress() as bar:
@@ -82,69 +63,20 @@ def evaluate(config: Config) -> dict:
 
         if config.lvae:
             shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
-            rebuilt = rebuild(
-                real,
-                absolute(config.lvae),
-                config.actors,
-                voxel_range_m=config.voxel_range_m,
-                on_scene=lambda: bar.advance(shown),
+            scores["reconstruction"] = rebuild(
+                real, absolute(config.lvae), config.actors, on_scenes=lambda n: bar.advance(shown, n)
             )
-            scores["reconstruction"] = rebuilt.scores
-            write_reconstruction(config, rebuilt, output, bar)
         if wanted:
             source = f"generated-{config.run}" if config.run else None
             generated = Selection(absolute(wanted), source, config.generated_split or None, config.limit)
             sides = described(real, "describe real"), described(generated, "describe generated")
             scores["generation"] = compare(*sides, dataset, config.k)
+    output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
     storage.write_json(scores, storage.join(output, "metrics.json"))
     flat = flattened(scores)
     table = pa.table({"metric": list(flat), "value": list(flat.values())})
     storage.write_parquet(table, storage.join(output, "metrics.parquet"))
-    inputs = {
-        "real": dataset.root,
-        "split": config.real_split,
-        "generated": wanted,
-        "lvae": config.lvae and absolute(config.lvae),
-    }
-    track(output, inputs, flat)
     return scores
-
-
-def write_reconstruction(config: Config, rebuilt: Rebuilt, output: str, bar: Progress) -> None:
-    """reconstruction.parquet and reconstruction.html, with pictures of the best and worst scenes."""
-    from pipelines import storage
-    from pipelines.rebuild import draw
-    from pipelines.reconstruction_report import reconstruction_html
-
-    storage.write_parquet(rebuilt.scenes, storage.join(output, "reconstruction.parquet"))
-    places, count = rebuilt.places, max(0, min(config.pictures, len(rebuilt.places) // 2))
-    drawn = []
-    if count:
-        shown = bar.add_task("draw best and worst", total=2 * count)
-        chosen = places[:count] + places[-count:]
-        drawn = draw(chosen, absolute(config.lvae), config.actors, lambda: bar.advance(shown))
-    subtitle = f"{absolute(config.lvae)} on {rebuilt.scores['scenes']} scenes, split {config.real_split}"
-    html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[: count - 1 : -1], subtitle)
-    storage.write_whole(storage.join(output, "reconstruction.html"), lambda stream: stream.write(html.encode()))
-
-
-def track(output: str, inputs: dict[str, str], flat: dict[str, float]) -> None:
-    """Metrics, inputs and files to MLflow: one run per output directory, brought up to date."""
-    from jobs.tracking import Tracker
-    from pipelines import storage
-
-    name = output.rstrip("/").rsplit("/", 1)[-1]
-    tracker = Tracker.start("pritti-evaluation", name, {}, storage.join(output, "mlflow.json"))
-    for key, value in inputs.items():
-        tracker.client.set_tag(tracker.run_id, key, value)
-    names = list(flat)
-    for start in range(0, len(names), METRICS_PER_CALL):
-        tracker.metrics({name: flat[name] for name in names[start : start + METRICS_PER_CALL]}, step=0)
-    for file in ("metrics.json", "reconstruction.html"):
-        path = storage.join(output, file)
-        if "://" not in path and storage.exists(path):
-            tracker.client.log_artifact(tracker.run_id, path)
-    tracker.finish("FINISHED")
 
 
 def main(config: Config) -> None:
@@ -156,7 +88,7 @@ def main(config: Config) -> None:
     scores = evaluate(config)
     shown = Table("metric", "value")
     for name, value in flattened(scores).items():
-        if not any(part in name for part in DETAILS):
+        if ".statistics." not in name:
             shown.add_row(name, f"{value:.4g}")
     Console().print(shown)
 
