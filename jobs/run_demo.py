@@ -29,9 +29,9 @@ class Config:
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200
-    lvae_steps: int = 700
+    lvae_steps: int = 600
     lvae_batch_size: int = 4
-    dit_steps: int = 900
+    dit_steps: int = 850
     dit_batch_size: int = 8
     """Many small steps show something sooner than few large ones; so for the LVAE."""
     num_scenes: int = 48
