@@ -102,15 +102,16 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
 
 
 def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec) -> LVAELoss:
-    """The total objective of stage 1 and its parts."""
+    """The total objective of stage 1 and its parts; zero where the ground branch is left out."""
+    ground = float(output.branches != "objects")
     proposed = (output.features, output.existence_logit)
     assignment = match(*proposed, batch.features, batch.real, spec.slots, output.proposals, output.match_weights)
     existence, center, cholesky = object_losses(
         *proposed, batch.features, batch.real, assignment, spec, output.proposals
     )
     return LVAELoss(
-        occupancy=OCCUPANCY_WEIGHT * occupancy_loss(output.occupancy_logit, batch.occupied),
-        height=HEIGHT_WEIGHT * height_loss(output.height, batch.height, batch.occupied),
+        occupancy=ground * OCCUPANCY_WEIGHT * occupancy_loss(output.occupancy_logit, batch.occupied),
+        height=ground * HEIGHT_WEIGHT * height_loss(output.height, batch.height, batch.occupied),
         existence=existence,
         center=center,
         cholesky=cholesky,

@@ -143,7 +143,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         that a pole is thin and that most pixels are no road.
         """
         if self.ground_encoder:
-            start_ground(self.ground_encoder, self.ground_reader, batch.height, batch.occupied)
+            start_ground(self.ground_encoder, self._ground_start(), batch.height, batch.occupied)
         if not self.object_encoder:
             return
         groups = list(zip(batch.features.split(self.spec.slots, 1), batch.real.split(self.spec.slots, 1), strict=True))
@@ -151,19 +151,18 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         count = torch.stack([r.sum() / len(r) for _, r in groups])
         self.object_decoder.start_at(logit(features), count)
 
-    @property
-    def spec(self) -> LayoutSpec:
-        return LayoutSpec.from_dict(self.config.layout)
-
-    @property
-    def ground_reader(self) -> GroundDecoder | SimpleNamespace:
-        """The ground decoder, as one of the ground's own channels where it reads the joint latent."""
+    def _ground_start(self) -> GroundDecoder | SimpleNamespace:
+        """What `start_ground` fills: of a shortcut that reads the joint latent the ground's part, the rest is zero."""
         decoder, own = self.ground_decoder, self.config.latent_channels
-        if decoder.shortcut is None or len(decoder.shortcut.weight) == own:
+        if decoder.shortcut is None or decoder.shortcut.in_channels == own:
             return decoder
         decoder.shortcut.weight[own:] = 0
         shortcut = SimpleNamespace(weight=decoder.shortcut.weight[:own], bias=decoder.shortcut.bias)
         return SimpleNamespace(net=decoder.net, unfold=decoder.unfold, shortcut=shortcut)
+
+    @property
+    def spec(self) -> LayoutSpec:
+        return LayoutSpec.from_dict(self.config.layout)
 
     def encode(self, batch: LayoutBatch) -> Posterior:
         """Joint posterior: channel groups [ground; objects] of mean and of log-variance."""

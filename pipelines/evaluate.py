@@ -1,12 +1,12 @@
-"""Scores of any source against any other, from the tables alone: Ray Data graphs over shards, finished in numpy.
+"""Scores of any source against any other, from the tables alone: a Ray Data graph over shards, finished in numpy.
 
-Two graphs: `describe` turns every scene into statistics, validity records and picture features; `rebuild` sends
-scenes through an LVAE and back and compares. What they return adds up in any grouping.
+`describe` turns every scene into statistics, validity records and picture features; `compare` sets two such sets
+against each other. Reconstruction is scored by rebuild.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,19 +14,9 @@ import ray.data
 import torch
 
 from models.scene import CATEGORIES, Scene
-from models.tensors import EXISTENCE_THRESHOLD, ground_on_grid, layout_batch, scene_from_layout
+from models.tensors import ground_on_grid
 from pipelines.dataset import Dataset
-from pipelines.encode import gpus_per_actor, load_lvae
 from pipelines.metrics import generation, inception, statistics, validity
-from pipelines.metrics.reconstruction import (
-    GroundSums,
-    Matches,
-    detection_scores,
-    ground_scores,
-    ground_sums,
-    join_matches,
-    match_scene,
-)
 from pipelines.scenes.render import bev_picture
 from pipelines.scenes.tables import Shard, find_shards
 
@@ -185,107 +175,6 @@ def neighbourhood(real: np.ndarray, generated: np.ndarray, k: tuple[int, ...], p
         f"{prefix}{name}_k{r.k}": value
         for r in found
         for name, value in (("precision", r.precision), ("recall", r.recall))
-    }
-
-
-# ------------------------------------------------------------------------------------------------------ rebuild
-
-
-class Rebuilder:
-    """Actor. Row in: number of a selected shard. Row out: ground sums and primitive matches of its scenes."""
-
-    def __init__(self, chosen: list[tuple[Shard, list[int]]], lvae: str, batch_size: int) -> None:
-        self.chosen, self.model, self.batch_size = chosen, load_lvae(lvae), batch_size
-        self.device = "cuda" if torch.cuda.is_available() else "cpu"
-        self.model.to(self.device)
-
-    @torch.no_grad()
-    def compare(self, scenes: list[Scene]) -> Iterator[tuple[GroundSums, Matches]]:
-        """Truth against reconstruction from the latent mean, on the truth's own pixels; every slot is a detection."""
-        spec = self.model.spec
-        output = self.model.decode(self.model.encode(layout_batch(scenes, spec).to(self.device)).mean)
-        for scene, layout in zip(scenes, output.layouts(), strict=True):
-            height = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
-            everywhere = replace(
-                scene,
-                ground_classes=spec.ground_classes,
-                grid=spec.grid,
-                height_m=height,
-                occupied=np.ones_like(height, bool),
-            )
-            fine_height, _ = ground_on_grid(everywhere, spec.ground_classes, scene.grid)
-            masked = replace(everywhere, occupied=layout.occupancy > 0.5)
-            _, fine_occupied = ground_on_grid(masked, spec.ground_classes, scene.grid)
-            true_height, true_occupied = ground_on_grid(scene, spec.ground_classes, scene.grid)
-            sums = ground_sums(true_occupied, true_height, fine_occupied, fine_height)
-            yield sums, match_scene(scene, scene_from_layout(layout, spec, scene, threshold=-1.0))
-
-    def __call__(self, row: dict) -> dict:
-        shard, rows = self.chosen[row["id"]]
-        scenes, parts = shard.scenes(rows), []
-        for start in range(0, len(scenes), self.batch_size):
-            parts += self.compare(scenes[start : start + self.batch_size])
-        sums, matches = parts[0][0], join_matches([m for _, m in parts])
-        for part, _ in parts[1:]:
-            sums = sums + part
-        out = {"id": row["id"], "scenes": len(scenes)}
-        out |= {f"ground_{name}": getattr(sums, name).astype(np.float64) for name in GroundSums.__dataclass_fields__}
-        return out | {f"match_{name}": getattr(matches, name).ravel() for name in Matches.__dataclass_fields__}
-
-
-def rebuild(
-    selection: Selection,
-    lvae: str,
-    num_actors: int = 1,
-    batch_size: int = 8,
-    on_scenes: Callable[[int], None] | None = None,
-) -> dict:
-    """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), as nested plain numbers.
-
-    AP3D ranks every slot by existence (no threshold), and once more with the paper's threshold and Omni3D's 100
-    detections per category.
-    """
-    chosen = selection.shards()
-    graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
-        Rebuilder,
-        fn_constructor_args=(chosen, lvae, batch_size),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
-        num_gpus=gpus_per_actor(),
-    )
-    rows = []
-    for row in graph.iter_rows():
-        rows.append(row)
-        if on_scenes:
-            on_scenes(int(row["scenes"]))
-    rows.sort(key=lambda row: row["id"])
-    spec = load_lvae(lvae).spec
-    sums = GroundSums(
-        *(np.sum([row[f"ground_{name}"] for row in rows], axis=0) for name in GroundSums.__dataclass_fields__)
-    )
-    ground = ground_scores(sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high]))
-    matches = join_matches(
-        [
-            Matches(
-                **{name: np.asarray(row[f"match_{name}"]) for name in Matches.__dataclass_fields__}
-                | {"hit": np.asarray(row["match_hit"]).reshape(-1, 10)}
-            )
-            for row in rows
-        ]
-    )
-    ranked = detection_scores(matches)
-    kept = detection_scores(matches, max_detections=100, min_score=EXISTENCE_THRESHOLD)
-    return {
-        "scenes": sum(int(row["scenes"]) for row in rows),
-        "ground_iou": ground.iou,
-        "ground_class_iou": ground.class_iou,
-        "height_rmse_m": ground.height_rmse_m,
-        "height_mae_m": ground.height_mae_m,
-        "height_mse_normalised": ground.height_mse,
-        "ap3d": ranked.ap3d,
-        "ap3d_50": ranked.ap3d_50,
-        "category_ap3d": ranked.category_ap3d,
-        "ap3d_threshold_100": kept.ap3d,
-        "ap3d_50_threshold_100": kept.ap3d_50,
     }
 
 

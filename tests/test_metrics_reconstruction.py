@@ -1,13 +1,18 @@
 """AP3D against a literal reading of COCO's evaluation as Omni3D uses it; ground scores against plain loops."""
 
 import dataclasses
+from itertools import permutations
 
 import numpy as np
 import pytest
+from scenes import random_scene
 
+from models.layout import LayoutSpec
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, yaw_rotation
-from pipelines.metrics.iou3d import boxes_of, iou3d_matrix
+from models.tensors import layout_batch
+from pipelines.metrics.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
 from pipelines.metrics.reconstruction import (
+    MEMORY,
     SCORED,
     THRESHOLDS,
     average_precision,
@@ -17,7 +22,14 @@ from pipelines.metrics.reconstruction import (
     join_matches,
     match_greedily,
     match_scene,
+    memory_bytes,
+    pair_scores,
+    pair_sums,
+    voxel_confusion,
+    voxel_scores,
 )
+from pipelines.scenes.palette import CLASS_ID
+from pipelines.scenes.voxels import NUM_CLASSES, VoxelGrid, voxelise
 
 GRID = Grid(front_m=2.0, left_m=1.0, resolution_m=0.5, rows=4, cols=4)
 CAR, POLE, TREE = CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["pole"], CATEGORY_INDEX["vegetation_cuboid"]
@@ -175,8 +187,11 @@ def test_truncation_is_per_scene_and_category():
 
 def test_a_score_threshold_equals_dropping_the_detections():
     truths, predictions = random_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence >= 0.375) for p in predictions]
-    assert scores(truths, predictions, min_score=0.375) == scores(truths, dropped)
+    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as scene_from_layout does
+    got = scores(truths, predictions, min_score=0.375)
+    assert got == scores(truths, dropped)
+    assert list(got.at_threshold) == [f"{t:.2f}" for t in THRESHOLDS]
+    assert np.mean(list(got.at_threshold.values())) == pytest.approx(got.ap3d)
 
 
 def test_greedy_matching_takes_the_best_free_truth_and_the_later_of_equals():
@@ -224,7 +239,11 @@ def test_ground_scores_equal_plain_loops():
     assert got.iou == pytest.approx(sum(both) / sum(either))
     assert got.height_mae_m == pytest.approx(np.abs(together).mean())
     assert got.height_rmse_m == pytest.approx(np.sqrt((together**2).mean()))
-    assert got.class_height_rmse_m["road"] == pytest.approx(np.sqrt(np.mean(np.square(errors[0]))))
+    for c, name in enumerate(("road", "terrain")):
+        low, high = bounds_m[c]
+        assert got.class_height_mae_m[name] == pytest.approx(np.abs(errors[c]).mean())
+        assert got.class_height_rmse_m[name] == pytest.approx(np.sqrt(np.mean(np.square(errors[c]))))
+        assert got.class_height_mse[name] == pytest.approx(np.mean(np.square(errors[c])) / (high - low) ** 2)
     assert got.height_mse == pytest.approx(np.mean(normalised))
 
 
@@ -257,3 +276,99 @@ def test_ground_without_truth_bad_bounds_and_nan_are_refused():
         ground_sums(*rasters)
     with pytest.raises(ValueError, match="differ in shape"):
         ground_sums(*rasters[:3], rasters[3][:2])
+
+
+# ------------------------------------------------------------------------------------------ matched primitives
+
+
+def best_pairs(iou: np.ndarray) -> tuple[int, float]:
+    """Number and sum of IoU of the best one-to-one pairs, by trying all of them."""
+    if iou.shape[0] > iou.shape[1]:
+        iou = iou.T
+    ways = [iou[np.arange(iou.shape[0]), list(way)] for way in permutations(range(iou.shape[1]), iou.shape[0])]
+    best = max(ways, key=lambda found: found.sum())
+    return int((best > 0).sum()), float(best.sum())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pairs_are_the_best_of_all_assignments(seed):
+    rng = np.random.default_rng(seed)
+    category = np.repeat([CAR, POLE, ELLIPSOID], 5)
+    truth = scene(category, rng.uniform(-3, 3, (15, 3)), rng.uniform(1, 4, (15, 3)), yaw_rad=rng.uniform(-1, 1, 15))
+    kept = rng.permutation(15)[:12]
+    found = dataclasses.replace(
+        truth.select(kept), center_m=truth.center_m[kept] + rng.normal(0, 0.5, (12, 3)).astype(np.float32)
+    )
+    got = pair_sums(truth, found)
+    for c in (CAR, POLE, ELLIPSOID):
+        sides = [boxes_of(side.select(side.category == c)) for side in (found, truth)]
+        iou = (ellipsoid_iou3d_matrix if c == ELLIPSOID else iou3d_matrix)(*sides)
+        pairs, total = best_pairs(iou) if iou.size else (0, 0.0)
+        assert got.pairs[c] == pairs and got.iou[c] == pytest.approx(total)
+        assert (got.truths[c], got.predictions[c]) == (len(iou.T), len(iou))
+
+
+def test_pair_scores_by_hand():
+    truth = scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
+    found = scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D 1/3, nothing, 1
+    sums = pair_sums(truth, found)
+    got = pair_scores(sums + sums)
+    assert got.mean_iou3d == pytest.approx(1 / 3) and got.truth_iou3d == pytest.approx(1 / 9)
+    assert got.found == pytest.approx(1 / 3) and got.right == pytest.approx(1 / 2)  # of boxes: three true, two found
+    assert got.category_mean_iou3d == pytest.approx({"vehicle_small": 1 / 3, "vegetation_ellipsoid": 1})
+    assert got.category_found == pytest.approx({"vehicle_small": 0.5, "pole": 0, "vegetation_ellipsoid": 1})
+    assert got.category_right == pytest.approx({"vehicle_small": 0.5, "vegetation_ellipsoid": 1})
+
+
+def test_without_a_pair_the_mean_is_undefined_and_without_a_truth_so_is_all():
+    nothing = scene([], [])
+    got = pair_scores(pair_sums(scene([CAR], CENTERS[:1]), nothing))
+    assert got.mean_iou3d is None and got.right is None and got.found == got.truth_iou3d == 0
+    with pytest.raises(ValueError, match="no scored category"):
+        pair_scores(pair_sums(nothing, scene([CAR], CENTERS[:1])))
+
+
+# ------------------------------------------------------------------------------------------ voxels
+
+
+def test_voxel_scores_equal_plain_counting():
+    rng = np.random.default_rng(0)
+    truth, found = rng.choice([0, 0, 0, 1, 5, 9, 17], (2, 3, 12, 11, 10)).astype(np.uint8)
+    confusion = sum(voxel_confusion(t, f) for t, f in zip(truth, found, strict=True))
+    np.testing.assert_array_equal(confusion, voxel_confusion(truth, found))
+    assert confusion.shape == (NUM_CLASSES, NUM_CLASSES) and confusion.sum() == truth.size
+    assert confusion[5, 9] == ((truth == 5) & (found == 9)).sum()
+    got = voxel_scores(confusion)
+    assert got.iou == pytest.approx(((truth > 0) & (found > 0)).sum() / ((truth > 0) | (found > 0)).sum())
+    names = {name: k for name, k in CLASS_ID.items() if k in (1, 5, 9, 17)}
+    literal = {n: ((truth == k) & (found == k)).sum() / ((truth == k) | (found == k)).sum() for n, k in names.items()}
+    assert got.class_iou == pytest.approx(literal)
+    assert got.miou == pytest.approx(np.mean(list(literal.values())))
+
+
+def test_equal_voxels_score_one_and_air_is_not_scored():
+    space = VoxelGrid(GRID, -2, 2, 8)
+    voxels = voxelise(scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
+    got = voxel_scores(voxel_confusion(voxels, voxels))
+    assert got.iou == got.miou == 1 and set(got.class_iou) == {"vehicle_small", "pole"}
+    nothing = np.zeros_like(voxels)
+    assert voxel_scores(voxel_confusion(voxels, nothing)).iou == 0
+    with pytest.raises(ValueError, match="at least one filled voxel"):
+        voxel_scores(voxel_confusion(nothing, nothing))
+    with pytest.raises(ValueError, match="differ in shape"):
+        voxel_confusion(voxels, nothing[:2])
+
+
+# ------------------------------------------------------------------------------------------ memory
+
+
+def test_memory_is_the_papers_for_the_papers_layout():
+    """2.50 MB of rasters, 0.02 MB of primitives; voxels of four bytes 8.00 MB (paper, Sec. 4.2 and Tab. 1)."""
+    truth, spec = random_scene(0, n=40), LayoutSpec()
+    latent = np.zeros((64, 32, 32), np.float32)
+    got = memory_bytes(layout_batch([truth], spec), latent, voxelise(truth, VoxelGrid()))
+    found = dict(zip(MEMORY, (got / 2**20).round(2), strict=True))
+    assert found["rasters"] == 2.50 and found["vectors"] == 0.02
+    assert found["voxels_32_bit"] == 8.00 and found["voxels"] == 2.00 and found["latent"] == 0.25
+    filled = sum(min(n, slots) for n, slots in zip(truth.counts(), spec.slots, strict=True))
+    assert dict(zip(MEMORY, got, strict=True))["vectors_filled"] == filled * 9 * 4

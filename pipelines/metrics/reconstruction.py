@@ -1,4 +1,4 @@
-"""Reconstruction scores: ground IoU and height error, AP3D (paper, Sec. 4.1 Metrics, Tab. 2).
+"""Reconstruction scores: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1 Metrics, Tab. 1, 2).
 
 One record per scene, cheap to make anywhere and to add up in any grouping; one function per table turns the sum into
 numbers. Everything is accumulated over the whole dataset before it is divided.
@@ -10,12 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
+from models.layout import LayoutBatch
 from models.scene import CATEGORIES, ELLIPSOID, Scene
-from pipelines.metrics.iou3d import boxes_of, iou3d_matrix
+from pipelines.metrics.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
+from pipelines.scenes.palette import CLASS_ID, EMPTY
+from pipelines.scenes.voxels import NUM_CLASSES
 
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # IoU3D, Omni3D's ten steps
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
+MAX_DETECTIONS = 100  # per scene and category, Omni3D's default
 SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # paper: all categories but VE
 
 
@@ -64,8 +69,10 @@ class GroundScores:
     class_iou: dict[str, float]
     height_mae_m: float
     height_rmse_m: float
-    class_height_rmse_m: dict[str, float]  # of truly occupied classes
     height_mse: float  # the paper's: heights normalised to [0, 1] by the bounds
+    class_height_mae_m: dict[str, float]  # of truly occupied classes, as are the next two
+    class_height_rmse_m: dict[str, float]
+    class_height_mse: dict[str, float]
 
 
 def ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray) -> GroundScores:
@@ -83,15 +90,21 @@ def ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds
     names = np.asarray(ground_classes)
     iou = sums.intersection[seen] / sums.union[seen]
     truly = sums.pixels > 0
-    rmse_m = np.sqrt(sums.squared_m2[truly] / sums.pixels[truly])
+    mae_m, squared_m2 = (part[truly] / sums.pixels[truly] for part in (sums.absolute_m, sums.squared_m2))
+
+    def by_class(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(names[truly].tolist(), values.tolist(), strict=True))
+
     return GroundScores(
         iou=float(sums.intersection.sum() / sums.union.sum()),
         mean_iou=float(iou.mean()),
         class_iou=dict(zip(names[seen].tolist(), iou.tolist(), strict=True)),
         height_mae_m=float(sums.absolute_m.sum() / pixels),
         height_rmse_m=float(np.sqrt(sums.squared_m2.sum() / pixels)),
-        class_height_rmse_m=dict(zip(names[truly].tolist(), rmse_m.tolist(), strict=True)),
         height_mse=float((sums.squared_m2 / (high - low) ** 2).sum() / pixels),
+        class_height_mae_m=by_class(mae_m),
+        class_height_rmse_m=by_class(np.sqrt(squared_m2)),
+        class_height_mse=by_class(squared_m2 / (high - low)[truly] ** 2),
     )
 
 
@@ -108,7 +121,7 @@ class Matches:
 
     category: np.ndarray  # (d,) int8
     score: np.ndarray  # (d,) float32
-    rank: np.ndarray  # (d,) int64
+    rank: np.ndarray  # (d,) int32
     hit: np.ndarray  # (d, 10) bool: true positive at each of THRESHOLDS
     truths: np.ndarray  # (11,) int64: number of true primitives per category
 
@@ -136,7 +149,7 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
         truths[c] = len(true_index)
         category.append(np.full(len(index), c, np.int8))
         score.append(prediction.existence[index])
-        rank.append(np.arange(len(index)))
+        rank.append(np.arange(len(index), dtype=np.int32))
         hit.append(match_greedily(iou[np.ix_(index, true_index)]))
     return Matches(*map(np.concatenate, (category, score, rank, hit)), truths=truths)
 
@@ -172,16 +185,22 @@ class DetectionScores:
     category_ap3d_50: dict[str, float]
     table: dict[str, list[float]]  # (10,) average precision at each of THRESHOLDS
 
+    @property
+    def at_threshold(self) -> dict[str, float]:
+        """Mean over categories at each of THRESHOLDS."""
+        means = np.mean(list(self.table.values()), axis=0)
+        return {f"{threshold:.2f}": float(mean) for threshold, mean in zip(THRESHOLDS, means, strict=True)}
+
 
 def detection_scores(
     matches: Matches, max_detections: int | None = None, min_score: float = -np.inf
 ) -> DetectionScores:
     """AP3D and AP3D@50 as in Omni3D (paper, Sec. 4.1), over all scenes at once.
 
-    max_detections keeps the best so many per scene and category (Omni3D: 100; None: all); min_score drops detections
-    below a score. Raises ValueError if no category has a truth.
+    max_detections keeps the best so many per scene and category (Omni3D: 100; None: all); only detections with a
+    score above min_score count. Raises ValueError if no category has a truth.
     """
-    keep = matches.score >= min_score
+    keep = matches.score > min_score
     if max_detections is not None:
         keep &= matches.rank < max_detections
     table = {}
@@ -219,3 +238,142 @@ def average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
         reached = first < len(hit)
         average[t] = precision[first[reached], t].sum() / len(RECALL_POINTS)
     return average
+
+
+# ------------------------------------------------------------------------------------- IoU3D of matched primitives
+
+
+@dataclass(frozen=True)
+class PairSums:
+    """What mean IoU3D is made of, summed over scenes; all (11,), one entry per category."""
+
+    truths: np.ndarray
+    predictions: np.ndarray
+    pairs: np.ndarray  # matched ones
+    iou: np.ndarray  # sum of IoU3D over the pairs
+
+    def __add__(self, other: PairSums) -> PairSums:
+        return PairSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+
+
+def pair_sums(truth: Scene, prediction: Scene) -> PairSums:
+    """Sums of one scene. Primitives are matched one to one within their category such that the sum of their IoU3D is
+    greatest; two that do not overlap are no pair.
+
+    Boxes exactly, ellipsoids as ellipsoids by sampling (iou3d.py). Pass the predictions that are meant to be kept:
+    every one counts, whatever its existence.
+    """
+    sums = PairSums(truth.counts(), prediction.counts(), *np.zeros((2, len(CATEGORIES))))
+    for c in np.flatnonzero((sums.truths > 0) & (sums.predictions > 0)):
+        matrix = ellipsoid_iou3d_matrix if c == ELLIPSOID else iou3d_matrix
+        iou = matrix(boxes_of(prediction.select(prediction.category == c)), boxes_of(truth.select(truth.category == c)))
+        matched = iou[linear_sum_assignment(iou, maximize=True)]
+        sums.pairs[c], sums.iou[c] = (matched > 0).sum(), matched.sum()
+    return sums
+
+
+@dataclass(frozen=True)
+class PairScores:
+    """IoU3D of matched primitives in [0, 1], over all SCORED categories together and by category, VE among them.
+
+    A category without a truth, or without a pair, has no entry where its share or mean is undefined.
+    """
+
+    mean_iou3d: float | None  # over matched pairs; None if there are none
+    truth_iou3d: float  # over truths, those without a partner as 0
+    found: float  # share of truths with a partner
+    right: float | None  # share of predictions with a partner
+    category_mean_iou3d: dict[str, float]
+    category_truth_iou3d: dict[str, float]
+    category_found: dict[str, float]
+    category_right: dict[str, float]
+
+
+def pair_scores(sums: PairSums) -> PairScores:
+    """Scores of the summed scenes. Raises ValueError if no scored category has a truth."""
+    truths, predictions, pairs, iou = (getattr(sums, name) for name in PairSums.__dataclass_fields__)
+    total = [part[list(SCORED)].sum() for part in (truths, predictions, pairs, iou)]
+    if total[0] == 0:
+        raise ValueError("IoU3D of matched primitives is undefined: no scored category has a true primitive")
+
+    def by_category(part: np.ndarray, whole: np.ndarray) -> dict[str, float]:
+        return {CATEGORIES[c]: float(part[c] / whole[c]) for c in np.flatnonzero(whole)}
+
+    return PairScores(
+        mean_iou3d=float(total[3] / total[2]) if total[2] else None,
+        truth_iou3d=float(total[3] / total[0]),
+        found=float(total[2] / total[0]),
+        right=float(total[2] / total[1]) if total[1] else None,
+        category_mean_iou3d=by_category(iou, pairs),
+        category_truth_iou3d=by_category(iou, truths),
+        category_found=by_category(pairs, truths),
+        category_right=by_category(pairs, predictions),
+    )
+
+
+# --------------------------------------------------------------------------------------------------------- voxels
+
+
+def voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
+    """(classes, classes) int64 voxels by true class (rows) and predicted class, from class ids of equal shape.
+
+    Confusion matrices add up over scenes. Raises ValueError if the shapes differ.
+    """
+    if truth.shape != prediction.shape:
+        raise ValueError(f"voxel grids differ in shape: {truth.shape} and {prediction.shape}")
+    filled = np.flatnonzero((truth | prediction).reshape(-1) != EMPTY)  # half of a scene and more is air
+    pair = truth.reshape(-1).take(filled).astype(np.int16) * np.int16(NUM_CLASSES) + prediction.reshape(-1).take(filled)
+    confusion = np.bincount(pair, minlength=NUM_CLASSES**2).reshape(NUM_CLASSES, NUM_CLASSES)
+    confusion[EMPTY, EMPTY] = truth.size - len(filled)
+    return confusion
+
+
+@dataclass(frozen=True)
+class VoxelScores:
+    """Voxel scores of a dataset (paper, Tab. 1). A class that neither side ever has, has no entry."""
+
+    iou: float  # of occupancy: any class against empty
+    miou: float  # mean of the classes' own, empty left out
+    class_iou: dict[str, float]
+
+
+def voxel_scores(confusion: np.ndarray) -> VoxelScores:
+    """Scores of a dataset's summed confusion matrix. Raises ValueError if no voxel is filled on either side."""
+    hit, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
+    class_iou = {name: float(hit[k] / either[k]) for name, k in CLASS_ID.items() if either[k]}
+    if not class_iou:
+        raise ValueError("voxel scores need at least one filled voxel; all scenes are empty within the voxel grid")
+    occupied = np.arange(NUM_CLASSES) != EMPTY
+    both = confusion[np.ix_(occupied, occupied)].sum()
+    return VoxelScores(
+        iou=float(both / (confusion.sum() - confusion[EMPTY, EMPTY])),
+        miou=float(np.mean(list(class_iou.values()))),
+        class_iou=class_iou,
+    )
+
+
+# --------------------------------------------------------------------------------------------------------- memory
+
+
+MEMORY = (
+    "rasters",  # float32 tensors of heights and masks, the paper's count (its MB are 2^20 bytes)
+    "vectors",  # float32 features and flags of all slots, the paper's count
+    "vectors_filled",  # the same without empty slots
+    "latent",
+    "voxels",  # a byte per voxel
+    "voxels_32_bit",  # four, the paper's count for SemCity
+)
+
+
+def memory_bytes(layout: LayoutBatch, latent: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+    """(6,) int64 bytes of the forms MEMORY that one scene takes (paper, Tab. 1); layout is a batch of one."""
+    return np.array(
+        [
+            layout.height.nbytes + layout.occupied.nbytes,
+            layout.features.nbytes + layout.real.nbytes,
+            layout.features[layout.real].nbytes,
+            latent.nbytes,
+            voxels.nbytes,
+            voxels.astype(np.int32).nbytes,
+        ]
+    )

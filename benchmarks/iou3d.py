@@ -1,0 +1,130 @@
+"""Exact IoU3D of rotated boxes: pairs per second and errors; sampled IoU3D of ellipsoids: the same.
+
+python benchmarks/iou3d.py
+
+Cases and oracles are those of tests/test_metrics_iou3d.py: manifold3d's polytopes, and half-space intersection in
+float64 where manifold3d disagrees. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import numpy as np
+from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from scipy.spatial.transform import Rotation
+from test_metrics_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs, random_boxes, sphere_lens
+
+from models.scene import ELLIPSOID
+from pipelines.metrics.iou3d import (
+    Boxes,
+    boxes,
+    boxes_of,
+    ellipsoid_iou3d_pairs,
+    iou3d_matrix,
+    iou3d_pairs,
+    overlapping_bounds,
+)
+from pipelines.sources.town import town_drive
+
+ROUNDS = 7
+NUM_PAIRS, NUM_MANIFOLD = 100_000, 1_000
+PAPER_OBJECTS = 514
+
+
+def main() -> None:
+    print(where())
+    overlapping_pairs()
+    whole_scenes()
+    errors()
+    ellipsoids()
+
+
+def overlapping_pairs() -> None:
+    """Arbitrarily rotated boxes that truly overlap: ours against manifold3d, per pair."""
+    rng = np.random.default_rng(0)
+    a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
+    kept = np.flatnonzero(iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
+    a, b = a.take(kept), b.take(kept)
+    few = np.arange(NUM_MANIFOLD)
+    ways = {
+        "ours": lambda _: iou3d_pairs(a, b),
+        "manifold3d": lambda _: manifold_iou(a.take(few), b.take(few)),
+    }
+    seconds = interleaved(ways, ROUNDS)
+    ours, theirs = ([s / n for s in seconds[name]] for name, n in (("ours", len(kept)), ("manifold3d", len(few))))
+    rates = [[1e-3 / s for s in per_pair] for per_pair in (ours, theirs)]
+    print(f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}")  # fmt: skip
+
+
+def whole_scenes() -> None:
+    """Every predicted with every true box of a scene, most of them culled: by their bounds, and in AP3D by category."""
+    rng = np.random.default_rng(1)
+    scenes = [drive.scene(len(drive) // 2) for drive in map(town_drive, DENSE_SEEDS)]
+    truths = [(boxes_of(scene), scene.category) for scene in scenes]
+    joined = boxes(*(np.concatenate(parts) for parts in zip(*(box for box, _ in truths), strict=True)))
+    crowd = np.arange(PAPER_OBJECTS)
+    crowded = (joined.take(crowd), np.concatenate([category for _, category in truths])[crowd])
+    for name, chosen in (("dense towns", truths), (f"{PAPER_OBJECTS} boxes, several towns in one place", [crowded])):
+        sides = [(disturbed(rng, box, 0.1), box, category[:, None] == category) for box, category in chosen]
+        count = sum(len(a.size_m) * len(b.size_m) for a, b, _ in sides)
+        for kind in ("all pairs", "pairs of one category"):
+            masks = [same if kind == "pairs of one category" else np.ones_like(same) for _, _, same in sides]
+            survive = sum(
+                int(mask[overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
+            )
+            seconds = interleaved({kind: lambda _, s=sides, w=masks: [iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)]}, ROUNDS)[kind]  # fmt: skip
+            per_scene = [1e3 * s / len(sides) for s in seconds]
+            print(f"{name}, {kind}: {spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, {100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene")  # fmt: skip
+
+
+def errors() -> None:
+    """Errors of IoU against manifold3d; where that differs by more than the tolerance, half-space intersection decides."""
+    print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
+    total = wrong = 0
+    for name, (a, b) in pairs(np.random.default_rng(0)).items():
+        ours, oracle = iou3d_pairs(a, b), manifold_iou(a, b)
+        error, theirs = np.abs(ours - oracle), 0
+        for i in np.flatnonzero(~(error <= TOLERANCE)):
+            exact = halfspace_iou(a, b, i)
+            error[i] = abs(ours[i] - exact)
+            theirs += not abs(oracle[i] - exact) <= TOLERANCE
+        off = int((~(error <= TOLERANCE)).sum())
+        total, wrong = total + len(ours), wrong + off
+        print(f"{name:36s} {len(ours):5d}   {np.median(error):15.1e} {error.max():11.1e} {off:12d} {theirs:18d}")
+    print(f"{wrong} of {total} pairs off by more than {TOLERANCE:g}")
+
+
+def ellipsoids() -> None:
+    """Sampled on 4,096 points: spheres in closed form, stretched alike, which keeps IoU and makes them ellipsoids."""
+    rng, n = np.random.default_rng(2), 2_000
+    radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
+    lens = sphere_lens(*radius, distance)
+    exact = lens / (4 / 3 * np.pi * (radius**3).sum(axis=0) - lens)
+    stretch, turn = np.exp(rng.uniform(-1, 1, (n, 3))), Rotation.random(n, rng=rng).as_matrix()
+    center = np.stack([np.zeros((n, 3)), distance[:, None] * directions(rng, n)])
+    sides = [
+        Boxes(np.einsum("nij,nj->ni", turn, c * stretch), turn, 2 * r[:, None] * stretch)
+        for c, r in zip(center, radius, strict=True)
+    ]
+    error = ellipsoid_iou3d_pairs(*sides) - exact
+    seconds = interleaved({"ours": lambda _: ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
+    print(f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, root mean square {np.sqrt(np.mean(error**2)):.5f}; {spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core")  # fmt: skip
+    real = [s.select(s.category == ELLIPSOID) for s in (town_drive(seed).scene(100) for seed in DENSE_SEEDS)]
+    pair = [(boxes_of(s), disturbed(rng, boxes_of(s), 0.1)) for s in real if len(s)]
+    survive = [len(overlapping_bounds(a, b)[0]) for a, b in pair]
+    print(f"ellipsoids of dense towns: {', '.join(map(str, survive))} pairs a scene survive their bounds")
+
+
+def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    at = rng.normal(size=(n, 3))
+    return at / np.linalg.norm(at, axis=1, keepdims=True)
+
+
+if __name__ == "__main__":
+    main()

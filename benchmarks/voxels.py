@@ -1,0 +1,98 @@
+"""Voxelising a scene at 256 x 256 x 32: runs of levels against testing voxel centres primitive by primitive.
+
+python benchmarks/voxels.py
+
+The plain way is vectorised within a primitive, on the voxels of its bounds. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import replace
+
+import numpy as np
+from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from scipy.spatial.transform import Rotation
+
+from models.scene import CATEGORY_INDEX, ELLIPSOID, Scene
+from pipelines.metrics.reconstruction import voxel_confusion
+from pipelines.scenes.palette import CLASS_ID, EMPTY
+from pipelines.scenes.voxels import PRECEDENCE, VoxelGrid, voxelise
+from pipelines.sources.town import town_drive
+
+ROUNDS = 7
+PAPER_OBJECTS = 514
+
+
+def plain(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
+    """`voxelise` as one would write it first."""
+    out = np.zeros(voxels.shape, np.uint8)
+    grid = voxels.columns
+    surface, winner = scene.surface()
+    for k, name in enumerate(scene.ground_classes):
+        row, col = np.nonzero(winner == k)
+        level = np.floor((surface[row, col].astype(np.float64) - voxels.bottom_m) / voxels.step_m).astype(int)
+        inside = (level >= 0) & (level < voxels.levels)
+        out[row[inside], col[inside], level[inside]] = CLASS_ID[name]
+    x, y, z = grid.x_m(), grid.y_m(), voxels.z_m()
+    for name in reversed(PRECEDENCE):
+        for i in np.flatnonzero(scene.category == CATEGORY_INDEX[name]):
+            center, rotation = scene.center_m[i].astype(float), scene.rotation[i].astype(float)
+            half = scene.size_m[i].astype(float) / 2
+            reach = np.abs(rotation) @ half
+            at = [np.flatnonzero(np.abs(axis - c) <= r) for axis, c, r in zip((x, y, z), center, reach, strict=True)]
+            offset = np.stack(np.meshgrid(x[at[0]], y[at[1]], z[at[2]], indexing="ij"), axis=-1) - center
+            local = offset @ rotation / half
+            inside = (local**2).sum(-1) <= 1 if scene.category[i] == ELLIPSOID else (np.abs(local) <= 1).all(-1)
+            part = out[np.ix_(*at)]
+            part[inside] = CLASS_ID[name]
+            out[np.ix_(*at)] = part
+    return out
+
+
+def tilted(scene: Scene, rng: np.random.Generator) -> Scene:
+    """The scene with every primitive leaning by a few degrees, as decoders give them."""
+    axis = rng.normal(size=(len(scene), 3))
+    return replace(scene, rotation=(Rotation.from_rotvec(0.05 * axis).as_matrix() @ scene.rotation).astype(np.float32))
+
+
+def crowded(scenes: list[Scene]) -> Scene:
+    """Primitives of several scenes in one place, as many as the paper has slots."""
+    joined = {
+        name: np.concatenate([getattr(s, name) for s in scenes])
+        for name in ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
+    }
+    return replace(scenes[0], **joined).select(np.arange(PAPER_OBJECTS))
+
+
+def main() -> None:
+    print(where())
+    rng, voxels = np.random.default_rng(0), VoxelGrid()
+    dense = [drive.scene(len(drive) // 2) for drive in map(town_drive, DENSE_SEEDS)]
+    leaning = [tilted(scene, rng) for scene in dense]
+    for name, scenes in (
+        ("dense towns", dense),
+        ("the same, leaning", leaning),
+        (f"{PAPER_OBJECTS} primitives, several towns in one place", [crowded(leaning)]),
+    ):
+        differ = sum(int((voxelise(s, voxels) != plain(s, voxels)).sum()) for s in scenes)
+        seconds = interleaved(
+            {
+                "plain": lambda _, scenes=scenes: [plain(s, voxels) for s in scenes],
+                "ours": lambda _, scenes=scenes: [voxelise(s, voxels) for s in scenes],
+            },
+            ROUNDS,
+        )
+        per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
+        filled = np.mean([(voxelise(s, voxels) != EMPTY).mean() for s in scenes])
+        print(f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ")  # fmt: skip
+    truth, found = voxelise(dense[0], voxels), voxelise(leaning[0], voxels)
+    confusion = interleaved({"confusion": lambda _: voxel_confusion(truth, found)}, ROUNDS)["confusion"]
+    print(f"confusion matrix of two grids: {spread(confusion, 1e3, 1)} ms")
+
+
+if __name__ == "__main__":
+    main()
