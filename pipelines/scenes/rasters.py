@@ -86,7 +86,8 @@ def cast_down(
     pixel, triangle, value = _hits(triangles_m, grid)
     if layer is not None:
         pixel = pixel + np.asarray(layer, np.int64)[triangle] * (grid.rows * grid.cols)
-    height = _highest(pixel, value, grid, num_layers)
+    height = np.full((num_layers, grid.rows, grid.cols), -np.inf)
+    np.maximum.at(height.reshape(-1), pixel, value)
     hit = np.full(height.shape, -1, np.int64)
     wins = value == height.reshape(-1)[pixel]
     np.maximum.at(hit.reshape(-1), pixel[wins], triangle[wins])
@@ -94,14 +95,11 @@ def cast_down(
 
 
 def height_map(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
-    """(num_layers, H, W) float64 of `cast_down`: the heights alone, in less time."""
+    """(num_layers, H, W) float32 of `cast_down`: the heights alone, in half the memory and less time."""
     pixel, triangle, value = _hits(triangles_m, grid)
-    return _highest(pixel + np.asarray(layer, np.int64)[triangle] * (grid.rows * grid.cols), value, grid, num_layers)
-
-
-def _highest(pixel: np.ndarray, value: np.ndarray, grid: Grid, num_layers: int) -> np.ndarray:
-    height = np.full((num_layers, grid.rows, grid.cols), -np.inf)
-    np.maximum.at(height.reshape(-1), pixel, value)
+    height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
+    pixel += np.asarray(layer, np.int32)[triangle] * np.int32(grid.rows * grid.cols)
+    np.maximum.at(height.reshape(-1), pixel, value.astype(np.float32))
     return height
 
 

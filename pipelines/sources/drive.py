@@ -117,7 +117,7 @@ class MapGround:
         surface = np.full(x.shape, np.nan)
         surface[on_map] = self.raster_m[row[on_map], col[on_map]]
         surface -= pose.xyz_m[2]
-        height = np.full((num_classes, *x.shape), -np.inf)
+        height = np.full((num_classes, *x.shape), -np.inf, np.float32)
         for index, outline in zip(self.polygon_class, self.polygons_m, strict=True):
             local = pose.to_ego(np.column_stack([outline, np.zeros(len(outline))]))[:, :2]
             low, high = local.min(axis=0), local.max(axis=0)
@@ -154,8 +154,10 @@ class SurfaceGround:
 
 
 def _heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    occupied = np.isfinite(height_m)
-    return np.where(occupied, height_m, 0.0).astype(np.float32), occupied
+    """float32 heights, zero where there is none (-inf, which is overwritten), and where there is one."""
+    occupied = height_m > -np.inf
+    height_m[~occupied] = 0.0
+    return height_m.astype(np.float32, copy=False), occupied
 
 
 def _reach_m(grid: Grid) -> float:
