@@ -25,15 +25,15 @@ def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _row_spans(u: np.ndarray, v: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Column intervals of triangles per pixel row.
 
-    u, v (t, 3): row and column coordinates, in pixels, a centre at each integer. Returns the row, the triangle and
-    the low and high column coordinate of each span.
+    u, v (3, t): row and column coordinates of the corners, in pixels, a centre at each integer. Returns the row, the
+    triangle and the low and high column coordinate of each span.
     """
-    first = np.ceil(u.min(axis=1) - EDGE_PX).clip(0, rows).astype(np.int64)
-    last = np.floor(u.max(axis=1) + EDGE_PX).clip(-1, rows - 1).astype(np.int64)
+    first = np.ceil(u.min(axis=0) - EDGE_PX).clip(0, rows).astype(np.int64)
+    last = np.floor(u.max(axis=0) + EDGE_PX).clip(-1, rows - 1).astype(np.int64)
     row, triangle = ranges(first, (last - first + 1).clip(0))
     low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        ua, ub, va, vb = u[:, a], u[:, b], v[:, a], v[:, b]
+        ua, ub, va, vb = u[a], u[b], v[a], v[b]
         level = ua == ub  # an edge along a row: its ends are those of the other two
         per_row = np.where(level, 0.0, (vb - va) / np.where(level, 1.0, ub - ua))
         top, bottom = np.minimum(ua, ub) - EDGE_PX, np.where(level, -np.inf, np.maximum(ua, ub) + EDGE_PX)
@@ -48,16 +48,15 @@ def _row_spans(u: np.ndarray, v: np.ndarray, rows: int) -> tuple[np.ndarray, np.
 
 def _hits(triangles_m: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every pixel centre under every triangle (t, 3, 3): flat pixel index, triangle and height (m,) of each."""
-    triangles_m = np.asarray(triangles_m, np.float64).reshape(-1, 3, 3)
-    u = (grid.front_m - triangles_m[:, :, 0]) / grid.resolution_m - 0.5
-    v = (grid.left_m - triangles_m[:, :, 1]) / grid.resolution_m - 0.5
-    z = triangles_m[:, :, 2]
+    x, y, z = np.ascontiguousarray(np.asarray(triangles_m, np.float64).reshape(-1, 3, 3).T)  # (3, t) each
+    u = (grid.front_m - x) / grid.resolution_m - 0.5
+    v = (grid.left_m - y) / grid.resolution_m - 0.5
     # Plane z = z0 + du (u - u0) + dv (v - v0) by Cramer's rule.
-    (u1, u2), (v1, v2), (z1, z2) = [(w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]) for w in (u, v, z)]
+    (u1, u2), (v1, v2), (z1, z2) = [(w[1] - w[0], w[2] - w[0]) for w in (u, v, z)]
     area = u1 * v2 - u2 * v1
-    seen = (np.abs(area) > 1e-9) & (u.min(1) < grid.rows) & (u.max(1) > -1) & (v.min(1) < grid.cols) & (v.max(1) > -1)
+    seen = (np.abs(area) > 1e-9) & (u.min(0) < grid.rows) & (u.max(0) > -1) & (v.min(0) < grid.cols) & (v.max(0) > -1)
     index = np.flatnonzero(seen)
-    u, v, z, area = u[index], v[index], z[index], area[index]
+    u, v, z, area = u[:, index], v[:, index], z[:, index], area[index]
     slope_u = (z1[index] * v2[index] - z2[index] * v1[index]) / area
     slope_v = (u1[index] * z2[index] - u2[index] * z1[index]) / area
 
@@ -65,11 +64,11 @@ def _hits(triangles_m: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, 
     first = np.ceil(low - EDGE_PX).clip(0, grid.cols)
     count = (np.floor(high + EDGE_PX).clip(-1, grid.cols - 1) - first + 1).clip(0)
     # Along a row the height is linear: start + slope_v col.
-    start = (z[:, 0] - slope_u * u[:, 0] - slope_v * v[:, 0])[triangle] + slope_u[triangle] * row
+    start = (z[0] - slope_u * u[0] - slope_v * v[0])[triangle] + slope_u[triangle] * row
     col, span = ranges(first.astype(np.int64), count.astype(np.int64))
     height = start[span] + slope_v[triangle][span] * col
     if np.abs(slope_u).max(initial=0) > STEEP or np.abs(slope_v).max(initial=0) > STEEP:
-        height = height.clip(z.min(axis=1)[triangle][span], z.max(axis=1)[triangle][span])
+        height = height.clip(z.min(axis=0)[triangle][span], z.max(axis=0)[triangle][span])
     return row[span] * np.int32(grid.cols) + col, index[triangle][span], height
 
 

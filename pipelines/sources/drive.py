@@ -57,10 +57,10 @@ class SlabGround:
         )
 
     @cached_property
-    def _upper(self) -> np.ndarray:
-        """The triangles without undersides: a vertical ray hits the top or a side of an extruded slab before them.
+    def _upper(self) -> tuple[np.ndarray, np.ndarray]:
+        """The triangles without undersides, and the slab of each.
 
-        A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
+        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
@@ -72,8 +72,9 @@ class SlabGround:
         same = np.abs(down_m - first_m[np.cumsum(np.diff(owner, prepend=owner[:1]) > 0)]).max(axis=1) < EXTRUSION_M
         extruded = count % 2 == 0
         extruded[owner[~same | (down_m[:, 2] >= 0)]] = False
-        underside = lower[self.triangles].all(axis=1) & extruded[self.vertex_slab[self.triangles[:, 0]]]
-        return self.triangles[~underside]
+        slab = self.vertex_slab[self.triangles[:, 0]]
+        upper = ~(lower[self.triangles].all(axis=1) & extruded[slab])
+        return self.triangles[upper], slab[upper]
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
         """height_m and occupied (G, H, W): slab tops seen from above, of slabs with a vertex inside the grid.
@@ -83,9 +84,9 @@ class SlabGround:
         local = pose.to_ego(self.vertices_m)
         inside = np.zeros(len(self.slab_class), bool)
         inside[self.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
-        triangles = self._upper[inside[self.vertex_slab[self._upper[:, 0]]]]
-        layer = self.slab_class[self.vertex_slab[triangles[:, 0]]]
-        return _heights(height_map(local[triangles], grid, layer, num_classes))
+        triangles, slab = self._upper
+        kept = np.flatnonzero(inside[slab])
+        return _heights(height_map(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes))
 
 
 @dataclass(frozen=True, eq=False)
