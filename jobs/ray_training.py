@@ -108,7 +108,9 @@ def with_scene_ids(error: NotFinite, stream: Stream) -> str:
     ids = [
         stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
     ]
-    return f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
+    return (
+        f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
+    )
 
 
 def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:
