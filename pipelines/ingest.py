@@ -26,12 +26,16 @@ from pipelines.scenes.tables import SCHEMA_VERSION, Shard
 from pipelines.sources.drive import Drive
 
 STAGING = ".staging"
-MAX_RETRIES = (
-    20  # of a task whose worker died: a killed worker is replaced, a shard that always kills its worker stops the run
-)
+# Of a task whose worker died: a killed worker is replaced, a shard that always kills its worker stops the run.
+MAX_RETRIES = 20
 
 
 # ------------------------------------------------------------------------------------------------------- pass 1
+
+
+def patient() -> dict:
+    """Remote arguments of the graphs' tasks, in the form that Ray Data keeps beyond 2.64."""
+    return {"max_retries": MAX_RETRIES}
 
 
 def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
@@ -63,7 +67,7 @@ def write_shards(tasks: list[Task], staging: str, grid: Grid) -> Iterator[dict]:
         return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
-    for row in dataset.map(write, num_cpus=1, max_retries=MAX_RETRIES).iter_rows():
+    for row in dataset.map(write, num_cpus=1, ray_remote_args_fn=patient).iter_rows():
         yield json.loads(row["manifest"])
 
 
@@ -88,7 +92,9 @@ def publish(root: str, staging: str, manifests: list[dict], statistics: Statisti
         {k: m[k] for k in ("source", "split", "number", "scenes")} | {"rejects": len(m["rejects"])} for m in manifests
     ]
     blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
-    ray.data.from_items(rows, override_num_blocks=blocks).map(move, num_cpus=1, max_retries=MAX_RETRIES).materialize()
+    ray.data.from_items(rows, override_num_blocks=blocks).map(
+        move, num_cpus=1, ray_remote_args_fn=patient
+    ).materialize()
 
 
 # ---------------------------------------------------------------------------------------------------------- run
