@@ -15,7 +15,8 @@ class GroundEncoder(nn.Module):
     """Raster maps [H; B] -> mean and log-variance of the ground latent, stacked along the channels.
 
     Blocks of fold x fold pixels first become channels (1 in the paper: no folding); then each entry of `channels` but
-    the last halves the resolution once: four entries give the paper's factor 8. With `shortcut`, the mean is the
+    the last halves the resolution once: four entries give the paper's factor 8. `attention` is the paper's, over all cells in
+    the middle of the network. With `shortcut`, the mean is the
     network's plus a linear map of the cell's pixels (`start_at`). Not in the paper.
     """
 
@@ -26,6 +27,7 @@ class GroundEncoder(nn.Module):
         channels: tuple[int, ...],
         norm_groups: int,
         fold: int,
+        attention: bool,
         shortcut: bool,
     ) -> None:
         super().__init__()
@@ -36,6 +38,7 @@ class GroundEncoder(nn.Module):
             down_block_types=("DownEncoderBlock2D",) * len(channels),
             block_out_channels=channels,
             layers_per_block=1,
+            mid_block_add_attention=attention,
             norm_num_groups=norm_groups,
             double_z=True,
         )
@@ -60,6 +63,7 @@ class GroundDecoder(nn.Module):
         channels: tuple[int, ...],
         norm_groups: int,
         fold: int,
+        attention: bool,
         shortcut: bool,
     ) -> None:
         super().__init__()
@@ -69,6 +73,7 @@ class GroundDecoder(nn.Module):
             up_block_types=("UpDecoderBlock2D",) * len(channels),
             block_out_channels=channels,
             layers_per_block=1,
+            mid_block_add_attention=attention,
             norm_num_groups=norm_groups,
         )
         self.unfold = nn.PixelShuffle(fold)

@@ -83,7 +83,8 @@ class LayoutVAE(ModelMixin, ConfigMixin):
     """Encodes layouts into a (2 c, h, w) latent and decodes them back.
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
-    (fold 2^(len(channels) - 1)). `shortcut`: a linear way past the ground networks. `decoder` is the paper's DETR or `cells`: proposals of each latent cell (cells.py).
+    (fold 2^(len(channels) - 1)). `fold`, `attention` and `shortcut`: ground.py and objects.py. `decoder` is the paper's
+    DETR or `cells`: proposals of each latent cell (cells.py).
 
     The paper's ablations: without `split_latent` both decoders read the joint latent; with `branches` ground or
     objects there is that branch alone, its latent has c channels, and the other side of a layout comes out empty.
@@ -97,6 +98,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         channels: tuple[int, ...] = (64, 128, 256, 512),
         norm_groups: int = 32,
         fold: int = 1,
+        attention: bool = True,
         width: int = 512,
         layers: int = 6,
         heads: int = 8,
@@ -119,17 +121,18 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
-            ground = (tuple(channels), norm_groups, fold, shortcut)
+            ground = (tuple(channels), norm_groups, fold, attention, shortcut)
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, *ground)
             self.ground_decoder = GroundDecoder(num_classes, seen, *ground)
             with torch.no_grad():
                 self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
         if branches != "ground":
-            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, width, layers, heads, hidden)
+            body = (size, width, layers, heads, hidden)
+            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, *body, shortcut)
             if decoder == "detr":
-                self.object_decoder = ObjectDecoder(spec.slots, seen, size, width, layers, heads, hidden, head_hidden)
+                self.object_decoder = ObjectDecoder(spec.slots, seen, *body, head_hidden)
             elif decoder == "cells":
-                self.object_decoder = CellDecoder(spec.slots, seen, size, width, layers)
+                self.object_decoder = CellDecoder(spec.slots, seen, size, head_hidden)
             else:
                 raise ValueError(f"LayoutVAE: decoder is {decoder!r}, expected 'detr' (the paper's) or 'cells'")
             with torch.no_grad():

@@ -86,7 +86,9 @@ class ObjectEncoder(nn.Module):
     """Primitives -> mean and log-variance of the object latent, by scatter-mean onto a learnable grid.
 
     A cell is the learnable grid's value plus the mean of the features that fall into it. Padded slots are masked in
-    attention and never scattered.
+    attention and never scattered. With `shortcut`, a primitive also writes into its cell what it knows of itself:
+    its place in the cell, shape and category through a small network of its own, past the transformer, whose norms
+    blur numbers. Not in the paper.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class ObjectEncoder(nn.Module):
         layers: int,
         heads: int,
         hidden: int,
+        shortcut: bool = False,
     ) -> None:
         super().__init__()
         slot_category = torch.tensor([category for category, count in enumerate(slots) for _ in range(count)])
@@ -107,6 +110,15 @@ class ObjectEncoder(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(width, heads, hidden) for _ in range(layers))
         self.project_out = nn.Linear(width, 2 * latent_channels)
         self.grid = nn.Parameter(torch.zeros(2 * latent_channels, latent_size, latent_size))
+        self.shortcut = None
+        if shortcut:
+            self.shortcut = nn.Sequential(
+                nn.Linear(FEATURES + CATEGORY_EMBEDDING, width),
+                nn.SiLU(),
+                nn.Linear(width, width),
+                nn.SiLU(),
+                nn.Linear(width, latent_channels),
+            )
 
     def forward(
         self, features: Float[Tensor, "batch n 9"], real: Bool[Tensor, "batch n"]
@@ -121,13 +133,23 @@ class ObjectEncoder(nn.Module):
         visible[:, 0] |= ~real.any(dim=1)
         for layer in self.layers:
             x = layer(x, visible)
-        x = self.project_out(x) * real[..., None]  # (b, n, moments)
+        x = self.project_out(x)  # (b, n, moments)
         row, col = grid_cells(features[..., :3], rows, cols)
+        if self.shortcut is not None:
+            mean, logvar = x.chunk(2, dim=-1)
+            x = torch.cat([mean + self.shortcut(self.seen_from_cell(features, row, col, category)), logvar], dim=-1)
+        x = x * real[..., None]
         cell = row * cols + col  # (b, n)
         total = x.new_zeros(batch, rows * cols, moments).scatter_add_(1, cell[..., None].expand(-1, -1, moments), x)
         count = x.new_zeros(batch, rows * cols).scatter_add_(1, cell, real.to(x.dtype))
         mean = total / count.clamp(min=1)[..., None]
         return self.grid + mean.transpose(1, 2).unflatten(2, (rows, cols))
+
+    def seen_from_cell(self, features: Tensor, row: Tensor, col: Tensor, category: Tensor) -> Tensor:
+        """(b, n, 19): centre from the middle of its cell, in cells; the rest of the features in [-2, 2]; category."""
+        _, rows, cols = self.grid.shape
+        down, right = (1 - features[..., 0]) * rows - row - 0.5, (1 - features[..., 1]) * cols - col - 0.5
+        return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, category], dim=-1)
 
     def without_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features, padding flags and categories with real primitives first, cut to the fullest scene of the batch.

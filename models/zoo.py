@@ -24,7 +24,8 @@ class LVAEPreset:
     batch_size: int
     steps: int
     decoder: str = "detr"  # the paper's, or "cells"
-    shortcut: bool = False  # a linear way past the ground networks; not in the paper
+    attention: bool = True  # in the middle of the ground networks
+    shortcut: bool = False  # ways past the ground networks and the object encoder; not in the paper
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-5
     weight_decay: float = 5e-4

@@ -150,6 +150,21 @@ def test_cell_proposals_lie_in_and_around_their_cell():
     assert (first[..., 1] - middle[None, :]).abs().max() <= 1 / 8 + 1e-6
 
 
+def test_the_object_shortcut_moves_with_its_cell():
+    encoder = small_lvae(shortcut=True).object_encoder
+    torch.nn.init.zeros_(encoder.project_out.weight)
+    features = torch.full((2, sum(small_spec().slots), 9), 0.3)
+    features[1, 0, :2] += torch.tensor(
+        [2 / 8, -1 / 8]
+    )  # two cells ahead, one to the right: to a lower row, a higher column
+    real = torch.zeros(features.shape[:2], dtype=torch.bool)
+    real[:, 0] = True
+    with torch.no_grad():
+        here, there = encoder(features, real)[:, :4] - encoder.grid[:4]
+    assert here[:, 5, 5].abs().max() > 0.01 and here.count_nonzero() == 4 == there.count_nonzero()
+    assert torch.allclose(here[:, 5, 5], there[:, 3, 6], atol=1e-5)
+
+
 def test_outputs_start_at_the_means_of_the_data():
     batch = layout_batch([random_scene(i) for i in range(8)], small_spec())
     for decoder in ("detr", "cells"):
