@@ -56,7 +56,7 @@ class Branches:
     """The layout VAE whole, without latent split, without objects and without ground: equally many steps each."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """smoke, town, kitti360 or av2."""
+    """smoke, demo, town, kitti360 or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0

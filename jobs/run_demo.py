@@ -25,7 +25,7 @@ CHECKPOINTS = 8  # per training run: each also validates and draws
 class Config:
     output: str = "runs/demo"
     """Where everything goes: data, runs, models, MLflow, report.html."""
-    preset: str = "town"
+    preset: str = "demo"
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200

@@ -27,7 +27,7 @@ class Config:
     """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """smoke, town, kitti360, kitti360-l, kitti360-xl or av2."""
+    """smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     latents: str = ""

@@ -34,7 +34,7 @@ class CellDecoder(nn.Module):
         cells = latent_size**2
         self.per_cell = tuple(min(MAX_PER_CELL, max(1, math.ceil(4 * count / cells))) for count in slots)
         self.proposals = tuple(count * cells for count in self.per_cell)
-        self.match_weights = MatchWeights(existence=1.0, center=3.0 * latent_size)
+        self.match_weights = MatchWeights(existence=1.0)
         self.net = nn.Sequential(
             nn.Linear(latent_channels, hidden),
             nn.SiLU(),

@@ -83,6 +83,14 @@ class LayoutSpec:
         extent_m = self.grid.rows * self.grid.resolution_m
         return replace(self, grid=replace(self.grid, rows=pixels, cols=pixels, resolution_m=extent_m / pixels))
 
+    def feature_unit(self, length_m: float) -> tuple[float, ...]:
+        """(9,) a length in normalised features: of the centre, and of the Cholesky entries, which are roots of metres."""
+        return tuple(
+            unit / (high - low)
+            for bounds, unit in ((self.center_bounds_m, length_m), (self.cholesky_bounds, length_m**0.5))
+            for low, high in zip(bounds.low, bounds.high, strict=True)
+        )
+
     def to_dict(self) -> dict:
         return json.loads(json.dumps(asdict(self)))
 

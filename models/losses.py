@@ -104,11 +104,10 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
 def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec) -> LVAELoss:
     """The total objective of stage 1 and its parts; zero where the ground branch is left out."""
     ground = float(output.branches != "objects")
-    proposed = (output.features, output.existence_logit)
-    assignment = match(*proposed, batch.features, batch.real, spec.slots, output.proposals, output.match_weights)
-    existence, center, cholesky = object_losses(
-        *proposed, batch.features, batch.real, assignment, spec, output.proposals
-    )
+    unit = batch.features.new_tensor(output.feature_unit)
+    proposed, truth = (output.features / unit, output.existence_logit), batch.features / unit
+    assignment = match(*proposed, truth, batch.real, spec.slots, output.proposals, output.match_weights)
+    existence, center, cholesky = object_losses(*proposed, truth, batch.real, assignment, spec, output.proposals)
     return LVAELoss(
         occupancy=ground * OCCUPANCY_WEIGHT * occupancy_loss(output.occupancy_logit, batch.occupied),
         height=ground * HEIGHT_WEIGHT * height_loss(output.height, batch.height, batch.occupied),

@@ -50,6 +50,7 @@ class LayoutOutput:
     existence_logit: Float[Tensor, "batch proposals"]
     proposals: tuple[int, ...]
     match_weights: MatchWeights
+    feature_unit: tuple[float, ...] = (1.0,) * FEATURES  # normalised features are matched and compared in these
     branches: str = "both"  # which of them were decoded; the other's values are placeholders
 
     def float(self) -> LayoutOutput:
@@ -117,6 +118,13 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % factor:
             raise ValueError(f"LayoutVAE needs a square grid divisible by {factor}, got {spec.grid}")
         size, num_classes = spec.grid.rows // factor, len(spec.ground_classes)
+        # Proposals of cells say where things are to a fraction of their cell; so that losses see it too, metres count in
+        # cells. The paper's DETR, whose queries search the whole crop, is trained on normalised numbers.
+        self.feature_unit = (
+            spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
+            if decoder == "cells"
+            else (1.0,) * FEATURES
+        )
         self.latent_shape = (latent_channels * (2 if branches == "both" else 1), size, size)  # of the joint latent
         seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
@@ -182,7 +190,8 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         split = self.config.split_latent and self.config.branches == "both"
         ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
         height, occupancy_logit = self.decode_ground(ground)
-        return LayoutOutput(height, occupancy_logit, *self.decode_objects(objects), self.config.branches)
+        unit, branches = self.feature_unit, self.config.branches
+        return LayoutOutput(height, occupancy_logit, *self.decode_objects(objects), unit, branches)
 
     def decode_ground(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor]:
         """Heights and occupancy logits; nothing occupied where there is no ground branch."""

@@ -1,5 +1,5 @@
-"""Presets: one row per model size, same code on every rung. `smoke` takes seconds (tests), `town` is what two CPU
-cores can train (the demo), `kitti360` and `av2` are the paper (supplement B.2 and B.3)."""
+"""Presets: one row per model size, same code on every rung. `smoke` takes seconds (tests), `demo` and `town` are
+what two CPU cores can train in minutes and in an hour, `kitti360` and `av2` are the paper (supplement B.2 and B.3)."""
 
 from __future__ import annotations
 
@@ -40,13 +40,17 @@ class LVAEPreset:
         return {name: value for name, value in vars(self).items() if name not in training}
 
 
+QUICK = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "warmup_steps": 50, "grad_clip": 1.0}
+
 # fmt: off
 LVAE_PRESETS = {
     #                       source      px   c   channels             groups fold width layers heads hidden head batch  steps
     "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     1,   32,   1,     2,    64,    32,  4,     8,
                            learning_rate=1e-3, final_learning_rate=1e-4),
-    "town":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   128, 8,     20_000,
-                           decoder="cells", shortcut=True, learning_rate=4e-3, final_learning_rate=1e-5, warmup_steps=50, grad_clip=1.0),
+    "demo":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   256, 8,     5_000,
+                           decoder="cells", attention=False, shortcut=True, **QUICK),
+    "town":     LVAEPreset("town",      128, 32, (32,),               8,     4,   128,  2,     4,    256,   256, 8,     12_000,
+                           decoder="cells", attention=False, shortcut=True, **QUICK),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
@@ -78,6 +82,7 @@ class DiTPreset:
 DIT_PRESETS = {
     #                         lvae       patch depth width heads batch steps
     "smoke":       DiTPreset("smoke",    2,    1,    32,   2,    8,    8, normalise_latents=True, learning_rate=1e-3),
+    "demo":        DiTPreset("demo",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999),
     "town":        DiTPreset("town",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999),
     # The paper gives three days on four A100s, not a number of steps.
     "kitti360":    DiTPreset("kitti360", 2,    12,   768,  12,   256,  400_000),

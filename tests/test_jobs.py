@@ -307,7 +307,7 @@ def test_help_explains(job):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("train_lvae.py", "tiny"), "unknown preset 'tiny', expected one of: smoke, town, kitti360, av2"),
+        (("train_lvae.py", "tiny"), "unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"),
         (("train_lvae.py",), "run jobs/preprocess_scenes.py"),
         (("train_dit.py", "kitti360"), "run jobs/preprocess_scenes.py"),
         (("encode_latents.py",), "run jobs/preprocess_scenes.py"),
