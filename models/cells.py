@@ -20,19 +20,20 @@ from models.matching import MatchWeights
 
 REACH_CELLS = 0.5  # how far outside its cell a proposal's centre may lie
 MAX_PER_CELL = 4
+SPARE = 16  # proposals per slot, where MAX_PER_CELL allows them: primitives crowd
 
 
 class CellDecoder(nn.Module):
     """Object latent -> normalised features in [0, 1] and existence logits of `proposals[k]` primitives per category.
 
-    Four times as many proposals as slots where cells allow it, one to MAX_PER_CELL per cell and category. Cells are
+    SPARE times as many proposals as slots where cells allow it, one to MAX_PER_CELL per cell and category. Cells are
     read one by one, by the same small network: its neighbours know nothing of a primitive that the cell does not.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, hidden: int) -> None:
         super().__init__()
         cells = latent_size**2
-        self.per_cell = tuple(min(MAX_PER_CELL, max(1, math.ceil(4 * count / cells))) for count in slots)
+        self.per_cell = tuple(min(MAX_PER_CELL, max(1, math.ceil(SPARE * count / cells))) for count in slots)
         self.proposals = tuple(count * cells for count in self.per_cell)
         self.match_weights = MatchWeights(existence=1.0)
         self.net = nn.Sequential(

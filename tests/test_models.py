@@ -38,7 +38,7 @@ def test_paper_presets_have_the_papers_parameter_counts():
 
 
 def test_unknown_preset_lists_the_known():
-    with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, town, kitti360, av2"):
+    with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"):
         preset(LVAE_PRESETS, "tiny")
 
 
