@@ -10,8 +10,12 @@ and a rectangular assignment over the n real rows is the square problem of the p
 
 from __future__ import annotations
 
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
@@ -57,21 +61,40 @@ def match(
     """For every proposal the index of the true slot it is matched with, -1 where with padding.
 
     Per category, `proposals[k]` >= `slots[k]`; real primitives come first in their category's slots (tensors.py).
-    Raises NotFiniteError, a ValueError, for predictions that are not finite.
+    Costs are made on the tensors' device and leave it in one piece; samples are solved in threads, as scipy's solver
+    lets go of Python's lock. Raises NotFiniteError, a ValueError, for predictions that are not finite.
     """
-    assignment = torch.full(existence_logit.shape, -1, dtype=torch.long)
-    if not (torch.isfinite(features).all() and torch.isfinite(existence_logit).all()):
+    counts = torch.stack([group.sum(dim=1) for group in real.split(slots, dim=1)]).tolist()  # [category][sample]
+    first_slot, first_proposal = (np.cumsum([0, *sizes[:-1]]).tolist() for sizes in (slots, proposals))
+    costs, start, blocks = [], 0, []
+    for k, most in enumerate(map(max, counts)):
+        if most:
+            theirs, mine = (
+                slice(first_slot[k], first_slot[k] + most),
+                slice(first_proposal[k], first_proposal[k] + proposals[k]),
+            )
+            costs.append(match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs], weights).flatten())
+            blocks.append((k, most, start))
+            start += costs[-1].numel()
+    assignment = np.full(existence_logit.shape, -1)
+    if not blocks:
+        return torch.from_numpy(assignment).to(real.device)
+    flat = torch.cat(costs).cpu().double().numpy()
+    if not np.isfinite(flat).all():
         raise NotFiniteError("predicted primitives are not finite; lower the learning rate or look at this batch")
-    first_slot, first_proposal = 0, 0
-    for capacity, offered in zip(slots, proposals, strict=True):
-        theirs, mine = slice(first_slot, first_slot + capacity), slice(first_proposal, first_proposal + offered)
-        counts = real[:, theirs].sum(dim=1).tolist()
-        if most := max(counts):
-            cost = match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs][:, :most], weights)
-            cost = cost.double().cpu().numpy()
-            for sample, count in enumerate(counts):
-                if count:
-                    rows, cols = linear_sum_assignment(cost[sample, :count])
-                    assignment[sample, first_proposal + cols] = torch.from_numpy(first_slot + rows)
-        first_slot, first_proposal = theirs.stop, mine.stop
-    return assignment.to(real.device)
+
+    def solve(sample: int) -> None:
+        for k, most, start in blocks:
+            if count := counts[k][sample]:
+                first = start + sample * most * proposals[k]
+                cost = flat[first : first + count * proposals[k]].reshape(count, proposals[k])
+                rows, cols = linear_sum_assignment(cost)
+                assignment[sample, first_proposal[k] + cols] = first_slot[k] + rows
+
+    deque(_threads(torch.get_num_threads()).map(solve, range(len(assignment))), maxlen=0)
+    return torch.from_numpy(assignment).to(real.device)
+
+
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="matching")
