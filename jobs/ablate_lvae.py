@@ -3,6 +3,7 @@
 
     jobs/ablate_lvae.py encoding            Cholesky against quaternion against octahedral, on synthetic boxes
     jobs/ablate_lvae.py branches            without latent split, objects or ground, on $PRITTI_HOME/datasets/town
+    jobs/ablate_lvae.py decoders            primitives read off cells against the paper's DETR, at equal time
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --seeds 5
 
 Run it again with the same options to go on: finished trials are kept. Scores also go to MLflow.
@@ -21,6 +22,7 @@ from jobs.command import absolute, home, run, start_ray
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
     from jobs.tracking import Tracker
+    from pipelines.ablation import Variant
     from pipelines.chart import Chart
     from pipelines.report import Table
 
@@ -70,13 +72,31 @@ class Branches:
     """Ray Train workers."""
     limit: int | None = None
     """Score at most so many held-out scenes."""
+    checks: int = 4
+    """So many checkpoints and looks at held-out scenes per training."""
     name: str = "branches"
     """Of the runs. Another name is another study."""
     output: str = ""
     """Where everything goes (default: $PRITTI_HOME/ablations/<name>)."""
 
 
-Config = Annotated[Encoding, tyro.conf.subcommand("encoding")] | Annotated[Branches, tyro.conf.subcommand("branches")]
+@dataclass(frozen=True)
+class Decoders(Branches):
+    """Cells against the paper's DETR decoder, with and without the object shortcut: equally long each."""
+
+    preset: tyro.conf.Positional[str] = "demo"
+    """smoke, demo, town, kitti360 or av2."""
+    checks: int = 12
+    """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
+    name: str = "decoders"
+    """Of the runs. Another name is another study."""
+
+
+Config = (
+    Annotated[Encoding, tyro.conf.subcommand("encoding")]
+    | Annotated[Branches, tyro.conf.subcommand("branches")]
+    | Annotated[Decoders, tyro.conf.subcommand("decoders")]
+)
 
 
 # ---------------------------------------------------------------------------------------------------- encoding
@@ -137,11 +157,11 @@ def compare_encodings(config: Encoding) -> str:
     return output
 
 
-# ---------------------------------------------------------------------------------------------------- branches
+# ---------------------------------------------------------------------------------------------------- variants
 
 
-def compare_branches(config: Branches) -> str:
-    """Train and score what is missing, write the table and page, and return the directory."""
+def compare_variants(config: Branches | Decoders) -> str:
+    """Train and score what is missing, write the table, curves and page, and return the directory."""
     from jobs.tracking import Tracker
     from pipelines import ablation, storage
 
@@ -152,26 +172,33 @@ def compare_branches(config: Branches) -> str:
     claim(output, options)
     start_ray()
     tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join(output, "mlflow.json"))
-    steps, scores = config.steps or affordable_steps(config, output), []
+    scores = []
     for seed in range(config.seeds):
-        for variant in ablation.VARIANTS:
+        for variant in variants(config):
             path = storage.join(output, "runs", f"{slug(variant)}-seed{seed}.json")
             if not storage.exists(path):
-                storage.write_json(train_variant(config, variant, seed, steps, output), path)
+                storage.write_json(train_variant(config, variant, seed, output), path)
             scores.append(storage.read_json(path))
             kept = {f"{slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
             tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
-    rows = ablation.by_variant(scores)
-    table = ablation.branch_table(rows)
-    write_tables(output, "branches", rows, [table])
-    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {steps:,} steps each.", machine()]
-    html = ablation.page("Ablations of the layout VAE", "Latent split and joint training", [table], [], how)
+    rows, curves = ablation.by_variant(scores), ablation.curve_chart(scores)
+    table = ablation.variant_table(rows)
+    write_tables(output, config.name, rows, [table], curves)
+    equal = "equal time" if isinstance(config, Decoders) and not config.steps else "equally many steps"
+    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", machine()]
+    html = ablation.page("Ablations of the layout VAE", config.name, [table], [curves], how)
     publish(output, html, [table], tracker)
     return output
 
 
+def variants(config: Branches | Decoders) -> dict[str, Variant]:
+    from pipelines import ablation
+
+    return ablation.DECODERS if isinstance(config, Decoders) else ablation.BRANCHES
+
+
 def slug(variant: str) -> str:
-    return variant.replace(" ", "-")
+    return variant.replace(",", "").replace(" ", "-")
 
 
 def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps: int) -> TrainingRun:
@@ -180,8 +207,8 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
     from functools import partial
 
     from jobs.train_lvae import Config, prepare
-    from pipelines.ablation import VARIANTS
 
+    switched = variants(config)[variant]
     training = prepare(
         Config(
             preset=config.preset,
@@ -189,15 +216,16 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
             name=name,
             steps=steps,
             batch_size=config.batch_size,
+            learning_rate=switched.learning_rate,
             seed=seed,
-            checkpoint_every=max(1, steps // 4),
+            checkpoint_every=max(1, steps // config.checks),
         )
     )
     architecture, *rest = training.build.args
-    return replace(training, build=partial(training.build.func, architecture | VARIANTS[variant], *rest))
+    return replace(training, build=partial(training.build.func, architecture | switched.architecture, *rest))
 
 
-def train_variant(config: Branches, variant: str, seed: int, steps: int, output: str) -> dict:
+def train_variant(config: Branches, variant: str, seed: int, output: str) -> dict:
     """Train one variant with one seed, rebuild the held-out scenes, and return its scores."""
     import time
 
@@ -207,6 +235,8 @@ def train_variant(config: Branches, variant: str, seed: int, steps: int, output:
     from pipelines.evaluate import Selection
     from pipelines.rebuild import rebuild
 
+    timed = variant if isinstance(config, Decoders) else next(iter(variants(config)))
+    steps = config.steps or affordable_steps(config, timed, output)
     name = f"{config.name}-{slug(variant)}-seed{seed}"
     training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
     model = fit(training, config.workers, storage.join(output, "models", f"{slug(variant)}-seed{seed}"))
@@ -216,22 +246,24 @@ def train_variant(config: Branches, variant: str, seed: int, steps: int, output:
     reconstruction = rebuild(Selection(root, source, "test", config.limit), model).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
     described |= {"parameters": load_lvae(model).num_parameters(), "training_seconds": seconds}
-    return described | ablation.measured(variant, reconstruction) | {"scenes": reconstruction["scenes"]}
+    described |= {"curve": training.tracker.history("validation_ap3d"), "scenes": reconstruction["scenes"]}
+    return described | ablation.measured(variants(config)[variant], reconstruction)
 
 
-def affordable_steps(config: Branches, output: str) -> int:
-    """Steps that the full model makes in `config.minutes`: timed once, then read from the study's timing.json."""
+def affordable_steps(config: Branches, variant: str, output: str) -> int:
+    """Steps that a variant makes in `config.minutes`: timed once, then read from the study's timing-<variant>.json."""
     from dataclasses import replace
     from statistics import median
 
     from jobs.ray_training import fit
     from pipelines import storage
 
-    record = storage.join(output, "timing.json")
+    record = storage.join(output, f"timing-{slug(variant)}.json")
     if not storage.exists(record):
-        training = prepare_variant(config, "full model", f"{config.name}-timing", 0, TIMING_STEPS)
+        name = f"timing-{slug(variant)}"
+        training = prepare_variant(config, variant, f"{config.name}-{name}", 0, TIMING_STEPS)
         training = replace(training, validate=None, log_every=1)
-        fit(training, config.workers, storage.join(output, "models", "timing"))
+        fit(training, config.workers, storage.join(output, "models", name))
         rates = [value for _, value in training.tracker.history("scenes_per_second")]
         per_second = median(rates[len(rates) // 2 :]) / training.stream.batch_size  # the first steps are slow
         storage.write_json(
@@ -313,8 +345,8 @@ def machine() -> str:
     return f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, torch {torch.__version__}"
 
 
-def main(config: Encoding | Branches) -> None:
-    print(compare_encodings(config) if isinstance(config, Encoding) else compare_branches(config))
+def main(config: Encoding | Branches | Decoders) -> None:
+    print(compare_encodings(config) if isinstance(config, Encoding) else compare_variants(config))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from models.tensors import layout_batch, scene_from_layout
 from models.training import Trainer, stacked_noise
 from pipelines.encode import load_lvae
 from pipelines.feed import LatentReader
-from pipelines.metrics.reconstruction import ground_scores, ground_sums
+from pipelines.metrics.reconstruction import detection_scores, ground_scores, ground_sums, join_matches, match_scene
 from pipelines.scenes.render import bev_picture, contact_sheet
 from pipelines.scenes.tables import find_shards, read_scenes
 
@@ -43,9 +43,9 @@ class ReconstructionCheck:
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Losses, ground IoU and height error; pictures: truth above reconstruction."""
+        """Losses, ground IoU, height error and AP3D; pictures: truth above reconstruction."""
         model, scenes = trainer.averaged().eval(), list(held_out_scenes(self.root, self.source, self.count))
-        spec, sums, losses, rebuilt = model.spec, None, [], []
+        spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
             batch = layout_batch(chosen, spec).to(trainer.device)
@@ -55,8 +55,10 @@ class ReconstructionCheck:
             output, posterior = model(batch, noise)
             parts = lvae_loss(output, posterior, batch, spec).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
-            rebuilt += [scene_from_layout(x, spec, s) for x, s in zip(output.layouts(), chosen, strict=True)]
-            for truth, layout in zip(zip(batch.occupied, batch.height, strict=True), output.layouts(), strict=True):
+            layouts = output.layouts()
+            for scene, layout, *truth in zip(chosen, layouts, batch.occupied, batch.height, strict=True):
+                rebuilt.append(scene_from_layout(layout, spec, scene))
+                matches.append(match_scene(scene, scene_from_layout(layout, spec, scene, threshold=-1.0)))
                 occupied, height = (v.cpu().numpy() for v in truth)
                 height_m = [spec.height_bounds_m.restore(h[..., None])[..., 0] for h in (height, layout.height)]
                 part = ground_sums(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
@@ -67,6 +69,7 @@ class ReconstructionCheck:
         )
         metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
         metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
+        metrics |= {"validation_ap3d": detection_scores(join_matches(matches)).ap3d}
         pictures = [bev_picture(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
         return metrics, {"reconstruction": contact_sheet(pictures, columns=min(SHOWN, len(scenes)))}
 

@@ -207,26 +207,41 @@ def yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[fl
 
 # ----------------------------------------------------------------------------------------------------- branches
 
-VARIANTS = {
-    "full model": {},
-    "without latent split": {"split_latent": False},
-    "without objects": {"branches": "ground"},
-    "without ground": {"branches": "objects"},
+
+@dataclass(frozen=True)
+class Variant:
+    """What differs from the preset: entries of its architecture, and where given the learning rate."""
+
+    architecture: Mapping[str, object]
+    learning_rate: float | None = None
+
+
+BRANCHES = {
+    "full model": Variant({}),
+    "without latent split": Variant({"split_latent": False}),
+    "without objects": Variant({"branches": "ground"}),
+    "without ground": Variant({"branches": "objects"}),
+}
+# The paper's decoder between the same branches and latents. It does not bear the cells' learning rate.
+DECODERS = {
+    "cells": Variant({"decoder": "cells"}),
+    "DETR": Variant({"decoder": "detr"}, learning_rate=5e-4),
+    "DETR, no shortcut": Variant({"decoder": "detr", "shortcut": False}, learning_rate=5e-4),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
 MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
 
 
-def measured(variant: str, reconstruction: Mapping) -> dict[str, float | None]:
+def measured(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
     """The scores of `rebuild.rebuild` that mean something for a variant; None for the branch that it lacks."""
-    kept = VARIANTS[variant].get("branches", "both")
+    kept = variant.architecture.get("branches", "both")
     return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
 
 
 def by_variant(scores: Iterable[dict]) -> list[dict]:
     """Mean, lowest and highest of each measure over seeds, per variant."""
     rows, scores = [], list(scores)
-    for variant in VARIANTS:
+    for variant in dict.fromkeys(row["variant"] for row in scores):
         found = [row for row in scores if row["variant"] == variant]
         if not found:
             continue
@@ -284,21 +299,35 @@ def yaw_table(rows: Sequence[dict]) -> Table:
     return Table("What the angle costs", columns, cells, note=note)
 
 
-def branch_table(rows: Sequence[dict]) -> Table:
-    names = ("ground_iou", "height_mse_normalised", "ap3d")
-    columns = ["variant", "seeds", "steps"]
-    for name in ("ground IoU, %", "height MSE x 100", "AP3D, %"):
+def variant_table(rows: Sequence[dict]) -> Table:
+    names = {
+        "ground_iou": "ground IoU, %",
+        "height_mse_normalised": "height MSE x 100",
+        "ap3d": "AP3D, %",
+        "ap3d_50": "AP3D@50, %",
+    }
+    columns = ["variant", "seeds", "steps", "minutes"]
+    for name in names.values():
         columns += [name, "lowest", "highest"]
-    scale = {"ground_iou": 100, "height_mse_normalised": 100, "ap3d": 100}
     cells = []
     for row in rows:
-        cell: list = [row["variant"], row["seeds"], row["steps"]]
+        cell: list = [row["variant"], row["seeds"], row["steps"], round(row["training_seconds"] / 60, 1)]
         for name in names:
             values = [row[f"{name}_{way}"] for way in ("mean", "min", "max")]
-            cell += [None if v is None else round(scale[name] * v, 3) for v in values]
+            cell += [None if v is None else round(100 * v, 3) for v in values]
         cells.append(cell)
-    note = "Mean, lowest and highest over seeds, of scenes rebuilt from the latent mean. Every variant makes the same number of steps."
-    return Table("Branches and latent split", columns, cells, note=note)
+    note = "Mean, lowest and highest over seeds, of scenes rebuilt from the latent mean."
+    return Table("Variants of the layout VAE", columns, cells, note=note)
+
+
+def curve_chart(scores: Sequence[dict]) -> Chart:
+    """AP3D on the first held-out scenes while training, against minutes: a line per variant and seed."""
+    series = {}
+    for row in scores:
+        per_step = row["training_seconds"] / 60 / row["steps"]
+        steps, values = zip(*row["curve"], strict=True) if row["curve"] else ((), ())
+        series[f"{row['variant']}, seed {row['seed']}"] = ([per_step * step for step in steps], values)
+    return Chart("AP3D while training", series, "minutes", "AP3D of 32 held-out scenes")
 
 
 def _rounded(value: float | str | None) -> float | str | None:

@@ -1,19 +1,24 @@
-"""Tables -> training batches, by Ray Data, in an order that depends on the seed alone.
+"""Tables -> training batches, read ahead by Ray tasks, in an order that depends on the seed alone.
 
 The stream of samples is fixed before anything is read: epoch after epoch, shards in random order, rows shuffled
 within a window of a few shards. Every worker knows from its rank and the step which rows it needs, so that a resumed
 run goes on with the very next batch and two workers see what one would have seen.
+
+Not by Ray Data: its executor lives in the training process and, while finished blocks wait to be consumed, polls
+without a pause. With Python's lock in its hands that made steps on two cores four times as long (BENCHMARKS.md).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 import pyarrow as pa
-import ray.data
+import ray
 
 from models.augment import Augmentation
 from models.layout import LayoutSpec
@@ -24,6 +29,7 @@ from pipelines.scenes.tables import Shard, category_indices, fixed_lists, ground
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
+AHEAD = 2  # tasks under way or done while the samples of another are consumed
 READER_CPUS = 0.5  # leaves room beside a training worker on two cores: more would wait for each other for ever
 
 Arrays = dict[str, np.ndarray]
@@ -89,29 +95,25 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 def batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
-    """Local batches of steps start_step .. stop_step - 1 for one worker: a Ray Data pipeline that reads ahead.
+    """Local batches of steps start_step .. stop_step - 1 for one worker; Ray tasks read AHEAD of them.
 
-    Raises ValueError if the global batch does not divide by the number of workers.
+    Arrays are read-only. Raises ValueError if the global batch does not divide by the number of workers.
     """
     batch = stream.batch_size
     if batch % world:
         raise ValueError(f"batch size {batch} does not divide by {world} workers")
-    per_task = max(1, SAMPLES_PER_TASK // batch)
-    num_tasks = -(-(stop_step - start_step) // per_task)
-    if num_tasks <= 0:
-        return
-
-    def read_task(row: dict) -> Arrays:
-        """Row in: number of a task. Rows out: its samples, in order."""
-        first = start_step + int(row["id"][0]) * per_task
-        return read_samples(stream, read, first, min(per_task, stop_step - first), batch, rank, world)
-
-    context = ray.data.DataContext.get_current()
-    context.execution_options.preserve_order = True
-    context.enable_progress_bars = False
-    dataset = ray.data.range(num_tasks, override_num_blocks=num_tasks)
-    dataset = dataset.map_batches(read_task, batch_size=None, batch_format="numpy", num_cpus=READER_CPUS)
-    yield from dataset.iter_batches(batch_size=batch // world, batch_format="numpy", prefetch_batches=2)
+    per_task, local = max(1, SAMPLES_PER_TASK // batch), batch // world
+    reader = ray.remote(num_cpus=READER_CPUS)(read_samples)
+    shared = ray.put(stream), ray.put(read)
+    firsts, reading = iter(range(start_step, stop_step, per_task)), deque()
+    while True:
+        for first in islice(firsts, 1 + AHEAD - len(reading)):
+            reading.append(reader.remote(*shared, first, min(per_task, stop_step - first), batch, rank, world))
+        if not reading:
+            return
+        samples = ray.get(reading.popleft())
+        for start in range(0, len(next(iter(samples.values()))), local):
+            yield {name: values[start : start + local] for name, values in samples.items()}
 
 
 @dataclass(frozen=True)

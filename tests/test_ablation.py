@@ -20,8 +20,9 @@ from models.scene import canonical_boxes, yaw_rotation
 from models.tensors import layout_batch, scene_from_layout
 from models.zoo import LVAE_PRESETS
 from pipelines.ablation import (
+    BRANCHES,
+    DECODERS,
     LOST_YAW_IOU3D,
-    VARIANTS,
     CentredBoxes,
     Trial,
     iou3d,
@@ -289,18 +290,21 @@ def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, 
 
 
 def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
-    from jobs.ablate_lvae import Branches, prepare_variant
+    from jobs.ablate_lvae import Branches, Decoders, prepare_variant
     from jobs.ray_training import as_tensors
     from pipelines.feed import read_samples
 
-    config = Branches(preset="smoke")
-    for variant, switch in VARIANTS.items():
+    for config, variant, switch in (
+        *((Branches(preset="smoke"), *item) for item in BRANCHES.items()),
+        *((Decoders(preset="smoke"), *item) for item in DECODERS.items()),
+    ):
         run = prepare_variant(config, variant, f"test-{variant}", seed=1, steps=3)
         trainer = run.build(torch.device("cpu"), lambda model: model)
         row = LVAE_PRESETS["smoke"]
         assert trainer.settings.steps == 3 and trainer.settings.seed == 1 == run.stream.seed
-        assert trainer.settings.learning_rate == row.learning_rate and run.stream.batch_size == row.batch_size
-        wanted = row.architecture() | switch
+        assert trainer.settings.learning_rate == (switch.learning_rate or row.learning_rate)
+        assert run.stream.batch_size == row.batch_size
+        wanted = row.architecture() | switch.architecture
         assert {name: trainer.model.config[name] for name in wanted} == wanted
         batch = as_tensors(read_samples(run.stream, run.reader, 0, 1, row.batch_size, 0, 1))
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
@@ -311,18 +315,19 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
 
     trained = []
 
-    def train_variant(config, variant, seed, steps, output):
+    def train_variant(config, variant, seed, output):
         trained.append((seed, variant))
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
-        described = {"variant": variant, "seed": seed, "steps": steps, "dataset": "DIR", "parameters": 1}
+        described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": "DIR", "parameters": 1}
         reconstruction = scores | {"ap3d": 0.5, "ap3d_50": 0.25}
-        return described | {"training_seconds": 1.0} | measured(variant, reconstruction)
+        described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
+        return described | measured(BRANCHES[variant], reconstruction)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
-    output = job.compare_branches(job.Branches(preset="smoke", steps=7, seeds=2))
-    assert trained == [(seed, variant) for seed in (0, 1) for variant in VARIANTS]
-    job.compare_branches(job.Branches(preset="smoke", steps=7, seeds=3))
-    assert trained[8:] == [(2, variant) for variant in VARIANTS]
+    output = job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=2))
+    assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCHES]
+    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=3))
+    assert trained[8:] == [(2, variant) for variant in BRANCHES]
     rows = {row["variant"]: row for row in json.loads((Path(output) / "branches.json").read_text())["rows"]}
     full, bare = rows["full model"], rows["without ground"]
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
@@ -330,4 +335,4 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
     assert "without latent split" in capsys.readouterr().out
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
-        job.compare_branches(job.Branches(preset="smoke", steps=8, seeds=2))
+        job.compare_variants(job.Branches(preset="smoke", steps=8, seeds=2))
