@@ -8,7 +8,8 @@ from jobs.ray_training import with_scene_ids
 from models.augment import Augmentation
 from models.tensors import compact_layout
 from models.training import NotFinite
-from pipelines.feed import LayoutReader, Stream, read_samples
+from pipelines import feed
+from pipelines.feed import LayoutReader, Stream, batches, read_samples
 from pipelines.scenes.tables import Shard
 
 COUNTS = (5, 3, 7, 4, 6)
@@ -49,6 +50,19 @@ def test_two_workers_read_what_one_would(shards, augment):
     for name, value in one.items():
         together = np.stack([part[name].reshape(4, 2, *value.shape[1:]) for part in two], axis=1)
         assert np.array_equal(together.reshape(value.shape), value), name
+
+
+def test_batches_are_read_ahead_and_come_in_order(shards, cluster, monkeypatch):
+    monkeypatch.setattr(feed, "SAMPLES_PER_TASK", 8)  # two steps a task
+    reader, stream = LayoutReader(small_spec(32)), Stream(shards, COUNTS, 4, seed=0)
+    got = list(batches(stream, reader, start_step=3, stop_step=14, rank=1, world=2))
+    assert len(got) == 11
+    for step, batch in enumerate(got, 3):
+        for name, value in read_samples(stream, reader, step, 1, 4, 1, 2).items():
+            assert np.array_equal(batch[name], value), (step, name)
+    assert not list(batches(stream, reader, 5, 5))
+    with pytest.raises(ValueError, match="batch size 4 does not divide by 3 workers"):
+        next(batches(stream, reader, 0, 1, 0, 3))
 
 
 def test_a_broken_loss_names_its_scenes(shards):
