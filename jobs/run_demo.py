@@ -30,10 +30,10 @@ class Config:
     num_train: int = 1200
     num_test: int = 200
     lvae_steps: int = 600
-    lvae_batch_size: int = 4
-    dit_steps: int = 850
+    lvae_batch_size: int = 8
+    dit_steps: int = 2000
     dit_batch_size: int = 8
-    """Many small steps show something sooner than few large ones; so for the LVAE."""
+    """Many small steps show something sooner than few large ones."""
     num_scenes: int = 48
     """Scenes to generate."""
     sampling_steps: int = 100
