@@ -27,14 +27,16 @@ def where() -> str:
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}, commit {commit}{'+' if dirty else ''}"
 
 
-def interleaved(ways: dict[str, Callable[[int], object]], rounds: int) -> dict[str, list[float]]:
-    """CPU seconds of each way per round, in turn, so that a busy machine slows all alike. Each is called with the round."""
+def interleaved(
+    ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
+) -> dict[str, list[float]]:
+    """CPU seconds (or `clock`'s) of each way per round, in turn: a busy machine slows all alike. Called with the round."""
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for k in range(rounds):
         for name, way in ways.items():
-            start = time.process_time()
+            start = clock()
             way(k)
-            seconds[name].append(time.process_time() - start)
+            seconds[name].append(clock() - start)
     return seconds
 
 
