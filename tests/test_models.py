@@ -10,11 +10,12 @@ from scipy.optimize import linear_sum_assignment
 
 from models.dit import DiT
 from models.ground import reduced_rank_regression
-from models.layout import LayoutSpec
+from models.layout import LayoutBatch, LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
 from models.matching import MatchWeights, match
-from models.tensors import layout_batch
+from models.tensors import compact_layout, layout_batch
+from models.training import Execution, Optimisation, lvae_trainer
 from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
 
 
@@ -269,6 +270,27 @@ def test_lvae_overfits_one_batch(decoder):
     assert losses[-1] < 0.25 * losses[0]
     ground = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
     assert ground.float().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "execution", [Execution(precision="bf16"), Execution(accumulate=2), Execution(accumulate=4, precision="bf16")]
+)
+def test_the_lvaes_step_is_the_same_in_halves_and_in_bf16(execution):
+    """First the loss of equal weights, then, after steps of its own kind, a loss that has come down as far."""
+    spec = small_spec()
+    layouts = [compact_layout(random_scene(i, n=20), spec) for i in range(4)]
+    arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
+    losses = {}
+    for way in (Execution(precision="fp32"), execution):
+        lvae = small_lvae(decoder="cells", shortcut=True)
+        lvae.start_at(LayoutBatch.from_compact(arrays))
+        settings = Optimisation(steps=20, learning_rate=3e-3, weight_decay=0.0)
+        trainer = lvae_trainer(lvae, settings, torch.device("cpu"), lambda model: model, way)
+        losses[way] = [float(trainer.step(arrays, range(4))["loss"]) for _ in range(20)]
+        assert all(p.dtype == torch.float32 for p in lvae.parameters())
+    plain, other = losses.values()
+    assert np.isclose(other[0], plain[0], rtol=1e-2 if execution.precision == "bf16" else 1e-5)
+    assert plain[-1] < 0.9 * plain[0] and np.isclose(other[-1], plain[-1], rtol=0.1)
 
 
 def test_dit_is_conditioned_and_starts_at_zero():
