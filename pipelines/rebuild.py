@@ -112,7 +112,8 @@ def unstacked(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, Deco
 class SceneRecord:
     """Everything that reconstruction scores are made of, of one scene."""
 
-    ground: GroundSums
+    ground: GroundSums  # on the truth's pixels
+    raster: GroundSums  # on the model's own, to which the truth is resampled
     matches: Matches
     pairs: PairSums
     confusion: np.ndarray  # (classes, classes) voxels
@@ -122,7 +123,7 @@ class SceneRecord:
     def to_row(self) -> dict:
         """Flat arrays, for Arrow."""
         out = {"confusion": self.confusion.ravel(), "memory": self.memory}
-        for part in ("ground", "matches", "pairs", "outside"):
+        for part in ("ground", "raster", "matches", "pairs", "outside"):
             value = getattr(self, part)
             out |= {f"{part}_{name}": np.ravel(getattr(value, name)) for name in value.__dataclass_fields__}
         return out
@@ -135,6 +136,7 @@ class SceneRecord:
 
         return cls(
             ground=part("ground", GroundSums),
+            raster=part("raster", GroundSums),
             matches=part("matches", Matches, hit=(-1, len(THRESHOLDS))),
             pairs=part("pairs", PairSums),
             confusion=np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES),
@@ -146,20 +148,22 @@ class SceneRecord:
 def scene_record(
     truth: Scene, layout: DecodedLayout, latent: np.ndarray, spec: LayoutSpec, voxels: VoxelGrid
 ) -> SceneRecord:
-    """A scene against its reconstruction, on the truth's own pixels.
+    """A scene against its reconstruction; the ground on the truth's pixels and on the model's.
 
     Every true primitive counts, those too that had no slot. AP3D ranks every proposal; pairs and voxels are those of
     the scene that the decoder means, above the existence threshold.
     """
-    height_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
+    decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     rebuilt = scene_from_layout(layout, spec, truth)
-    everywhere = replace(rebuilt, height_m=height_m, occupied=np.ones_like(rebuilt.occupied))
+    everywhere = replace(rebuilt, height_m=decoded_m, occupied=np.ones_like(rebuilt.occupied))
     true_height_m, true_occupied = ground_on_grid(truth, spec.ground_classes, truth.grid)
     _, occupied = ground_on_grid(rebuilt, spec.ground_classes, truth.grid)
     height_m, _ = ground_on_grid(everywhere, spec.ground_classes, truth.grid)
+    coarse_height_m, coarse_occupied = ground_on_grid(truth, spec.ground_classes, spec.grid)
     true_voxels = voxelise(truth, voxels)
     return SceneRecord(
         ground=ground_sums(true_occupied, true_height_m, occupied, height_m),
+        raster=ground_sums(coarse_occupied, coarse_height_m, rebuilt.occupied, decoded_m),
         matches=match_scene(truth, scene_from_layout(layout, spec, truth, threshold=-1.0)),
         pairs=pair_sums(truth, rebuilt),
         confusion=voxel_confusion(true_voxels, voxelise(rebuilt, voxels)),
@@ -254,7 +258,10 @@ def draw(places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable
 def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
     """Scores of all scenes together, as nested plain numbers; per class or category under names that say so."""
     low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
-    ground = ground_scores(_sum(r.ground for r in records), spec.ground_classes, np.array([*low, *high]))
+    ground, raster = (
+        ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
+        for parts in ((r.ground for r in records), (r.raster for r in records))
+    )
     matches = join_matches([r.matches for r in records])
     detection = {name: detection_scores(matches, **options) for name, options in AP_VARIANTS.items()}
     left_out = _sum(r.outside for r in records)
@@ -263,6 +270,8 @@ def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: 
     return {
         "scenes": len(records),
         "raster_px": spec.grid.rows,
+        "raster_ground_iou": raster.iou,
+        "raster_height_rmse_m": raster.height_rmse_m,
         "ground_iou": ground.iou,
         "ground_mean_iou": ground.mean_iou,
         "height_mae_m": ground.height_mae_m,

@@ -136,7 +136,8 @@ def overall(scores: Mapping) -> Table:
     voxels, matched, memory = scores["voxels"], scores["matched"], scores["memory_bytes"]
     bounds = scores["height_bounds_m"]
     rows = [
-        ("ground IoU", scores["ground_iou"], PAPER["ground_iou"], "pixels on which both sides have a class, over those on which either has; all classes together"),
+        ("ground IoU", scores["ground_iou"], PAPER["ground_iou"], "the truth's pixels on which both sides have a class, over those on which either has; all classes together"),
+        ("ground IoU on the model's pixels", scores["raster_ground_iou"], None, f"the truth resampled to the model's rasters of {scores['raster_px']} x {scores['raster_px']}: what their resolution costs is left out"),
         ("height RMSE, m", scores["height_rmse_m"], None, "over truly occupied pixels"),
         ("height MAE, m", scores["height_mae_m"], None, "over truly occupied pixels"),
         (

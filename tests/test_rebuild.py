@@ -64,6 +64,14 @@ def test_a_perfect_decoder_scores_one():
     assert got["truths"] == {k: v for k, v in got["truths"].items() if v} and sum(got["truths"].values()) == 120
 
 
+def test_what_a_coarse_raster_costs_is_told_apart():
+    coarse, scenes = SPEC.with_resolution(SPEC.grid.rows // 2), [random_scene(k, n=30) for k in range(2)]
+    records = [record(s, perfect(s, coarse), coarse) for s in scenes]
+    got = reconstruction_scores(records, coarse, voxel_grid(coarse))
+    assert got["raster_px"] == coarse.grid.rows and got["raster_ground_iou"] == 1 > got["ground_iou"] > 0.5
+    assert got["raster_height_rmse_m"] < 1e-4
+
+
 def test_ground_errors_are_metres_over_truly_occupied_pixels():
     scene = random_scene(0, n=30)
     exact = perfect(scene, SPEC)
