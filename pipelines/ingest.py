@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
 import ray
 import ray.data
+from ray.util.annotations import RayDeprecationWarning
 
 from models.scene import Grid
 from pipelines import storage
@@ -33,9 +35,11 @@ MAX_RETRIES = 20
 # ------------------------------------------------------------------------------------------------------- pass 1
 
 
-def patient() -> dict:
-    """Remote arguments of the graphs' tasks, in the form that Ray Data keeps beyond 2.64."""
-    return {"max_retries": MAX_RETRIES}
+def per_row(dataset: ray.data.Dataset, function: Callable[[dict], dict]) -> ray.data.Dataset:
+    """One Ray task per row, tried again when its worker dies."""
+    with warnings.catch_warnings():  # Ray says that 2.64 will take this option in another way; 2.60 has none yet
+        warnings.simplefilter("ignore", RayDeprecationWarning)
+        return dataset.map(function, num_cpus=1, max_retries=MAX_RETRIES)
 
 
 def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
@@ -67,7 +71,7 @@ def write_shards(tasks: list[Task], staging: str, grid: Grid) -> Iterator[dict]:
         return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
-    for row in dataset.map(write, num_cpus=1, ray_remote_args_fn=patient).iter_rows():
+    for row in per_row(dataset, write).iter_rows():
         yield json.loads(row["manifest"])
 
 
@@ -92,9 +96,7 @@ def publish(root: str, staging: str, manifests: list[dict], statistics: Statisti
         {k: m[k] for k in ("source", "split", "number", "scenes")} | {"rejects": len(m["rejects"])} for m in manifests
     ]
     blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
-    ray.data.from_items(rows, override_num_blocks=blocks).map(
-        move, num_cpus=1, ray_remote_args_fn=patient
-    ).materialize()
+    per_row(ray.data.from_items(rows, override_num_blocks=blocks), move).materialize()
 
 
 # ---------------------------------------------------------------------------------------------------------- run

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -225,6 +226,7 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
             real=str(home / "datasets/smoke"),
             generated=str(samples),
             lvae=str(home / "models/lvae-smoke"),
+            pictures=0,
             output=str(tmp_path),
         )
     )
@@ -304,22 +306,31 @@ def test_help_explains(job):
     assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("train_lvae.py", "tiny"), "unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"),
-        (("train_lvae.py",), "run jobs/preprocess_scenes.py"),
-        (("train_dit.py", "kitti360"), "run jobs/preprocess_scenes.py"),
-        (("encode_latents.py",), "run jobs/preprocess_scenes.py"),
-        (("sample_scenes.py",), "run jobs/train_dit.py first"),
-        (("sample_scenes.py", "--num-scenes", "0"), "--num-scenes is 0"),
-        (("preprocess_scenes.py", "kitti360", "--input", "nowhere"), "--input nowhere: no such directory"),
-        (("preprocess_scenes.py", "av2", "--input", "tests"), "tests"),
-    ],
-)
-def test_a_mistake_is_one_clear_line(words, says, tmp_path):
-    done = command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=str(tmp_path))
+MISTAKES = {
+    ("train_lvae.py", "tiny"): "unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2",
+    ("train_lvae.py",): "run jobs/preprocess_scenes.py",
+    ("train_dit.py", "kitti360"): "run jobs/preprocess_scenes.py",
+    ("encode_latents.py",): "run jobs/preprocess_scenes.py",
+    ("sample_scenes.py",): "run jobs/train_dit.py first",
+    ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
+    ("preprocess_scenes.py", "kitti360", "--input", "nowhere"): "--input nowhere: no such directory",
+    ("preprocess_scenes.py", "av2", "--input", "tests"): "tests",
+}
+
+
+@pytest.fixture(scope="module")
+def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
+    """What the commands print; two at a time, as each takes seconds to start."""
+    empty = str(tmp_path_factory.mktemp("empty"))
+    with ThreadPoolExecutor(2) as pool:
+        done = pool.map(lambda words: command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
+        return dict(zip(MISTAKES, done, strict=True))
+
+
+@pytest.mark.parametrize("words", MISTAKES, ids=" ".join)
+def test_a_mistake_is_one_clear_line(mistakes, words):
+    done = mistakes[words]
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1 and says in lines[0], done.stderr
+    assert len(lines) == 1 and MISTAKES[words] in lines[0], done.stderr
     assert "Traceback" not in done.stderr
