@@ -29,9 +29,9 @@ class Config:
     """Model preset; smoke shows the mechanism in two minutes."""
     num_train: int = 1200
     num_test: int = 200
-    lvae_steps: int = 600
+    lvae_steps: int = 500
     lvae_batch_size: int = 8
-    dit_steps: int = 2000
+    dit_steps: int = 1300
     dit_batch_size: int = 8
     """Many small steps show something sooner than few large ones."""
     num_scenes: int = 48
