@@ -82,10 +82,12 @@ class Branches:
 
 @dataclass(frozen=True)
 class Decoders(Branches):
-    """Cells against the paper's DETR decoder, with and without the object shortcut: equally long each."""
+    """Cells against the paper's DETR decoder, with and without the shortcuts of ground and objects: equally long each."""
 
     preset: tyro.conf.Positional[str] = "demo"
     """smoke, demo, town, kitti360 or av2."""
+    minutes: float = 10.0
+    """As many steps as each variant makes in so much time on this machine, measured once."""
     checks: int = 12
     """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
     name: str = "decoders"

@@ -226,7 +226,7 @@ BRANCHES = {
 DECODERS = {
     "cells": Variant({"decoder": "cells"}),
     "DETR": Variant({"decoder": "detr"}, learning_rate=5e-4),
-    "DETR, no shortcut": Variant({"decoder": "detr", "shortcut": False}, learning_rate=5e-4),
+    "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, learning_rate=5e-4),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
 MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
