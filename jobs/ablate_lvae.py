@@ -4,6 +4,8 @@
     jobs/ablate_lvae.py encoding            Cholesky against quaternion against octahedral, on synthetic boxes
     jobs/ablate_lvae.py branches            without latent split, objects or ground, on $PRITTI_HOME/datasets/town
     jobs/ablate_lvae.py decoders            primitives read off cells against the paper's DETR, at equal time
+    jobs/ablate_lvae.py ground              how small the ground branch can be, at equal time
+    jobs/ablate_lvae.py augmentation        training scenes mirrored and moved
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --seeds 5
 
 Run it again with the same options to go on: finished trials are kept. Scores also go to MLflow.
@@ -22,6 +24,8 @@ from jobs.command import absolute, home, run, start_ray
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
     from jobs.tracking import Tracker
+    from models.layout import LayoutBatch
+    from models.lvae import LayoutVAE
     from pipelines.ablation import Variant
     from pipelines.chart import Chart
     from pipelines.report import Table
@@ -62,18 +66,21 @@ class Branches:
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
-    """As many steps as the full model makes in so much time on this machine, measured once."""
+    """As many steps as fit so much time on this machine, measured once: of the first variant for studies at equal
+    steps, of each for studies at equal time."""
     steps: int | None = None
     """So many steps instead."""
     seeds: int = 3
     """Every variant is trained with seed 0, then every variant with seed 1, and so on."""
+    only: tuple[str, ...] = ()
+    """Train and show only these variants, by name; the others can join later."""
     batch_size: int | None = None
     workers: int = 1
     """Ray Train workers."""
     limit: int | None = None
     """Score at most so many held-out scenes."""
     checks: int = 4
-    """So many checkpoints and looks at held-out scenes per training."""
+    """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
     name: str = "branches"
     """Of the runs. Another name is another study."""
     output: str = ""
@@ -86,11 +93,27 @@ class Decoders(Branches):
 
     preset: tyro.conf.Positional[str] = "demo"
     """smoke, demo, town, kitti360 or av2."""
-    minutes: float = 10.0
-    """As many steps as each variant makes in so much time on this machine, measured once."""
     checks: int = 12
     """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
     name: str = "decoders"
+    """Of the runs. Another name is another study."""
+
+
+@dataclass(frozen=True)
+class Ground(Branches):
+    """The ground branch alone, from the paper's networks down to one linear map: equally long each."""
+
+    checks: int = 8
+    """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
+    name: str = "ground"
+    """Of the runs. Another name is another study."""
+
+
+@dataclass(frozen=True)
+class Augmentation(Branches):
+    """Scenes mirrored, seen from a moved vehicle, or both: equally many steps each. Shows most on few training scenes."""
+
+    name: str = "augmentation"
     """Of the runs. Another name is another study."""
 
 
@@ -98,6 +121,8 @@ Config = (
     Annotated[Encoding, tyro.conf.subcommand("encoding")]
     | Annotated[Branches, tyro.conf.subcommand("branches")]
     | Annotated[Decoders, tyro.conf.subcommand("decoders")]
+    | Annotated[Ground, tyro.conf.subcommand("ground")]
+    | Annotated[Augmentation, tyro.conf.subcommand("augmentation")]
 )
 
 
@@ -162,21 +187,24 @@ def compare_encodings(config: Encoding) -> str:
 # ---------------------------------------------------------------------------------------------------- variants
 
 
-def compare_variants(config: Branches | Decoders) -> str:
+def compare_variants(config: Branches) -> str:
     """Train and score what is missing, write the table, curves and page, and return the directory."""
     from jobs.tracking import Tracker
+    from models.zoo import LVAE_PRESETS, preset
     from pipelines import ablation, storage
 
     output = absolute(config.output) if config.output else home("ablations", config.name)
     if config.minutes <= 0 or config.seeds < 1:
         raise ValueError(f"--minutes is {config.minutes}, --seeds {config.seeds}: expected more than 0")
-    options = {k: v for k, v in asdict(config).items() if k not in ("seeds", "workers", "output")}
+    preset(LVAE_PRESETS, config.preset)
+    chosen = variants(config)
+    options = {k: v for k, v in asdict(config).items() if k not in ("seeds", "only", "workers", "output")}
     claim(output, options)
     start_ray()
     tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join(output, "mlflow.json"))
     scores = []
     for seed in range(config.seeds):
-        for variant in variants(config):
+        for variant in chosen:
             path = storage.join(output, "runs", f"{slug(variant)}-seed{seed}.json")
             if not storage.exists(path):
                 storage.write_json(train_variant(config, variant, seed, output), path)
@@ -186,17 +214,31 @@ def compare_variants(config: Branches | Decoders) -> str:
     rows, curves = ablation.by_variant(scores), ablation.curve_chart(scores)
     table = ablation.variant_table(rows)
     write_tables(output, config.name, rows, [table], curves)
-    equal = "equal time" if isinstance(config, Decoders) and not config.steps else "equally many steps"
+    equal = "equal time" if at_equal_time(config) and not config.steps else "equally many steps"
     how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", machine()]
     html = ablation.page("Ablations of the layout VAE", config.name, [table], [curves], how)
     publish(output, html, [table], tracker)
     return output
 
 
-def variants(config: Branches | Decoders) -> dict[str, Variant]:
+def variants(config: Branches) -> dict[str, Variant]:
+    """By name, those of `--only`. Raises ValueError for a name that the study lacks."""
     from pipelines import ablation
 
-    return ablation.DECODERS if isinstance(config, Decoders) else ablation.BRANCHES
+    studies = {
+        Branches: ablation.BRANCHES,
+        Decoders: ablation.DECODERS,
+        Ground: ablation.GROUND,
+        Augmentation: ablation.AUGMENTATIONS,
+    }
+    known = studies[type(config)]
+    if unknown := set(config.only) - set(known):
+        raise ValueError(f"--only {sorted(unknown)}: expected some of {list(known)}")
+    return {name: variant for name, variant in known.items() if not config.only or name in config.only}
+
+
+def at_equal_time(config: Branches) -> bool:
+    return isinstance(config, Decoders | Ground)
 
 
 def slug(variant: str) -> str:
@@ -218,9 +260,9 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
             name=name,
             steps=steps,
             batch_size=config.batch_size,
-            learning_rate=switched.learning_rate,
             seed=seed,
             checkpoint_every=max(1, steps // config.checks),
+            **switched.options,
         )
     )
     architecture, *rest = training.build.args
@@ -230,14 +272,16 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
 def train_variant(config: Branches, variant: str, seed: int, output: str) -> dict:
     """Train one variant with one seed, rebuild the held-out scenes, and return its scores."""
     import time
+    from dataclasses import replace
 
     from jobs.ray_training import fit
+    from models.tensors import layout_batch
     from pipelines import ablation, storage
     from pipelines.encode import load_lvae
     from pipelines.evaluate import Selection
     from pipelines.rebuild import rebuild
 
-    timed = variant if isinstance(config, Decoders) else next(iter(variants(config)))
+    timed = variant if at_equal_time(config) else next(iter(variants(replace(config, only=()))))
     steps = config.steps or affordable_steps(config, timed, output)
     name = f"{config.name}-{slug(variant)}-seed{seed}"
     training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
@@ -247,9 +291,21 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     source = training.stream.shards[0].source
     reconstruction = rebuild(Selection(root, source, "test", config.limit), model).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
-    described |= {"parameters": load_lvae(model).num_parameters(), "training_seconds": seconds}
+    trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
+    described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
+    described |= {"gflops": giga_operations(trained, layout_batch(example, trained.spec))}
     described |= {"curve": training.tracker.history("validation_ap3d"), "scenes": reconstruction["scenes"]}
     return described | ablation.measured(variants(config)[variant], reconstruction)
+
+
+def giga_operations(model: LayoutVAE, batch: LayoutBatch) -> float:
+    """1e9 floating-point operations of encoding and decoding a batch, as torch counts them."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model.decode(model.encode(batch).mean)
+    return counter.get_total_flops() / 1e9
 
 
 def affordable_steps(config: Branches, variant: str, output: str) -> int:
@@ -347,7 +403,7 @@ def machine() -> str:
     return f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, torch {torch.__version__}"
 
 
-def main(config: Encoding | Branches | Decoders) -> None:
+def main(config: Encoding | Branches) -> None:
     print(compare_encodings(config) if isinstance(config, Encoding) else compare_variants(config))
 
 

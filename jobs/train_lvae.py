@@ -42,6 +42,8 @@ class Config:
     batch_size: int | None = None
     """Global batch size over all workers."""
     learning_rate: float | None = None
+    kl_weight: float | None = None
+    """Of the KL divergence, summed over the latent; the paper's 1e-6 unless the preset says otherwise."""
     accumulate: int = 1
     """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
     precision: str = "auto"
@@ -103,11 +105,20 @@ def prepare(config: Config) -> TrainingRun:
     )
     execution = Execution(config.accumulate, config.precision, config.compile)
     batch_size = row.batch_size if config.batch_size is None else config.batch_size
+    kl_weight = row.kl_weight if config.kl_weight is None else config.kl_weight
+    if kl_weight < 0:
+        raise ValueError(f"--kl-weight is {kl_weight}, expected 0 or more")
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
     identity = identity_of(
-        settings, stage="lvae", preset=config.preset, batch_size=batch_size, layout=spec.fingerprint(), dataset=root
+        settings,
+        stage="lvae",
+        preset=config.preset,
+        batch_size=batch_size,
+        kl_weight=kl_weight,
+        layout=spec.fingerprint(),
+        dataset=root,
     ) | ({"augmentation": asdict(augment)} if config.flip or config.jitter else {})
     record = claim(name, home("runs"), identity)
     parameters = identity | {"architecture": row.architecture()}
@@ -116,7 +127,13 @@ def prepare(config: Config) -> TrainingRun:
         name=name,
         storage_path=home("runs"),
         build=partial(
-            build, row.architecture(), spec.to_dict(), settings, execution, sample_layouts(shards, counts, spec)
+            build,
+            row.architecture(),
+            spec.to_dict(),
+            settings,
+            kl_weight,
+            execution,
+            sample_layouts(shards, counts, spec),
         ),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
@@ -125,7 +142,7 @@ def prepare(config: Config) -> TrainingRun:
         tracker=tracker,
         checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
-        validate=ReconstructionCheck(root, dataset.source),
+        validate=ReconstructionCheck(root, dataset.source, kl_weight),
     )
 
 
@@ -150,7 +167,7 @@ def sample_layouts(shards: list, counts: list[int], spec) -> dict:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def build(architecture: dict, layout: dict, settings, execution, sample: dict, device, wrap):
+def build(architecture: dict, layout: dict, settings, kl_weight: float, execution, sample: dict, device, wrap):
     """The Trainer of stage 1, with the same initial weights on every worker."""
     import torch
 
@@ -162,7 +179,7 @@ def build(architecture: dict, layout: dict, settings, execution, sample: dict, d
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
     model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
-    return lvae_trainer(model, settings, device, wrap, execution)
+    return lvae_trainer(model, settings, kl_weight, device, wrap, execution)
 
 
 def main(config: Config) -> None:

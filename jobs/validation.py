@@ -38,12 +38,15 @@ class ReconstructionCheck:
 
     root: str
     source: str
+    kl_weight: float
     count: int = 32
     batch: int = 8
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Losses, ground IoU, height error and AP3D; pictures: truth above reconstruction."""
+        """Losses of a sampled latent, as in training; ground IoU, height error and AP3D of the mean, as the evaluator
+        takes them; pictures: truth above reconstruction.
+        """
         model, scenes = trainer.averaged().eval(), list(held_out_scenes(self.root, self.source, self.count))
         spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
         for start in range(0, len(scenes), self.batch):
@@ -53,9 +56,9 @@ class ReconstructionCheck:
                 [keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
             )
             output, posterior = model(batch, noise)
-            parts = lvae_loss(output, posterior, batch, spec).items()
+            parts = lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
-            layouts = output.layouts()
+            layouts = model.decode(posterior.mean).layouts()
             for scene, layout, *truth in zip(chosen, layouts, batch.occupied, batch.height, strict=True):
                 rebuilt.append(scene_from_layout(layout, spec, scene))
                 matches.append(match_scene(scene, scene_from_layout(layout, spec, scene, threshold=-1.0)))

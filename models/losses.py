@@ -101,7 +101,9 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
     return -0.5 * (1 + logvar - mean.square() - logvar.exp()).sum(dim=(1, 2, 3)).mean()
 
 
-def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec) -> LVAELoss:
+def lvae_loss(
+    output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec, kl_weight: float = KL_WEIGHT
+) -> LVAELoss:
     """The total objective of stage 1 and its parts; zero where the ground branch is left out."""
     ground = float(output.branches != "objects")
     unit = batch.features.new_tensor(output.feature_unit)
@@ -114,5 +116,5 @@ def lvae_loss(output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, sp
         existence=existence,
         center=center,
         cholesky=cholesky,
-        kl=KL_WEIGHT * kl_loss(posterior),
+        kl=kl_weight * kl_loss(posterior),
     )

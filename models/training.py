@@ -94,7 +94,7 @@ def stacked_noise(generators: list[torch.Generator], shape: tuple[int, ...], dev
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 
-def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int]) -> LossFunction:
+def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float) -> LossFunction:
     """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
 
     def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
@@ -102,7 +102,7 @@ def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int]) -> LossFun
         batch = LayoutBatch.from_compact(arrays)
         output, posterior = model(batch, stacked_noise(generators, latent_shape, device))
         output, posterior = output.float(), posterior.float()
-        parts = lvae_loss(output, posterior, batch, spec).items()
+        parts = lvae_loss(output, posterior, batch, spec, kl_weight).items()
         return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
 
     return loss
@@ -274,13 +274,14 @@ Wrap = Callable[[nn.Module], nn.Module]
 def lvae_trainer(
     model: LayoutVAE,
     settings: Optimisation,
+    kl_weight: float,
     device: torch.device,
     wrap: Wrap = lambda m: m,
     execution: Execution | None = None,
 ) -> Trainer:
     execution = execution or Execution()
     model = model.to(device)
-    loss = layout_loss(model.spec, model.latent_shape)
+    loss = layout_loss(model.spec, model.latent_shape, kl_weight)
     return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
 
 

@@ -32,11 +32,12 @@ class LVAEPreset:
     warmup_steps: int = 0
     grad_clip: float | None = None
     ema_decay: float | None = None
+    kl_weight: float = 1e-6  # of the sum over the latent
 
     def architecture(self) -> dict:
         """Keyword arguments of `LayoutVAE` apart from the layout."""
         training = ("source", "raster_px", "batch_size", "steps", "learning_rate", "final_learning_rate")
-        training += ("weight_decay", "warmup_steps", "grad_clip", "ema_decay")
+        training += ("weight_decay", "warmup_steps", "grad_clip", "ema_decay", "kl_weight")
         return {name: value for name, value in vars(self).items() if name not in training}
 
 
@@ -49,8 +50,8 @@ LVAE_PRESETS = {
                            learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   256, 8,     5_000,
                            decoder="cells", attention=False, shortcut=True, **QUICK),
-    "town":     LVAEPreset("town",      128, 32, (32,),               8,     4,   128,  2,     4,    256,   256, 8,     4_000,
-                           decoder="cells", attention=False, shortcut=True, **QUICK),
+    "town":     LVAEPreset("town",      256, 32, (32,),               8,     8,   128,  2,     4,    256,   256, 8,     3_600,
+                           decoder="cells", attention=False, shortcut=True, kl_weight=1e-7, **QUICK),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import groupby
 
@@ -210,14 +210,14 @@ def yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[fl
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs from the preset: entries of its architecture, and where given the learning rate."""
+    """What differs from the preset: entries of its architecture, options of its training (jobs/train_lvae.py)."""
 
-    architecture: Mapping[str, object]
-    learning_rate: float | None = None
+    architecture: Mapping[str, object] = field(default_factory=dict)
+    options: Mapping[str, object] = field(default_factory=dict)
 
 
 BRANCHES = {
-    "full model": Variant({}),
+    "full model": Variant(),
     "without latent split": Variant({"split_latent": False}),
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
@@ -225,8 +225,19 @@ BRANCHES = {
 # The paper's decoder between the same branches and latents. It does not bear the cells' learning rate.
 DECODERS = {
     "cells": Variant({"decoder": "cells"}),
-    "DETR": Variant({"decoder": "detr"}, learning_rate=5e-4),
-    "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, learning_rate=5e-4),
+    "DETR": Variant({"decoder": "detr"}, {"learning_rate": 5e-4}),
+    "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, {"learning_rate": 5e-4}),
+}
+_PAPER_GROUND = {"channels": (64, 128, 256, 512), "norm_groups": 32, "fold": 1, "attention": True}
+GROUND = {
+    "as the preset": Variant({"branches": "ground"}),
+    "the paper's networks": Variant({"branches": "ground", "shortcut": False} | _PAPER_GROUND),
+}
+AUGMENTATIONS = {
+    "scenes as they are": Variant(),
+    "mirrored": Variant(options={"flip": True}),
+    "moved": Variant(options={"jitter": True}),
+    "mirrored and moved": Variant(options={"flip": True, "jitter": True}),
 }
 MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_rmse_m": "ground"}
 MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
@@ -246,7 +257,7 @@ def by_variant(scores: Iterable[dict]) -> list[dict]:
         if not found:
             continue
         out: dict = {"variant": variant, "seeds": len(found), "steps": found[0]["steps"]}
-        out["parameters"] = found[0]["parameters"]
+        out |= {name: found[0][name] for name in ("parameters", "gflops")}
         out["training_seconds"] = float(np.mean([row["training_seconds"] for row in found]))
         for name in MEASURES:
             values = [row[name] for row in found if row[name] is not None]
@@ -306,17 +317,18 @@ def variant_table(rows: Sequence[dict]) -> Table:
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
     }
-    columns = ["variant", "seeds", "steps", "minutes"]
+    columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes"]
     for name in names.values():
         columns += [name, "lowest", "highest"]
     cells = []
     for row in rows:
-        cell: list = [row["variant"], row["seeds"], row["steps"], round(row["training_seconds"] / 60, 1)]
+        cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
+        cell.append(round(row["training_seconds"] / 60, 1))
         for name in names:
             values = [row[f"{name}_{way}"] for way in ("mean", "min", "max")]
             cell += [None if v is None else round(100 * v, 3) for v in values]
         cells.append(cell)
-    note = "Mean, lowest and highest over seeds, of scenes rebuilt from the latent mean."
+    note = "Mean, lowest and highest over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
 

@@ -20,6 +20,7 @@ from models.scene import canonical_boxes, yaw_rotation
 from models.tensors import layout_batch, scene_from_layout
 from models.zoo import LVAE_PRESETS
 from pipelines.ablation import (
+    AUGMENTATIONS,
     BRANCHES,
     DECODERS,
     LOST_YAW_IOU3D,
@@ -290,19 +291,22 @@ def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, 
 
 
 def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
-    from jobs.ablate_lvae import Branches, Decoders, prepare_variant
+    from jobs.ablate_lvae import Augmentation, Branches, Decoders, Ground, prepare_variant
     from jobs.ray_training import as_tensors
     from pipelines.feed import read_samples
 
     for config, variant, switch in (
         *((Branches(preset="smoke"), *item) for item in BRANCHES.items()),
         *((Decoders(preset="smoke"), *item) for item in DECODERS.items()),
+        *((Augmentation(preset="smoke"), *item) for item in AUGMENTATIONS.items()),
     ):
         run = prepare_variant(config, variant, f"test-{variant}", seed=1, steps=3)
         trainer = run.build(torch.device("cpu"), lambda model: model)
         row = LVAE_PRESETS["smoke"]
         assert trainer.settings.steps == 3 and trainer.settings.seed == 1 == run.stream.seed
-        assert trainer.settings.learning_rate == (switch.learning_rate or row.learning_rate)
+        assert trainer.settings.learning_rate == switch.options.get("learning_rate", row.learning_rate)
+        mirrored = run.reader.augment is not None and run.reader.augment.flip
+        assert mirrored == switch.options.get("flip", False)
         assert run.stream.batch_size == row.batch_size
         wanted = row.architecture() | switch.architecture
         assert {name: trainer.model.config[name] for name in wanted} == wanted
@@ -319,6 +323,7 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
         trained.append((seed, variant))
         scores = {"ground_iou": 0.9 + 0.01 * seed, "height_mse_normalised": 1e-4, "height_rmse_m": 0.1}
         described = {"variant": variant, "seed": seed, "steps": config.steps, "dataset": "DIR", "parameters": 1}
+        described |= {"gflops": 0.5}
         reconstruction = scores | {"ap3d": 0.5, "ap3d_50": 0.25}
         described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
         return described | measured(BRANCHES[variant], reconstruction)
@@ -328,6 +333,9 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
     assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCHES]
     job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=3))
     assert trained[8:] == [(2, variant) for variant in BRANCHES]
+    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=4, only=("without ground",)))
+    assert trained[12:] == [(3, "without ground")]
+    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=3))
     rows = {row["variant"]: row for row in json.loads((Path(output) / "branches.json").read_text())["rows"]}
     full, bare = rows["full model"], rows["without ground"]
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
@@ -336,3 +344,8 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
     assert "without latent split" in capsys.readouterr().out
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
         job.compare_variants(job.Branches(preset="smoke", steps=8, seeds=2))
+    with pytest.raises(ValueError, match=r"--only \['without sky'\]: expected some of \['full model'"):
+        job.compare_variants(job.Branches(preset="smoke", steps=7, only=("without sky",)))
+    with pytest.raises(ValueError, match="unknown preset 'smokes'"):
+        job.compare_variants(job.Branches(preset="smokes", name="another"))
+    assert not (Path(output).parent / "another").exists()

@@ -285,7 +285,7 @@ def test_the_lvaes_step_is_the_same_in_halves_and_in_bf16(execution):
         lvae = small_lvae(decoder="cells", shortcut=True)
         lvae.start_at(LayoutBatch.from_compact(arrays))
         settings = Optimisation(steps=20, learning_rate=3e-3, weight_decay=0.0)
-        trainer = lvae_trainer(lvae, settings, torch.device("cpu"), lambda model: model, way)
+        trainer = lvae_trainer(lvae, settings, 1e-6, torch.device("cpu"), lambda model: model, way)
         losses[way] = [float(trainer.step(arrays, range(4))["loss"]) for _ in range(20)]
         assert all(p.dtype == torch.float32 for p in lvae.parameters())
     plain, other = losses.values()
