@@ -31,6 +31,8 @@ def start_ray() -> None:
     os.environ.setdefault("RAY_TRAIN_ENABLE_PRINT_PATCH", "0")
     os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
     os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
+    # Few CPUs mean few idle processes: a reader would be killed after every read and start again, 10 s of imports each.
+    os.environ.setdefault("RAY_idle_worker_killing_time_threshold_ms", "300000")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow torch fivefold beside a busy process
     import ray
     import ray.data

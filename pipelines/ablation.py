@@ -314,21 +314,20 @@ def variant_table(rows: Sequence[dict]) -> Table:
     names = {
         "ground_iou": "ground IoU, %",
         "height_mse_normalised": "height MSE x 100",
+        "height_rmse_m": "height RMSE, cm",
         "ap3d": "AP3D, %",
         "ap3d_50": "AP3D@50, %",
     }
-    columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes"]
-    for name in names.values():
-        columns += [name, "lowest", "highest"]
+    columns = ["variant", "parameters", "GFLOP", "seeds", "steps", "minutes", *names.values()]
     cells = []
     for row in rows:
         cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
         cell.append(round(row["training_seconds"] / 60, 1))
         for name in names:
-            values = [row[f"{name}_{way}"] for way in ("mean", "min", "max")]
-            cell += [None if v is None else round(100 * v, 3) for v in values]
+            mean, low, high = (row[f"{name}_{way}"] for way in ("mean", "min", "max"))
+            cell.append(None if mean is None else f"{100 * mean:.2f} ({100 * low:.2f} to {100 * high:.2f})")
         cells.append(cell)
-    note = "Mean, lowest and highest over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
+    note = "Mean (lowest to highest) over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
 

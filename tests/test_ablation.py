@@ -291,7 +291,7 @@ def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, 
 
 
 def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
-    from jobs.ablate_lvae import Augmentation, Branches, Decoders, Ground, prepare_variant
+    from jobs.ablate_lvae import Augmentation, Branches, Decoders, prepare_variant
     from jobs.ray_training import as_tensors
     from pipelines.feed import read_samples
 
