@@ -228,10 +228,23 @@ DECODERS = {
     "DETR": Variant({"decoder": "detr"}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, {"learning_rate": 5e-4}),
 }
-_PAPER_GROUND = {"channels": (64, 128, 256, 512), "norm_groups": 32, "fold": 1, "attention": True}
+# Of the ground branch alone; town's (32,) after folding by 8 is the smallest but one. Linear start: models/ground.py.
 GROUND = {
-    "as the preset": Variant({"branches": "ground"}),
-    "the paper's networks": Variant({"branches": "ground", "shortcut": False} | _PAPER_GROUND),
+    name: Variant({"branches": "ground"} | changes)
+    for name, changes in {
+        "as the preset": {},
+        "without the linear start": {"shortcut": False},
+        "half as wide": {"channels": (16,)},
+        "one level more, folded by 4": {"channels": (32, 32), "fold": 4},
+        "an eighth of the paper's widths": {"channels": (8, 16, 32, 64), "fold": 1, "attention": True},
+        "the paper's networks": {
+            "channels": (64, 128, 256, 512),
+            "norm_groups": 32,
+            "fold": 1,
+            "attention": True,
+            "shortcut": False,
+        },
+    }.items()
 }
 AUGMENTATIONS = {
     "scenes as they are": Variant(),
@@ -327,7 +340,9 @@ def variant_table(rows: Sequence[dict]) -> Table:
             mean, low, high = (row[f"{name}_{way}"] for way in ("mean", "min", "max"))
             cell.append(None if mean is None else f"{100 * mean:.2f} ({100 * low:.2f} to {100 * high:.2f})")
         cells.append(cell)
-    note = "Mean (lowest to highest) over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
+    note = (
+        "Mean (lowest to highest) over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
+    )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
 

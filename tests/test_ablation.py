@@ -13,6 +13,7 @@ from scenes import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
 from models.encodings import ENCODINGS, harmonics, nearest_frame
+from models.layout import LayoutSpec
 from models.losses import lvae_loss
 from models.lvae import LayoutVAE
 from models.orientation_study import THINGS, OneObjectAutoencoder, Settings, draw_boxes, fit
@@ -23,6 +24,7 @@ from pipelines.ablation import (
     AUGMENTATIONS,
     BRANCHES,
     DECODERS,
+    GROUND,
     LOST_YAW_IOU3D,
     CentredBoxes,
     Trial,
@@ -312,6 +314,17 @@ def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
         assert {name: trainer.model.config[name] for name in wanted} == wanted
         batch = as_tensors(read_samples(run.stream, run.reader, 0, 1, row.batch_size, 0, 1))
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
+
+
+def test_the_ground_study_goes_from_the_papers_networks_down_with_equal_latents():
+    row = LVAE_PRESETS["town"].architecture()
+    models = {name: LayoutVAE(layout=LayoutSpec().to_dict(), **row | v.architecture) for name, v in GROUND.items()}
+    assert {model.latent_shape for model in models.values()} == {(32, 32, 32)}
+    sizes = {name: model.num_parameters() for name, model in models.items()}
+    paper = LVAE_PRESETS["kitti360"]
+    assert GROUND["the paper's networks"].architecture["channels"] == paper.channels
+    assert min(sizes, key=sizes.get) in ("half as wide", "an eighth of the paper's widths")
+    assert max(sizes, key=sizes.get) == "the paper's networks"
 
 
 def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatch, capsys):
