@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import torch
 from diffusers.models.autoencoders.vae import Decoder, Encoder
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-LOGIT_GAIN = 6.0  # occupancy 0 and 1 of the linear start become logits of -3 and 3
+LOGIT_PER_PX = 2.0  # occupancy logit of the linear start, per pixel of distance from the border
+HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell, in the linear start
 
 
 class GroundEncoder(nn.Module):
@@ -16,8 +17,8 @@ class GroundEncoder(nn.Module):
 
     Blocks of fold x fold pixels first become channels (1 in the paper: no folding); then each entry of `channels` but
     the last halves the resolution once: four entries give the paper's factor 8. `attention` is the paper's, over all cells in
-    the middle of the network. With `shortcut`, the mean is the
-    network's plus a linear map of the cell's pixels (`start_at`). Not in the paper.
+    the middle of the network. With `shortcut`, the mean is the network's plus a linear map of the cell's `smooth_maps`,
+    solved in closed form (`start_at`). Not in the paper.
     """
 
     def __init__(
@@ -50,7 +51,8 @@ class GroundEncoder(nn.Module):
         if self.shortcut is None:
             return moments
         mean, logvar = moments.chunk(2, dim=1)
-        return torch.cat([mean + self.shortcut(maps), logvar], dim=1)
+        smooth = smooth_maps(*maps.chunk(2, dim=1), self.shortcut.stride[0])
+        return torch.cat([mean + self.shortcut(smooth), logvar], dim=1)
 
 
 class GroundDecoder(nn.Module):
@@ -94,9 +96,9 @@ def start_at(
 ) -> None:
     """Start where linear algebra can: outputs at their means; with shortcuts, at the best linear autoencoder.
 
-    The shortcuts become the closed form of reduced-rank regression (Izenman 1975) from a cell's pixels to what its
-    decoder should say, and the networks start at zero beside them. On the town it starts at a ground IoU of 0.9,
-    which the networks alone have not reached after ten minutes on two cores.
+    The shortcuts become the principal components of a cell's `smooth_maps`, scaled to unit variance, distances being
+    read as logits, and the networks start at zero beside them. On the town at 256 pixels it starts at a ground IoU
+    of 99.5 %, which the networks alone have not reached after an hour on two cores.
     """
     count = occupied.sum(dim=(0, 2, 3)).clamp(min=1)
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count
@@ -105,21 +107,57 @@ def start_at(
     decoder.net.conv_out.bias.copy_(bias)
     if encoder.shortcut is None:
         return
-    cell = encoder.shortcut.stride[0]
-    given = _cells(torch.cat([height, occupied], dim=1), cell)
-    wanted = _cells(torch.cat([_filled(height, occupied, cell), occupied], dim=1), cell)
-    given_mean, wanted_mean = given.mean(dim=0), wanted.mean(dim=0)
-    latent, maps = encoder.shortcut.out_channels, 2 * occupied.shape[1]
-    encode, decode = reduced_rank_regression(given - given_mean, wanted - wanted_mean, latent)
-    gain = torch.tensor([1.0, LOGIT_GAIN], dtype=decode.dtype).repeat_interleave(decode.shape[1] // 2)
-    centred = wanted_mean - torch.tensor([0.0, 0.5], dtype=decode.dtype).repeat_interleave(decode.shape[1] // 2)
-    encoder.shortcut.weight.copy_(encode.T.reshape(latent, maps, cell, cell))
-    encoder.shortcut.bias.copy_(-given_mean @ encode)
-    decoder.shortcut.weight.copy_((decode * gain).reshape(latent, maps, cell, cell))
-    decoder.shortcut.bias.copy_((centred * gain).reshape(maps, -1).mean(dim=1))
+    cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
+    maps = _cells(smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
+    heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
+    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # in the principal components
+    unit = torch.cat([heights, LOGIT_PER_PX * reach(cell) * distances])  # of the decoder's outputs
+    mean = maps.mean(dim=0)
+    components, deviation = principal_components((maps - mean) * weight, latent)
+    encode = weight[:, None] * components / deviation
+    decode = (deviation * components).T / weight * unit
+    encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
+    encoder.shortcut.bias.copy_(-mean @ encode)
+    decoder.shortcut.weight.copy_(decode.reshape(latent, -1, cell, cell))
+    decoder.shortcut.bias.copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
     encoder.net.conv_out.weight[:latent].zero_()
     decoder.net.conv_out.weight.zero_()
     decoder.net.conv_out.bias.zero_()
+
+
+def smooth_maps(
+    height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
+) -> Float[Tensor, "batch maps rows cols"]:
+    """Raster maps as few numbers can carry them: heights that go on where nothing is occupied, distances for 0 and 1.
+
+    A border through a cell is a step in occupancy, which takes many linear components, and a plane in distance from
+    the border, which takes three. Distances are in units of `reach`, within [-1, 1].
+    """
+    distance = signed_distance_px(occupied > 0.5, reach(cell)) / reach(cell)
+    return torch.cat([filled(height, occupied, cell), distance.to(height.dtype)], dim=1)
+
+
+def reach(cell: int) -> int:
+    """Pixels from a border up to which distances are told apart: half a cell."""
+    return max(1, cell // 2)
+
+
+def signed_distance_px(inside: Bool[Tensor, "*batch rows cols"], most: int) -> Float[Tensor, "*batch rows cols"]:
+    """Euclidean distance from pixel centres to the border, positive inside, exact up to `most` pixels and cut there.
+
+    The border lies half a pixel before the nearest pixel of the other kind (Felzenszwalb & Huttenlocher 2012, on a
+    bounded window).
+    """
+    squared = torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2  # to the nearest pixel outside, inside
+    for axis in (-1, -2):
+        padded = F.pad(squared, (most, most, 0, 0) if axis == -1 else (0, 0, most, most), value=(most + 0.5) ** 2)
+        nearest = squared
+        for step in range(1, most + 1):
+            for start in (most - step, most + step):
+                nearest = torch.minimum(nearest, padded.narrow(axis, start, squared.shape[axis]) + step**2)
+        squared = nearest
+    to_outside, to_inside = squared.sqrt()
+    return torch.where(inside, to_outside - 0.5, 0.5 - to_inside)
 
 
 def _cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
@@ -128,10 +166,10 @@ def _cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tens
     return pixels.permute(0, 2, 3, 1).reshape(-1, pixels.shape[1]).double()
 
 
-def _filled(
+def filled(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch ground rows cols"]:
-    """Heights, and where nothing is occupied and so any height will do, the cell's or the scene's mean."""
+    """Heights, and where nothing is occupied and so any height will do, the cell's mean or the scene's."""
     total, count = (F.avg_pool2d(v.sum(dim=1, keepdim=True), cell) for v in (height * occupied, occupied))
     scene = (height * occupied).sum(dim=(1, 2, 3)) / occupied.sum(dim=(1, 2, 3)).clamp(min=1)
     mean = torch.where(count > 0, total / count.clamp(min=1e-6), scene[:, None, None, None])
@@ -139,15 +177,9 @@ def _filled(
     return torch.where(occupied > 0, height, mean)
 
 
-def reduced_rank_regression(
-    given: Float[Tensor, "n p"], wanted: Float[Tensor, "n q"], rank: int
-) -> tuple[Float[Tensor, "p rank"], Float[Tensor, "rank q"]]:
-    """encode and decode that minimise |given encode decode - wanted|^2, codes of unit variance. Centred inputs."""
-    covariance = given.T @ given / len(given)
-    ridge = 1e-4 * torch.eye(len(covariance), dtype=given.dtype)
-    regression = torch.linalg.solve(covariance + ridge, given.T @ wanted / len(given))
-    _, directions = torch.linalg.eigh(regression.T @ covariance @ regression)
-    directions = directions[:, -rank:]
-    encode = regression @ directions
-    scale = torch.einsum("pr,pq,qr->r", encode, covariance, encode).sqrt().clamp(min=1e-6)
-    return encode / scale, (directions * scale).T
+def principal_components(
+    centred: Float[Tensor, "n p"], count: int
+) -> tuple[Float[Tensor, "p count"], Float[Tensor, count]]:
+    """The directions of largest variance, and the standard deviations along them (at least 0.01)."""
+    variance, directions = torch.linalg.eigh(centred.T @ centred / len(centred))
+    return directions[:, -count:], variance[-count:].clamp(min=1e-4).sqrt()

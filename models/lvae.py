@@ -162,6 +162,12 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         count = torch.stack([r.sum() / len(r) for _, r in groups])
         self.object_decoder.start_at(logit(features), count)
 
+    def learning_rates(self) -> dict[str, float]:
+        """Shares of the learning rate, by beginning of a parameter's name: what starts solved must not be shaken."""
+        if not self.config.shortcut:
+            return {}
+        return {"ground_encoder.shortcut": 0.05, "ground_decoder.shortcut": 0.05, "ground_": 0.25}
+
     def _ground_start(self) -> GroundDecoder | SimpleNamespace:
         """What `start_ground` fills: of a shortcut that reads the joint latent the ground's part, the rest is zero."""
         decoder, own = self.ground_decoder, self.config.latent_channels

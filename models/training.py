@@ -150,8 +150,14 @@ class Trainer:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or Execution()
         self.parameters = dict(model.named_parameters())
+        rates = getattr(model, "learning_rates", dict)()  # of parts whose rate is not everybody's, by name's beginning
+        share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
+        groups = [
+            {"params": [p for n, p in self.parameters.items() if share[n] == value], "share": value}
+            for value in sorted(set(share.values()))
+        ]
         self.optimiser = torch.optim.AdamW(
-            self.parameters.values(), settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
+            groups, settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
         )
         self.ema = {n: p.detach().clone() for n, p in self.parameters.items()} if settings.ema_decay else None
         self.steps_done = 0
@@ -164,7 +170,7 @@ class Trainer:
         """
         rate, beta1 = self.settings.at(self.steps_done)
         for group in self.optimiser.param_groups:
-            group["lr"], group["betas"] = rate, (beta1, self.settings.betas[1])
+            group["lr"], group["betas"] = group["share"] * rate, (beta1, self.settings.betas[1])
         positions = list(positions)
         arrays = {k: v.to(self.device, non_blocking=True) for k, v in arrays.items()}
         self.optimiser.zero_grad(set_to_none=True)

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 import torch
 from scenes import random_scene, small_spec
+from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
+from torch.nn import functional as F
 
 from models.dit import DiT
-from models.ground import reduced_rank_regression
+from models.ground import HEIGHT_WEIGHT, LOGIT_PER_PX, reach, signed_distance_px, smooth_maps
 from models.layout import LayoutBatch, LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
 from models.matching import MatchWeights, match
 from models.tensors import compact_layout, layout_batch
-from models.training import Execution, Optimisation, lvae_trainer
+from models.training import Execution, Optimisation, Trainer, lvae_trainer
 from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
 
 
@@ -181,18 +183,59 @@ def test_outputs_start_at_the_means_of_the_data():
         assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
 
 
-def test_the_linear_start_is_the_best_of_its_rank():
-    generator = torch.Generator().manual_seed(0)
-    given = torch.randn(500, 12, generator=generator, dtype=torch.float64)
-    wanted = given @ torch.randn(12, 9, generator=generator, dtype=torch.float64)
-    given, wanted = given - given.mean(dim=0), wanted - wanted.mean(dim=0)
-    full = float((wanted**2).sum())
-    singular = torch.linalg.svdvals(wanted)
-    for rank in (1, 3, 9):
-        encode, decode = reduced_rank_regression(given, wanted, rank)
-        error = float(((given @ encode @ decode - wanted) ** 2).sum())
-        assert abs(error - float((singular[rank:] ** 2).sum())) < 1e-3 * full  # Eckart-Young: no rank does better
-        assert np.allclose((given @ encode).var(dim=0, correction=0), 1, atol=1e-6)
+def test_distances_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    inside = np.stack([rng.random((40, 30)) < share for share in (0.02, 0.5, 0.9, 0.0, 1.0)])
+    inside[1] = ndimage.binary_opening(inside[1], iterations=1)
+    for most in (1, 3, 6):
+        found = signed_distance_px(torch.from_numpy(inside), most).numpy()
+        for mask, distance in zip(inside, found, strict=True):
+            border = np.pad(mask, 50, mode="edge")  # nothing is known of beyond
+            to = [
+                ndimage.distance_transform_edt(side) if not side.all() else np.full(side.shape, 99.0)
+                for side in (border, ~border)
+            ]
+            want = np.where(border, to[0] - 0.5, 0.5 - to[1])[50:-50, 50:-50].clip(-most, most)
+            inner = (slice(most, -most), slice(most, -most))  # edge padding invents borders near a crop's own
+            assert np.allclose(distance[inner], want[inner], atol=1e-5)
+
+
+def test_the_linear_start_is_the_best_of_its_rank_and_has_codes_of_unit_variance():
+    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    lvae = small_lvae(shortcut=True, latent_channels=16)
+    lvae.start_at(batch)
+    cell = lvae.ground_encoder.shortcut.stride[0]
+    maps = smooth_maps(batch.height, batch.occupied, cell)
+    with torch.no_grad():
+        code = lvae.ground_encoder.shortcut(maps)
+        rebuilt = lvae.ground_decoder.shortcut(code)
+    classes, pixels = batch.occupied.shape[1], maps.shape[1] * cell**2
+    unit = torch.tensor([1.0, LOGIT_PER_PX * reach(cell)]).repeat_interleave(classes)[:, None, None]
+    weight = torch.tensor([HEIGHT_WEIGHT, 1.0]).repeat_interleave(classes)[:, None, None]
+    cells = (
+        F.pixel_unshuffle(m * weight, cell).permute(0, 2, 3, 1).reshape(-1, pixels) for m in (maps, rebuilt / unit)
+    )
+    truth, ours = (part.double() for part in cells)
+    centred = truth - truth.mean(dim=0)
+    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # Eckart-Young: no map of rank 16 does better
+    within = 0.02 * float((centred**2).sum())  # the decoder's bias is one per map, not per pixel
+    assert least <= float(((ours - truth) ** 2).sum()) < least + within
+    deviation = code.transpose(0, 1).flatten(1).std(dim=1)
+    assert (deviation < 1.01).all() and deviation.max() > 0.99
+
+
+def test_what_starts_solved_learns_slower():
+    lvae = small_lvae(shortcut=True, decoder="cells")
+    trainer = Trainer(lvae, None, Optimisation(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
+    share = {id(p): group["share"] for group in trainer.optimiser.param_groups for p in group["params"]}
+    assert len(share) == len(list(lvae.parameters()))
+    names = {name: share[id(p)] for name, p in lvae.named_parameters()}
+    assert {v for n, v in names.items() if n.startswith(("ground_encoder.shortcut", "ground_decoder.shortcut"))} == {
+        0.05
+    }
+    assert {v for n, v in names.items() if n.startswith("ground_") and ".shortcut" not in n} == {0.25}
+    assert {v for n, v in names.items() if n.startswith("object_")} == {1.0}
+    assert not small_lvae().learning_rates()
 
 
 def test_shortcuts_show_the_ground_before_the_first_step():
