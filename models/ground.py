@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-LOGIT_PER_PX = 2.0  # occupancy logit of the linear start, per pixel of distance from the border
+LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # of distance from the border: the linear start takes the best
 HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell, in the linear start
 
 
@@ -111,14 +111,20 @@ def start_at(
     maps = _cells(smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
     heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
     weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # in the principal components
-    unit = torch.cat([heights, LOGIT_PER_PX * reach(cell) * distances])  # of the decoder's outputs
     mean = maps.mean(dim=0)
     components, deviation = principal_components((maps - mean) * weight, latent)
     encode = weight[:, None] * components / deviation
-    decode = (deviation * components).T / weight * unit
+    decode = (deviation * components).T / weight
+    rebuilt = (maps - mean) @ encode @ decode + mean
+    inside = (_cells(occupied, cell) > 0.5).to(maps.dtype)
+    error = {
+        logit: F.binary_cross_entropy_with_logits(logit * reach(cell) * rebuilt[:, maps.shape[1] // 2 :], inside)
+        for logit in LOGITS_PER_PX
+    }
+    unit = torch.cat([heights, min(error, key=error.get) * reach(cell) * distances])  # of the decoder's outputs
     encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
     encoder.shortcut.bias.copy_(-mean @ encode)
-    decoder.shortcut.weight.copy_(decode.reshape(latent, -1, cell, cell))
+    decoder.shortcut.weight.copy_((decode * unit).reshape(latent, -1, cell, cell))
     decoder.shortcut.bias.copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
     encoder.net.conv_out.weight[:latent].zero_()
     decoder.net.conv_out.weight.zero_()

@@ -70,6 +70,7 @@ class LayoutOutput:
 # Posteriors start narrow (sigma 0.14): decoders see the latent, not noise, from the first step on. With sigma 1,
 # the default, the same number of steps ends at 1.5 times the loss (tests/test_models.py, one batch, 300 steps).
 INITIAL_LOGVAR = -4.0
+SOLVED_LOGVAR = -8.0  # of a ground that starts solved (ground.py): sigma 0.018
 
 BRANCHES = ("both", "ground", "objects")
 EMPTY_LOGIT = -6.0  # occupancy where there is no ground branch
@@ -133,7 +134,8 @@ class LayoutVAE(ModelMixin, ConfigMixin):
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, *ground)
             self.ground_decoder = GroundDecoder(num_classes, seen, *ground)
             with torch.no_grad():
-                self.ground_encoder.net.conv_out.bias[latent_channels:] = INITIAL_LOGVAR
+                logvar = SOLVED_LOGVAR if shortcut else INITIAL_LOGVAR
+                self.ground_encoder.net.conv_out.bias[latent_channels:] = logvar
         if branches != "ground":
             body = (size, width, layers, heads, hidden)
             self.object_encoder = ObjectEncoder(spec.slots, latent_channels, *body, shortcut)

@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from torch.nn import functional as F
 
 from models.dit import DiT
-from models.ground import HEIGHT_WEIGHT, LOGIT_PER_PX, reach, signed_distance_px, smooth_maps
+from models.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
 from models.layout import LayoutBatch, LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
@@ -210,7 +210,10 @@ def test_the_linear_start_is_the_best_of_its_rank_and_has_codes_of_unit_variance
         code = lvae.ground_encoder.shortcut(maps)
         rebuilt = lvae.ground_decoder.shortcut(code)
     classes, pixels = batch.occupied.shape[1], maps.shape[1] * cell**2
-    unit = torch.tensor([1.0, LOGIT_PER_PX * reach(cell)]).repeat_interleave(classes)[:, None, None]
+    slope = torch.linalg.lstsq(maps[:, classes:].flatten()[:, None], rebuilt[:, classes:].flatten()[:, None]).solution
+    best = min(LOGITS_PER_PX, key=lambda logit: abs(logit * reach(cell) - float(slope)))
+    assert abs(float(slope) / (best * reach(cell)) - 1) < 0.1
+    unit = torch.tensor([1.0, best * reach(cell)]).repeat_interleave(classes)[:, None, None]
     weight = torch.tensor([HEIGHT_WEIGHT, 1.0]).repeat_interleave(classes)[:, None, None]
     cells = (
         F.pixel_unshuffle(m * weight, cell).permute(0, 2, 3, 1).reshape(-1, pixels) for m in (maps, rebuilt / unit)
