@@ -101,7 +101,7 @@ class Decoders(Branches):
 
 @dataclass(frozen=True)
 class Ground(Branches):
-    """The ground branch alone, from the paper's networks down to one linear map: equally long each."""
+    """The ground branch alone, from the paper's networks down to a hundredth of them: equally long each."""
 
     checks: int = 8
     """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
