@@ -31,7 +31,7 @@ class Config:
     num_test: int = 200
     lvae_steps: int = 500
     lvae_batch_size: int = 8
-    dit_steps: int = 1100
+    dit_steps: int = 1700
     dit_batch_size: int = 8
     """Many small steps show something sooner than few large ones."""
     num_scenes: int = 48
