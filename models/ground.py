@@ -98,7 +98,7 @@ def start_at(
 
     The shortcuts become the principal components of a cell's `smooth_maps`, scaled to unit variance, distances being
     read as logits, and the networks start at zero beside them. On the town at 256 pixels it starts at a ground IoU
-    of 99.5 %, which the networks alone have not reached after an hour on two cores.
+    of 99.4 % (BENCHMARKS.md).
     """
     count = occupied.sum(dim=(0, 2, 3)).clamp(min=1)
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count
