@@ -338,7 +338,8 @@ def claim(output: str, options: dict) -> None:
     from pipelines import storage
 
     record = storage.join(output, "study.json")
-    if storage.exists(record) and (made := storage.read_json(record)) != options:
+    kept = [path for path in storage.list_files(output, ".json") if not path.endswith(("/study.json", "/mlflow.json"))]
+    if kept and storage.exists(record) and (made := storage.read_json(record)) != options:
         key = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
         raise ValueError(
             f"{output} holds a study with {key}={made.get(key)}, asked for {options.get(key)}; "

@@ -228,7 +228,7 @@ DECODERS = {
     "DETR": Variant({"decoder": "detr"}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Of the ground branch alone; town's (32,) after folding by 8 is the smallest but one. Linear start: models/ground.py.
+# Of the ground branch alone; town has (32,) after folding by 8. Linear start: models/ground.py.
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {

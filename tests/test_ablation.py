@@ -362,3 +362,16 @@ def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatc
     with pytest.raises(ValueError, match="unknown preset 'smokes'"):
         job.compare_variants(job.Branches(preset="smokes", name="another"))
     assert not (Path(output).parent / "another").exists()
+
+
+def test_a_study_without_trials_gives_its_directory_up(tmp_path):
+    from jobs.ablate_lvae import claim
+
+    claim(str(tmp_path), {"dataset": "/nowhere"})
+    (tmp_path / "mlflow.json").write_text("{}")
+    claim(str(tmp_path), {"dataset": "/somewhere"})
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "cells-seed0.json").write_text("{}")
+    claim(str(tmp_path), {"dataset": "/somewhere"})
+    with pytest.raises(ValueError, match="holds a study with dataset=/somewhere, asked for /nowhere"):
+        claim(str(tmp_path), {"dataset": "/nowhere"})
