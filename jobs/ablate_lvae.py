@@ -278,8 +278,8 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     from models.tensors import layout_batch
     from pipelines import ablation, storage
     from pipelines.encode import load_lvae
-    from pipelines.evaluate import Selection
     from pipelines.rebuild import rebuild
+    from pipelines.selection import Selection
 
     timed = variant if at_equal_time(config) else next(iter(variants(replace(config, only=()))))
     steps = config.steps or affordable_steps(config, timed, output)

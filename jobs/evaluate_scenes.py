@@ -3,109 +3,223 @@
 
     jobs/evaluate_scenes.py --real DIR --generated DIR
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
+    jobs/evaluate_scenes.py --real DIR --generated DIR --samples 10000 --k 3 5 --reference apart --apart-m 10
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
-Writes metrics.json and metrics.parquet, and with --lvae also reconstruction.html, with the best and worst scenes, and
-reconstruction.parquet, a row per scene; all of it goes to MLflow too. FID, IS, precision and recall need local
-Inception weights; without them distances of layout statistics and of a fixed random network are given, under their own
-names.
+By default as in the paper: at most 1,000 training scenes with poses as far apart as can be, as many generated ones with
+labels in equal parts, k = 3. Every score comes with a 95 % interval over scenes.
+
+Writes metrics.json, metrics.parquet and evaluation.html; with --lvae also reconstruction.html, with the best and worst
+scenes, and reconstruction.parquet, a row per scene; all of it goes to MLflow too. FID, sFID, KID, IS, precision and
+recall need local Inception weights; without them distances of layout statistics and of a fixed random network are given,
+under their own names. Run it again with the same options to go on after an interruption.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from jobs.command import absolute, home, run, start_ray
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.progress import Progress
 
-    from pipelines.evaluate import Selection
+    from pipelines.dataset import Dataset
+    from pipelines.evaluation_report import Shown
+    from pipelines.metrics.intervals import Estimate
+    from pipelines.selection import Selection
 
 METRICS_PER_CALL = 1000  # MLflow's limit
-DETAILS = (".statistics.", "category_", "class_", "ap3d_at", ".truths.")  # in the files, not on the screen
+DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
+SHOWN = 12  # pictures of either side on the page
 
 
 @dataclass(frozen=True)
 class Config:
     real: str = ""
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
-    real_split: str = "test"
-    """Split to compare with; the paper takes train as its reference."""
+    real_split: str = "train"
+    """Split that generated scenes are compared with; the paper takes the training split."""
     generated: str = ""
     """Dataset directory of the generated scenes (default with neither --lvae nor this: $PRITTI_HOME/generated)."""
     generated_split: str = ""
     """Only this split of them (default: whatever is there); --generated may be any dataset directory."""
     run: str = ""
     """Only source generated-<run> (default: whatever is there)."""
+    samples: int = 1000
+    """At most so many scenes on each side, equally many; the paper takes 1000, also 5000 and 10000."""
+    reference: Literal["farthest", "apart", "spread"] = "farthest"
+    """Which real scenes: poses as far apart as can be, all poses at least --apart-m apart, or evenly spread ones."""
+    apart_m: float = 10.0
+    """Distance of poses for --reference apart."""
+    balance: bool = True
+    """Take equally many generated scenes of each label, as far as they go."""
+    k: tuple[int, ...] = (3,)
+    """Neighbourhood sizes of precision, recall, density and coverage."""
+    supersample: int = 1
+    """Draw each pixel of a picture as the mean of so many squared."""
+    inception: str = ""
+    """Local Inception weights (pt_inception-2015-12-05) for FID, sFID, KID, IS, precision and recall."""
     lvae: str = ""
-    """Also score this LVAE's reconstruction of the real scenes."""
+    """Also score this LVAE's reconstruction of real scenes."""
+    lvae_split: str = "test"
+    """Split to reconstruct."""
+    limit: int | None = None
+    """Reconstruct at most so many scenes, spread evenly."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
     """Lowest and highest z of the 256 x 256 x 32 voxels."""
     pictures: int = 3
     """So many of the best and of the worst reconstructed scenes to show."""
-    limit: int | None = None
-    """At most so many scenes on each side, spread evenly."""
-    inception: str = ""
-    """Local Inception weights (pt_inception-2015-12-05) for FID, IS, precision and recall."""
-    k: tuple[int, ...] = (3,)
-    """Neighbourhood sizes of precision and recall."""
     output: str = ""
-    """Where metrics.json and metrics.parquet go (default: $PRITTI_HOME/evaluations/<run or 'latest'>)."""
+    """Where everything goes (default: $PRITTI_HOME/evaluations/<run or 'latest'>)."""
     actors: int = 2
 
 
 def evaluate(config: Config) -> dict:
-    """Score, write and return the nested metrics."""
+    """Score, write and return the nested metrics, as metrics.json holds them."""
     import pyarrow as pa
     from rich.progress import Progress
 
     from pipelines import storage
     from pipelines.dataset import Dataset
-    from pipelines.evaluate import Selection, compare, describe, flattened
+    from pipelines.evaluate import flattened, plain
 
-    if config.pictures < 0:
-        raise ValueError(f"--pictures is {config.pictures}, expected 0 or more")
+    for name, least in (("pictures", 0), ("samples", 2), ("supersample", 1)):
+        if (given := getattr(config, name)) < least:
+            raise ValueError(f"--{name} is {given}, expected {least} or more")
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
-    real = Selection(dataset.root, dataset.source, config.real_split, config.limit)
     wanted = config.generated or ("" if config.lvae else home("generated"))
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
     scores: dict = {}
     start_ray()
     with Progress() as bar:
-
-        def described(selection: Selection, name: str) -> dict:
-            shown = bar.add_task(name, total=sum(len(rows) for _, rows in selection.shards()))
-            return describe(selection, dataset, config.inception or None, config.actors, lambda: bar.advance(shown))
-
         if config.lvae:
-            scores["reconstruction"] = reconstruction(config, real, output, bar)
+            scores["reconstruction"] = reconstruction(config, dataset, output, bar)
         if wanted:
-            source = f"generated-{config.run}" if config.run else None
-            generated = Selection(absolute(wanted), source, config.generated_split or None, config.limit)
-            sides = described(real, "describe real"), described(generated, "describe generated")
-            scores["generation"] = compare(*sides, dataset, config.k)
-    storage.write_json(scores, storage.join(output, "metrics.json"))
-    flat = flattened(scores)
-    table = pa.table({"metric": list(flat), "value": list(flat.values())})
-    storage.write_parquet(table, storage.join(output, "metrics.parquet"))
+            scores["generation"] = generation(config, dataset, absolute(wanted), output, bar)
+    nested, flat = plain(scores), flattened(scores)
+    storage.write_json(nested, storage.join(output, "metrics.json"))
+    storage.write_parquet(pa.Table.from_pylist(metric_rows(flat)), storage.join(output, "metrics.parquet"))
     tags = {
         "real": dataset.root,
         "split": config.real_split,
         "generated": wanted,
         "lvae": config.lvae and absolute(config.lvae),
     }
-    track(output, tags, flat, ["metrics.json"] + (["reconstruction.html"] if config.lvae else []))
+    pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
+    track(output, tags, flat, ["metrics.json", *(pages[name] for name in scores)])
+    return nested
+
+
+def metric_rows(flat: dict[str, Estimate | float]) -> list[dict]:
+    """A row per metric: name, value, and the ends of its 95 % interval where it has one."""
+    rows = []
+    for name, value in flat.items():
+        ends = {"value": value, "low": None, "high": None} if isinstance(value, float) else value._asdict()
+        rows.append({"metric": name} | ends)
+    return rows
+
+
+def generation(config: Config, dataset: Dataset, root: str, output: str, bar: Progress) -> dict:
+    """Scores of the generated scenes; writes evaluation.html and what is known of each scene, under described/."""
+    from dataclasses import replace
+
+    from pipelines import storage
+    from pipelines.describe import Looks, describe
+    from pipelines.evaluate import compare, memorisation, plain
+    from pipelines.evaluation_report import evaluation_html
+    from pipelines.selection import Selection
+
+    source = f"generated-{config.run}" if config.run else None
+    sides = {
+        "real": Selection(
+            dataset.root, dataset.source, config.real_split, config.samples, config.reference, config.apart_m
+        ),
+        "generated": Selection(
+            root, source, config.generated_split or None, config.samples, "balanced" if config.balance else "spread"
+        ),
+    }
+    count = min(sum(len(rows) for _, rows in side.shards()) for side in sides.values())
+    sides = {name: replace(side, limit=count) for name, side in sides.items()}
+    looks = Looks(config.supersample, config.inception and absolute(config.inception))
+    described = {}
+    for name, side in sides.items():
+        bar_task = bar.add_task(f"describe {name}", total=count)
+        directory = storage.join(output, "described", name)
+        described[name] = describe(
+            side, dataset, looks, directory, config.actors, lambda n, task=bar_task: bar.advance(task, n)
+        )
+    task = bar.add_task("compare", total=2)
+    scores = compare(described["real"], described["generated"], dataset.spec.ground_classes, config.k)
+    bar.advance(task)
+    if count > 3:
+        features = "pool3" if "pool3" in described["real"] else "random"
+        found = memorisation(described["real"][features], described["generated"][features])
+        scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
+    bar.advance(task)
+    counts = {name: part["statistics"][:, :11] for name, part in described.items()}
+    html = evaluation_html(
+        plain(scores), counts, shown(sides, described, scores, looks), protocol(config, sides, count)
+    )
+    storage.write_whole(storage.join(output, "evaluation.html"), lambda stream: stream.write(html.encode()))
     return scores
 
 
-def reconstruction(config: Config, real: Selection, output: str, bar: Progress) -> dict:
+def protocol(config: Config, sides: dict[str, Selection], count: int) -> list[str]:
+    """How it was done, in words."""
+    how = {
+        "farthest": "poses as far apart as can be (farthest point sampling)",
+        "apart": f"poses at least {config.apart_m:g} m apart",
+        "spread": "evenly spread",
+    }[config.reference]
+    labels = "labels in equal parts as far as they go" if config.balance else "evenly spread"
+    drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
+    return [
+        f"Real: {count} scenes of {sides['real'].root}, split {config.real_split}, {how}. "
+        f"Generated: {count} scenes of {sides['generated'].root}, {labels}. Equal numbers on both sides.",
+        f"Pictures: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.",
+    ]
+
+
+def shown(sides: dict[str, Selection], described: dict, scores: dict, looks: object) -> Shown:
+    """The page's pictures: evenly chosen ones, those nearest to real scenes, and those with most faults."""
+
+    from pipelines.describe import chosen_scenes
+    from pipelines.evaluation_report import Shown
+    from pipelines.scenes.render import bev_picture
+    from pipelines.selection import evenly
+
+    parts = {name: side.shards() for name, side in sides.items()}
+
+    def drawn(side: str, indices: np.ndarray) -> list[np.ndarray]:
+        return [bev_picture(scene, supersample=2) for scene in chosen_scenes(parts[side], indices)]
+
+    count = len(described["generated"]["scene_id"])
+    even = evenly(count, min(SHOWN, count))
+    neighbours = []
+    if "memorisation" in scores:
+        found = scores["memorisation"]
+        alike = found["distance"][:, 0].argsort(kind="stable")[: SHOWN // 3]
+        for index, picture in zip(alike, drawn("generated", alike), strict=True):
+            neighbours.append((picture, drawn("real", found["nearest"][index]), found["distance"][index].tolist()))
+    faults = described["generated"]["validity"][:, :-2:2]  # road connectivity, the last, is no fault
+    most = (-faults.sum(axis=1)).argsort(kind="stable")[: SHOWN // 2]
+    reasons = [f"{faults[index].sum():.0f} faults" for index in most]
+    worst = list(zip(drawn("generated", most), reasons, strict=True))
+    return Shown(drawn("real", even), drawn("generated", even), neighbours, worst)
+
+
+def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Scores; writes reconstruction.parquet, a row per scene, and reconstruction.html with the best and worst of them."""
     from pipelines import storage
     from pipelines.rebuild import draw, rebuild
     from pipelines.reconstruction_report import reconstruction_html
+    from pipelines.selection import Selection
 
+    real = Selection(dataset.root, dataset.source, config.lvae_split, config.limit)
     lvae = absolute(config.lvae)
     shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
     rebuilt = rebuild(
@@ -124,8 +238,11 @@ def reconstruction(config: Config, real: Selection, output: str, bar: Progress) 
     return rebuilt.scores
 
 
-def track(output: str, tags: dict[str, str], metrics: dict[str, float], files: list[str]) -> None:
-    """Metrics, tags and files of `output` to MLflow: one run per output directory, brought up to date."""
+def track(output: str, tags: dict[str, str], metrics: dict[str, Estimate | float], files: list[str]) -> None:
+    """Metrics, tags and files of `output` to MLflow: one run per output directory, brought up to date.
+
+    An interval's ends are metrics of their own, NAME.low and NAME.high.
+    """
     from jobs.tracking import Tracker
     from pipelines import storage
 
@@ -133,9 +250,13 @@ def track(output: str, tags: dict[str, str], metrics: dict[str, float], files: l
     tracker = Tracker.start("pritti-evaluation", name, {}, storage.join(output, "mlflow.json"))
     for key, value in tags.items():
         tracker.client.set_tag(tracker.run_id, key, value)
-    names = list(metrics)
+    known = {}
+    for row in metric_rows(metrics):
+        named = {"": row["value"], ".low": row["low"], ".high": row["high"]}
+        known |= {row["metric"] + end: value for end, value in named.items() if value is not None}
+    names = [name for name, value in known.items() if math.isfinite(value)]
     for start in range(0, len(names), METRICS_PER_CALL):
-        tracker.metrics({name: metrics[name] for name in names[start : start + METRICS_PER_CALL]}, step=0)
+        tracker.metrics({name: known[name] for name in names[start : start + METRICS_PER_CALL]}, step=0)
     if "://" not in output:  # MLflow takes local files only
         for file in files:
             tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
@@ -146,14 +267,13 @@ def main(config: Config) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pipelines.evaluate import flattened
+    from pipelines.evaluation_report import leaves, written
 
-    scores = evaluate(config)
-    shown = Table("metric", "value")
-    for name, value in flattened(scores).items():
+    lines = Table("metric", "value")
+    for name, value in leaves(evaluate(config)):
         if not any(part in name for part in DETAILS):
-            shown.add_row(name, f"{value:.4g}")
-    Console().print(shown)
+            lines.add_row(name, written(value))
+    Console().print(lines)
 
 
 if __name__ == "__main__":

@@ -50,8 +50,8 @@ def outpaint(config: Config) -> str:
 
     from models.pipeline import Resampling
     from pipelines import storage
-    from pipelines.evaluate import Selection
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.selection import Selection
 
     output = absolute(config.output) if config.output else home("outpainted")
     request = OutpaintRequest(
@@ -66,7 +66,7 @@ def outpaint(config: Config) -> str:
         guidance_scale=config.guidance,
     )
     source = absolute(config.input) if config.input else home("generated")
-    selection = Selection(source, config.source or None, config.split or None, config.limit, spread=False)
+    selection = Selection(source, config.source or None, config.split or None, config.limit, "first")
     selection.shards()
     if not storage.exists(storage.join(request.model, "model_index.json")):
         raise ValueError(f"{request.model}: no PrITTI pipeline here; run jobs/train_dit.py first")

@@ -1,189 +1,199 @@
-"""Scores of any source against any other, from the tables alone: a Ray Data graph over shards, finished in numpy.
+"""Scores of any source against any other, from what `describe` says of each scene.
 
-`describe` turns every scene into statistics, validity records and picture features; `compare` sets two such sets
-against each other. Reconstruction is scored by rebuild.py.
+Every score has a 95 % interval over scenes (metrics/intervals.py). Only distances and neighbourhoods of Inception's
+features bear the usual names (fid, sfid, kid, inception_score, precision, ...); those of other features say whose they
+are: `layout_`, of layout statistics, and `random_`, of an untrained network. Reconstruction is scored by rebuild.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-import ray.data
-import torch
+import ray
 
-from models.scene import CATEGORIES, Scene
-from models.tensors import ground_on_grid
-from pipelines.dataset import Dataset
-from pipelines.metrics import generation, inception, statistics, validity
-from pipelines.scenes.render import bev_picture
-from pipelines.scenes.tables import Shard, find_shards
+from models.scene import CATEGORIES
+from pipelines.metrics import distributions, statistics, validity
+from pipelines.metrics.frechet import frechet_distance, frechet_influence, moments, transport
+from pipelines.metrics.inception_score import inception_score
+from pipelines.metrics.intervals import Estimate, mean_estimate, moved, ratio_estimates
+from pipelines.metrics.kernel_distance import kernel_distance
+from pipelines.metrics.neighbours import Neighbourhood, Side, ball_radii, judged, nearest, prepare, within
 
-READER_CPUS = 0.5
-
-
-# ----------------------------------------------------------------------------------------------------- describe
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which scenes of a dataset directory to take: a source, a split, and at most `limit` of them.
-
-    `spread` takes them evenly from the whole selection, else the first ones.
-    """
-
-    root: str
-    source: str | None = None
-    split: str | None = None
-    limit: int | None = None
-    spread: bool = True
-
-    def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Shards with the rows to take."""
-        shards = find_shards(self.root, "scenes", self.source, self.split)
-        counts = np.array([shard.read("scenes", ["scene_id"]).num_rows for shard in shards])
-        total, starts = int(counts.sum()), np.cumsum(counts) - counts
-        wanted = min(total, self.limit or total)
-        chosen = np.floor((np.arange(wanted) + 0.5) * total / wanted).astype(int) if self.spread else np.arange(wanted)
-        rows = [chosen[(chosen >= s) & (chosen < s + n)] - s for s, n in zip(starts, counts, strict=True)]
-        return [(shard, r.tolist()) for shard, r in zip(shards, rows, strict=True) if len(r)]
+Described = Mapping[str, np.ndarray]
+ROWS_PER_TASK = 4096
+NEIGHBOURS = 3  # of each generated scene that are named
+MEMORISED_QUANTILE = 0.01  # of real scenes' distances to their nearest other
 
 
-class Describer:
-    """Actor. Row in: number of a selected shard. Rows out: one per scene, everything that scores are made of."""
-
-    def __init__(self, chosen: list[tuple[Shard, list[int]]], dataset: Dataset, inception_weights: str | None) -> None:
-        torch.set_num_threads(1)
-        self.chosen, self.dataset = chosen, dataset
-        self.network = inception.load_inception(inception_weights) if inception_weights else None
-        self.slab_offset_m = validity.SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
-
-    def __call__(self, row: dict) -> list[dict]:
-        shard, rows = self.chosen[row["id"]]
-        scenes = shard.scenes(rows)
-        pictures = np.stack([bev_picture(scene) for scene in scenes])
-        features = {"random_features": inception.random_features(pictures)}
-        if self.network is not None:
-            features["pool3"], features["logits"] = inception.inception_features(self.network, pictures)
-        out = []
-        for k, scene in enumerate(scenes):
-            labelled = scene.vegetation_density is not None or scene.vehicle_density is not None
-            fidelity = (
-                validity.label_fidelity(scene, self.dataset.vegetation, self.dataset.vehicle)
-                if labelled
-                else np.zeros((len(validity.LABEL_MEASURES), 2))
-            )
-            out.append(
-                {
-                    "scene_id": scene.scene_id,
-                    "statistics": scene_statistics(scene, self.dataset.spec.ground_classes),
-                    "validity": validity.scene_validity(scene, self.slab_offset_m).ravel(),
-                    "fidelity": fidelity.ravel(),
-                }
-                | {name: values[k] for name, values in features.items()}
-            )
-        return out
-
-
-def scene_statistics(scene: Scene, ground_classes: tuple[str, ...]) -> np.ndarray:
-    """`statistics.layout_statistics` over the dataset's own ground classes."""
-    height, occupied = ground_on_grid(scene, ground_classes, scene.grid)
-    return statistics.layout_statistics(
-        replace(scene, ground_classes=ground_classes, height_m=height, occupied=occupied)
-    )
-
-
-def describe(
-    selection: Selection,
-    dataset: Dataset,
-    inception_weights: str | None = None,
-    num_actors: int = 1,
-    on_scene: Callable[[], None] | None = None,
-) -> dict[str, np.ndarray]:
-    """Per-scene arrays of a selection, ordered by scene id: statistics (n, s), validity (n, 7, 2), features (n, d)."""
-    chosen = selection.shards()
-    graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).flat_map(
-        Describer,
-        fn_constructor_args=(chosen, dataset, inception_weights),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
-        num_cpus=READER_CPUS,
-    )
-    rows = []
-    for row in graph.iter_rows():
-        rows.append(row)
-        if on_scene:
-            on_scene()
-    rows.sort(key=lambda row: row["scene_id"])
-    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    arrays["validity"] = arrays["validity"].reshape(len(rows), -1, 2)
-    arrays["fidelity"] = arrays["fidelity"].reshape(len(rows), -1, 2)
-    return arrays
-
-
-def compare(
-    real: dict[str, np.ndarray], generated: dict[str, np.ndarray], dataset: Dataset, k: tuple[int, ...] = (3,)
-) -> dict:
-    """Scores of `generated` against `real`, both from `describe`, as nested plain numbers.
-
-    With Inception features: FID, IS, precision, recall. Without: distances of layout statistics and of a fixed
-    random network's features, under their own names.
-    """
-    names = statistics.statistic_names(dataset.spec.ground_classes)
-    scores: dict = {"scenes": {"real": len(real["statistics"]), "generated": len(generated["statistics"])}}
-    scores["layout_frechet"] = statistics.layout_frechet(real["statistics"], generated["statistics"])
-    scores["random_frechet"] = features_frechet(real["random_features"], generated["random_features"])
-    scores |= neighbourhood(real["random_features"], generated["random_features"], k, "random_")
-    if "pool3" in real:
-        scores["fid"] = features_frechet(real["pool3"], generated["pool3"])
-        scores["inception_score"] = generation.inception_score(generated["logits"])
-        scores |= neighbourhood(real["pool3"], generated["pool3"], k, "")
-    num = len(CATEGORIES)
-    divergence = statistics.count_divergence(
-        real["statistics"][:, :num].astype(int), generated["statistics"][:, :num].astype(int)
-    )
-    scores["count_divergence_bits"] = divergence
-    scores["statistics"] = {
-        name: {"real": None if np.isnan(a) else float(a), "generated": None if np.isnan(b) else float(b)}
-        for name, a, b in zip(names, _means(real["statistics"]), _means(generated["statistics"]), strict=True)
+def compare(real: Described, generated: Described, ground_classes: Sequence[str], k: Sequence[int] = (3,)) -> dict:
+    """Scores of `generated` against `real`, nested, Estimates at the leaves where an interval can be given."""
+    scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
+    if "statistics" in real and "statistics" in generated:
+        layout = statistics.standardised(real["statistics"], generated["statistics"])
+        scores |= {"layout_frechet": frechet(*layout), "layout_mmd": kernel_distance(*layout)}
+        scores |= layout_scores(real, generated, ground_classes)
+    scores |= {
+        f"random_{name}": value for name, value in feature_scores(real["random"], generated["random"], k).items()
     }
-    rates = [validity.validity_rates(side["validity"]) for side in (real, generated)]
-    scores["validity"] = {name: {"real": rates[0][name], "generated": rates[1][name]} for name in rates[0]}
-    scores["label_fidelity"] = validity.validity_rates(generated["fidelity"], validity.LABEL_MEASURES)
+    if "pool3" in real and "pool3" in generated:
+        names = {"frechet": "fid", "mmd": "kid"}
+        found = feature_scores(real["pool3"], generated["pool3"], k)
+        scores |= {names.get(name, name): value for name, value in found.items()}
+        scores["sfid"] = frechet(real["spatial"], generated["spatial"])
+        scores["inception_score"] = inception_score(generated["logits"])
+        scores["inception_score_real"] = inception_score(real["logits"])
     return scores
 
 
-def _means(values: np.ndarray) -> np.ndarray:
-    """Column means over the scenes that have a value; NaN where none has."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0).sum(axis=0)
-    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+# ----------------------------------------------------------------------------------------------------- features
 
 
-def features_frechet(real: np.ndarray, generated: np.ndarray) -> float:
-    return generation.frechet_distance(generation.moments(real), generation.moments(generated))
+def frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
+    a, b = moments(real), moments(generated)
+    between = transport(a, b)
+    return moved(frechet_distance(a, b, between), frechet_influence(real, generated, a, b, between))
 
 
-def neighbourhood(real: np.ndarray, generated: np.ndarray, k: tuple[int, ...], prefix: str) -> dict[str, float]:
-    """Improved precision and recall at equal numbers on both sides, evenly spread over the larger one."""
-    n = min(len(real), len(generated))
-    if n <= max(k):
-        return {}
-    real, generated = (side[np.arange(n) * len(side) // n] for side in (real, generated))
-    found = generation.precision_recall(real, generated, k)
+def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
+    """frechet, mmd, and for each k precision, recall, density and coverage.
+
+    The intervals of these four are over the judged samples; the balls are held fixed, as a sample drawn twice would be
+    its own neighbour. Neighbourhoods that there are too few samples for are left out.
+    """
+    found = {"frechet": frechet(real, generated), "mmd": kernel_distance(real, generated)}
+    sizes = [size for size in k if size < min(len(real), len(generated))]
+    for one in spread_neighbourhoods(real, generated, sizes) if sizes else ():
+        judged_samples = {
+            "precision": one.in_real > 0,
+            "recall": one.in_generated,
+            "density": one.in_real / one.k,
+            "coverage": one.covered,
+        }
+        found |= {
+            f"{name}_k{one.k}": mean_estimate(values, int(name in ("precision", "density")))
+            for name, values in judged_samples.items()
+        }
+    return found
+
+
+def spread_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[Neighbourhood]:
+    """`neighbours.neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each; features are shared, not copied."""
+    sides = prepare(real, generated, k)
+    shared = [ray.put(side) for side in sides]
+    radii = [
+        np.concatenate(ray.get([radii_task.remote(part, rows, k) for rows in row_parts(len(side))]), axis=1)
+        for part, side in zip(shared, sides, strict=True)
+    ]
+    balls = [ray.put(part) for part in radii]
+    return judged(k, ray.get([within_task.remote(*shared, *balls, rows) for rows in row_parts(len(real))]))
+
+
+def row_parts(count: int) -> list[range]:
+    return [range(start, min(start + ROWS_PER_TASK, count)) for start in range(0, count, ROWS_PER_TASK)]
+
+
+@ray.remote(num_cpus=1)
+def radii_task(side: Side, rows: range, k: Sequence[int]) -> np.ndarray:
+    return ball_radii(side, rows, k)
+
+
+@ray.remote(num_cpus=1)
+def within_task(*arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return within(*arguments)
+
+
+def memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
+    """Distances of generated samples to the nearest real ones, beside those of real samples to their nearest other.
+
+    `memorised`: share of generated samples nearer to a real one than all but 1 % of real samples are to another;
+    `nearest` (m, 3) real rows and `distance` (m, 3) of each generated sample, nearest first (paper, supplement).
+    """
+    sides = prepare(real, generated, (NEIGHBOURS,))
+    squared, index = nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
+    own = np.sqrt(nearest(sides[0], sides[0], range(len(real)), 1, themselves=True)[0][:, 0])
+    distance = np.sqrt(squared)
+    found = {}
+    for name, values in (("generated", distance[:, 0]), ("real", own)):
+        found[name] = {
+            "mean": mean_estimate(values),
+            "median": float(np.median(values)),
+            "minimum": float(values.min()),
+            "maximum": float(values.max()),
+        }
+    limit = np.quantile(own, MEMORISED_QUANTILE)
+    found["memorised"] = mean_estimate(distance[:, 0] < limit)
+    found["copies"] = mean_estimate(distance[:, 0] == 0)
+    return found | {"nearest": index, "distance": distance}
+
+
+# ------------------------------------------------------------------------------------------------------ layouts
+
+
+def layout_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict:
+    """Statistics and validity of both sides, their distances, and whether scenes are what was asked for."""
+    names = statistics.statistic_names(ground_classes)
+    sides = {"real": real, "generated": generated}
+    means = {side: scene_means(part["statistics"]) for side, part in sides.items()}
+    rates = {side: pair_ratios(part["validity"]) for side, part in sides.items()}
+    categories = slice(0, len(CATEGORIES))
+    # What two halves of the real scenes differ by: no source can come nearer than about that.
+    halves = real["statistics"][::2], real["statistics"][1::2]
+    floor = distributions.histogram_distances(real["histograms"][::2], real["histograms"][1::2])
+    distances = distributions.histogram_distances(real["histograms"], generated["histograms"])
+    counts = distributions.count_distances(*(part["statistics"][:, categories] for part in sides.values()))
+    count_floor = distributions.count_distances(*(half[:, categories] for half in halves))
     return {
-        f"{prefix}{name}_k{r.k}": value
-        for r in found
-        for name, value in (("precision", r.precision), ("recall", r.recall))
+        "statistics": {name: {side: means[side][i] for side in sides} for i, name in enumerate(names)},
+        "count_distance": {name: {"between": counts[name], "within_real": count_floor[name].value} for name in counts},
+        "distance": {
+            name: {"between": found, "within_real": floor[name].value if name in floor else None}
+            for name, found in distances.items()
+        },
+        "validity": {name: {side: rates[side][i] for side in sides} for i, name in enumerate(validity.MEASURES)},
+        "label_fidelity": dict(zip(validity.LABEL_MEASURES, pair_ratios(generated["fidelity"]), strict=True)),
     }
 
 
-def flattened(scores: dict, prefix: str = "") -> dict[str, float]:
-    """Nested scores as one level, names joined by dots; None left out."""
-    flat: dict[str, float] = {}
+def scene_means(values: np.ndarray) -> list[Estimate | None]:
+    """Column means over the scenes that have a value (NaN: it has none); None where no scene has."""
+    known = np.isfinite(values)
+    return ratio_estimates(np.where(known, values, 0), known)
+
+
+def pair_ratios(records: np.ndarray) -> list[Estimate | None]:
+    """Rates of measures from records (n, 2 measures): numerator and denominator in turn."""
+    return ratio_estimates(records[:, ::2], records[:, 1::2])
+
+
+# ------------------------------------------------------------------------------------------------------ writing
+
+
+def flattened(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
+    """Nested scores as one level, names joined by dots; None, arrays and what is not finite left out."""
+    flat: dict[str, Estimate | float] = {}
     for name, value in scores.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             flat |= flattened(value, f"{prefix}{name}.")
-        elif value is not None and np.isfinite(value):
+        elif isinstance(value, Estimate):
+            flat[prefix + name] = value
+        elif isinstance(value, int | float) and np.isfinite(value):
             flat[prefix + name] = float(value)
     return flat
+
+
+def plain(scores: Mapping) -> dict:
+    """Nested scores for JSON: an Estimate as value, low and high; arrays left out; what is not finite as null."""
+
+    def number(value: float) -> float | None:
+        return value if np.isfinite(value) else None
+
+    def converted(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return plain(value)
+        if isinstance(value, Estimate):
+            return {name: number(part) for name, part in value._asdict().items()}
+        return number(float(value)) if isinstance(value, np.floating | float) else value
+
+    return {name: converted(value) for name, value in scores.items() if not isinstance(value, np.ndarray)}

@@ -13,10 +13,10 @@ from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.encode import gpus_per_actor
-from pipelines.evaluate import Selection
 from pipelines.generate import load_pipeline, pipeline_digest
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.tables import Shard
+from pipelines.selection import Selection
 
 
 @dataclass(frozen=True)

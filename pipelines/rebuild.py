@@ -19,8 +19,8 @@ from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
 from pipelines import storage
+from pipelines.describe import READER_CPUS
 from pipelines.encode import gpus_per_actor, load_lvae
-from pipelines.evaluate import READER_CPUS, Selection
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
     MEMORY,
@@ -43,6 +43,7 @@ from pipelines.metrics.reconstruction import (
 from pipelines.scenes.render import bev_picture, picture_3d
 from pipelines.scenes.tables import Shard
 from pipelines.scenes.voxels import NUM_CLASSES, Outside, VoxelGrid, outside, voxelise
+from pipelines.selection import Selection
 
 Chunk = tuple[Shard, list[int]]  # scenes of one shard, by row
 AP_VARIANTS = {

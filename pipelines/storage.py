@@ -32,6 +32,13 @@ def exists(uri: str) -> bool:
     return fs.get_file_info(path).type != pafs.FileType.NotFound
 
 
+def fingerprint(uri: str) -> list[str | int]:
+    """Path, size in bytes and time of change of a file: another one after it was written again."""
+    fs, path = resolve(uri)
+    info = fs.get_file_info(path)
+    return [path, info.size, str(info.mtime)]
+
+
 def list_files(uri: str, suffix: str) -> list[str]:
     """Sorted URIs of the files under a directory, hidden and temporary ones left out; empty if it is missing."""
     fs, path = resolve(uri)

@@ -230,26 +230,54 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
             output=str(tmp_path),
         )
     )
-    assert scores["generation"]["scenes"] == {"real": 16, "generated": 9}
+    made = scores["generation"]
+    assert made["scenes"] == {"real": 9, "generated": 9}
+    assert made["layout_frechet"]["low"] < made["layout_frechet"]["value"] < made["layout_frechet"]["high"]
     assert 0 <= scores["reconstruction"]["ground_iou"] <= 1
     written = duckdb.sql(
-        f"select value from '{tmp_path}/metrics.parquet' where metric = 'generation.layout_frechet'"
+        f"select value, low, high from '{tmp_path}/metrics.parquet' where metric = 'generation.layout_frechet'"
     ).fetchall()
-    assert np.isclose(written[0][0], scores["generation"]["layout_frechet"])
-    assert "fid" not in scores["generation"]
+    assert written[0] == tuple(made["layout_frechet"].values())
+    assert "fid" not in made and "precision_k3" not in made
+    page = (tmp_path / "evaluation.html").read_text()
+    assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
 
 
-def test_real_against_real_is_near_perfect(home):
+def test_real_against_real_is_near_perfect(home, tmp_path):
     """The training scenes scored against themselves: the evaluator's own floor."""
     from pipelines.dataset import Dataset
-    from pipelines.evaluate import Selection, compare, describe
+    from pipelines.describe import Looks, describe
+    from pipelines.evaluate import compare
+    from pipelines.selection import Selection
 
     dataset = Dataset.open(str(home / "datasets/smoke"))
-    side = describe(Selection(dataset.root, "town", "train"), dataset)
-    scores = compare(side, side, dataset)
-    assert abs(scores["layout_frechet"]) < 1e-4 and abs(scores["random_frechet"]) < 1e-4
-    assert scores["random_precision_k3"] == scores["random_recall_k3"] == 1.0
-    assert scores["label_fidelity"]["joint_fidelity"] == 1.0
+    side = describe(Selection(dataset.root, "town", "train"), dataset, Looks(), str(tmp_path / "described"))
+    scores = compare(side, side, dataset.spec.ground_classes)
+    assert abs(scores["layout_frechet"].value) < 1e-4 and abs(scores["random_frechet"].value) < 1e-4
+    assert scores["random_precision_k3"].value == scores["random_recall_k3"].value == 1.0
+    assert scores["random_coverage_k3"].value == 1.0
+    assert scores["label_fidelity"]["joint_fidelity"].value == 1.0
+    assert all(found["between"].value == 0 for found in scores["distance"].values())
+
+
+def test_a_description_goes_on_where_it_stopped(home, tmp_path, monkeypatch):
+    """Parts that are there are kept, missing ones made again; other options or other scenes begin anew."""
+    from pipelines import describe as module
+    from pipelines.dataset import Dataset
+    from pipelines.selection import Selection
+
+    dataset = Dataset.open(str(home / "datasets/smoke"))
+    chosen, looks, directory = Selection(dataset.root, "town", "train"), module.Looks(), tmp_path / "described"
+    first = module.describe(chosen, dataset, looks, str(directory))
+    parts = sorted(directory.glob("part-*.parquet"))
+    assert len(parts) == len(chosen.shards()) > 1
+    kept, times = parts[1:], [part.stat().st_mtime_ns for part in parts[1:]]
+    parts[0].unlink()
+    again = module.describe(chosen, dataset, looks, str(directory))
+    assert [part.stat().st_mtime_ns for part in kept] == times
+    assert all(np.array_equal(first[name], again[name], equal_nan=name == "statistics") for name in first)
+    module.describe(chosen, dataset, module.Looks(supersample=2), str(directory))
+    assert all(part.stat().st_mtime_ns > time for part, time in zip(kept, times, strict=True))
 
 
 def test_an_lvae_of_another_dataset_is_refused(home, tmp_path):

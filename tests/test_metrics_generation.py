@@ -1,4 +1,4 @@
-"""FID, Inception score, precision and recall against literal float64 versions of the ADM formulas."""
+"""Scores of features against literal float64 versions of their definitions, and intervals against repetition."""
 
 import warnings
 
@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from pipelines.metrics import generation
-from pipelines.metrics.generation import (
-    Moments,
-    frechet_distance,
-    inception_score,
-    moments,
-    neighbour_radii,
-    precision_recall,
-)
+from pipelines.metrics import inception_score as inception_score_module
+from pipelines.metrics import kernel_distance as kernel_distance_module
+from pipelines.metrics import neighbours
+from pipelines.metrics.frechet import Moments, frechet_distance, frechet_influence, moments, transport
+from pipelines.metrics.inception_score import inception_score
+from pipelines.metrics.intervals import mean_estimate, moved, ratio_estimates
+from pipelines.metrics.kernel_distance import kernel_distance
+from pipelines.metrics.neighbours import ball_radii, nearest, neighbourhoods, principal_axes, short_vectors
 
 # ------------------------------------------------------------------------------------------ Frechet distance
 
@@ -76,26 +75,28 @@ def test_moments_add_up_exactly_in_any_grouping():
 # ------------------------------------------------------------------------------------------ Inception score
 
 
-def test_inception_score_equals_the_literal_version():
+def test_inception_score_equals_the_literal_version(monkeypatch):
+    monkeypatch.setattr(inception_score_module, "SPLIT_SAMPLES", 500)
     logits = np.random.default_rng(3).normal(0, 2, (1300, 20))
     scores = []
     for start in range(0, 1300, 500):
         p = np.array([np.exp(row) / np.exp(row).sum() for row in logits[start : start + 500]])
         scores.append(np.exp(np.mean([(row * (np.log(row) - np.log(p.mean(0)))).sum() for row in p])))
-    assert inception_score(logits, split_size=500) == pytest.approx(np.mean(scores), rel=1e-9)
+    assert inception_score(logits).value == pytest.approx(np.mean(scores), rel=1e-9)
 
 
 def test_inception_score_of_certain_and_of_equal_predictions():
-    assert inception_score(np.eye(7).repeat(3, axis=0) * 1e4) == pytest.approx(7)
-    assert inception_score(np.ones((9, 7))) == pytest.approx(1)
-    assert inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])) == pytest.approx(1)  # a class that never occurs
+    assert inception_score(np.eye(7).repeat(3, axis=0) * 1e4).value == pytest.approx(7)
+    assert inception_score(np.ones((9, 7))).value == pytest.approx(1)
+    assert inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])).value == pytest.approx(1)  # a class that never occurs
 
 
-# ------------------------------------------------------------------------------------------ precision and recall
+# ------------------------------------------------------------------------------------------ neighbourhoods
 
 
-def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float]:
-    """Sorted distances and loops; float64 differences, no matrix product."""
+def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float, float, float]:
+    """Precision, recall, density, coverage by sorted distances and loops; float64 differences, no matrix product."""
+    real, generated = real.astype(np.float64), generated.astype(np.float64)
 
     def distances(x, y):
         return np.array([[np.square(p - q).sum() for q in y] for p in x])
@@ -104,31 +105,45 @@ def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float,
         every = distances(x, x)
         return np.array([sorted(np.delete(row, i))[k - 1] for i, row in enumerate(every)])
 
-    between = distances(real, generated)
-    precision = np.mean(
-        [(between[:, j] <= radii_real).any() for radii_real in [radii(real)] for j in range(len(generated))]
-    )
-    radii_generated = radii(generated)
+    between, radii_real, radii_generated = distances(real, generated), radii(real), radii(generated)
+    precision = np.mean([(between[:, j] <= radii_real).any() for j in range(len(generated))])
     recall = np.mean([(between[i] <= radii_generated).any() for i in range(len(real))])
-    return float(precision), float(recall)
+    density = np.mean([(between[:, j] <= radii_real).sum() for j in range(len(generated))]) / k
+    coverage = np.mean([(between[i] <= radii_real[i]).any() for i in range(len(real))])
+    return precision, recall, density, coverage
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_precision_and_recall_equal_brute_force_exactly(seed, monkeypatch):
-    monkeypatch.setattr(generation, "BLOCK_ROWS", 32)
+def scores(real, generated, k) -> list[tuple]:
+    found = neighbourhoods(real, generated, k)
+    return [(one.precision, one.recall, one.density, one.coverage) for one in found]
+
+
+def clustered(rng, n: int, d: int, shift: float) -> np.ndarray:
+    """Some strong directions and many weak ones, as features have: the filter decides most, not all."""
+    strength = 0.85 ** np.arange(d)
+    return (shift + rng.normal(size=(n, d)) + rng.integers(0, 3, (n, 1))) * strength
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_neighbourhoods_equal_brute_force_exactly(seed, monkeypatch):
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", 32)
     rng = np.random.default_rng(seed)
-    real, generated = rng.normal(size=(90, 6)), rng.normal(0.5, 0.8, size=(70, 6))
-    for result in precision_recall(real, generated, k=(1, 3, 5)):
-        assert (result.precision, result.recall) == brute_force(real, generated, result.k)
-        assert 0 < result.precision <= 1 and 0 < result.recall < 1
+    if seed % 2:
+        real, generated = rng.normal(size=(90, 6)), rng.normal(0.5, 0.8, size=(70, 6))
+    else:
+        real, generated = clustered(rng, 90, 60, 0).astype(np.float32), clustered(rng, 130, 60, 0.3).astype(np.float32)
+        assert len(principal_axes(real, generated).axes) < 30
+    for k, got in zip((1, 3, 5), scores(real, generated, (1, 3, 5)), strict=True):
+        assert got == brute_force(real, generated, k)
+        assert 0 < got[0] <= 1 and 0 < got[1] <= 1
 
 
 def test_distances_that_are_equal_count_as_within():
     """Integer points far from the origin: many ties, exact in differences, blurred in a matrix product."""
     rng = np.random.default_rng(5)
     real, generated = rng.integers(0, 4, (2, 60, 3)).astype(float) + 1e6
-    for result in precision_recall(real, generated, k=(1, 2, 3)):
-        assert (result.precision, result.recall) == brute_force(real, generated, result.k)
+    for k, got in zip((1, 2, 3), scores(real, generated, (1, 2, 3)), strict=True):
+        assert got == brute_force(real, generated, k)
 
 
 def test_a_memorised_sample_lies_on_the_border_of_a_ball():
@@ -137,27 +152,122 @@ def test_a_memorised_sample_lies_on_the_border_of_a_ball():
     base = rng.normal(size=(40, 512))
     generated = rng.normal(50, 1, size=(40, 512))
     generated[0] = base[1]
-    got = precision_recall(base, generated, k=[1])[0]
-    assert got.precision == 1 / 40
-    assert (got.precision, got.recall) == brute_force(base, generated, 1)
+    got = scores(base, generated, [1])[0]
+    assert got[0] == 1 / 40
+    assert got == brute_force(base, generated, 1)
 
 
 def test_duplicated_samples_have_radius_zero_and_still_contain_their_copies():
     rng = np.random.default_rng(7)
     real = np.repeat(rng.normal(size=(5, 16)) * 1e3, 4, axis=0)  # every sample four times: radius 0 at k = 3
-    np.testing.assert_array_equal(neighbour_radii(real, [3]), 0)
-    got = precision_recall(real, real[::4].repeat(4, axis=0), k=[3])[0]
-    assert got.precision == got.recall == 1
-    got = precision_recall(real, real + 1e-3, k=[3])[0]
-    assert got.precision == got.recall == 0
+    side = short_vectors(real, principal_axes(real, real))
+    np.testing.assert_array_equal(ball_radii(side, range(20), [3]), 0)
+    assert scores(real, real[::4].repeat(4, axis=0), [3])[0][:2] == (1, 1)
+    assert scores(real, real + 1e-3, [3])[0] == (0, 0, 0, 0)
 
 
 def test_constant_features_lie_within_each_other_only_if_equal():
     constant = np.full((6, 3), 0.1)
-    got = precision_recall(constant, constant, k=[3])[0]
-    assert got.precision == got.recall == 1
-    got = precision_recall(constant, constant + 1e-9, k=[3])[0]
-    assert got.precision == got.recall == 0
+    assert scores(constant, constant, [3])[0] == (1, 1, 2, 1)
+    assert scores(constant, constant + 1e-9, [3])[0] == (0, 0, 0, 0)
+
+
+def test_nearest_names_the_neighbours_in_order(monkeypatch):
+    rng = np.random.default_rng(9)
+    a, b = clustered(rng, 50, 40, 0), clustered(rng, 80, 40, 0)
+    b[30] = b[60]  # equal distances: the lower index first
+    basis = principal_axes(a, b)
+    squared, index = nearest(short_vectors(a, basis), short_vectors(b, basis), range(10, 50), 4)
+    every = np.array([[np.square(p - q).sum() for q in b] for p in a[10:]])
+    assert np.array_equal(index, np.argsort(every, axis=1, kind="stable")[:, :4])
+    assert np.array_equal(squared, np.sort(every, axis=1)[:, :4])
+
+
+# ------------------------------------------------------------------------------------------ kernel distance
+
+
+def literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
+    """Binkowski et al., by loops."""
+
+    def k(a, b):
+        return (a @ b / len(a) + 1) ** 3
+
+    n, m = len(x), len(y)
+    own = sum(k(x[i], x[j]) for i in range(n) for j in range(n) if i != j) / (n * (n - 1))
+    other = sum(k(y[i], y[j]) for i in range(m) for j in range(m) if i != j) / (m * (m - 1))
+    return own + other - 2 * np.mean([[k(a, b) for b in y] for a in x])
+
+
+def test_kernel_distance_equals_the_literal_version(monkeypatch):
+    rng = np.random.default_rng(10)
+    x, y = rng.normal(size=(40, 8)), rng.normal(0.4, 1.2, size=(50, 8))
+    got = kernel_distance(x, y)
+    assert got.value == pytest.approx(literal_kernel_distance(x, y), rel=1e-9)
+    assert got.low < got.value < got.high
+    monkeypatch.setattr(kernel_distance_module, "GROUP_SAMPLES", 20)
+    halves = [literal_kernel_distance(x[k::2], y[k::2]) for k in range(2)]
+    assert kernel_distance(x, y).value == pytest.approx(np.mean(halves), rel=1e-9)
+
+
+def test_kernel_distance_of_equal_sources_is_zero_within_its_interval():
+    rng = np.random.default_rng(11)
+    got = kernel_distance(*rng.normal(size=(2, 300, 16)))
+    assert got.low < 0 < got.high
+
+
+# ------------------------------------------------------------------------------------------ intervals
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say():
+    """200 experiments of 150 scenes each: a mean and a share of objects."""
+    rng = np.random.default_rng(12)
+    held = np.zeros(2)
+    for _ in range(200):
+        objects = rng.poisson(5, 150) + 1
+        bad = rng.binomial(objects, 0.2)
+        mean, share = mean_estimate(rng.exponential(2, 150)), ratio_estimates(bad[:, None], objects[:, None])[0]
+        held += [mean.low <= 2 <= mean.high, share.low <= 0.2 <= share.high]
+    assert (np.abs(held / 200 - 0.95) < 0.045).all()
+
+
+def test_the_interval_of_a_frechet_distance_is_as_wide_as_the_distance_varies():
+    rng = np.random.default_rng(13)
+    scale = 0.8 ** np.arange(24)
+
+    def draw() -> tuple[np.ndarray, np.ndarray]:
+        return rng.normal(size=(400, 24)) * scale, rng.normal(0.2, 1.2, size=(400, 24)) * scale
+
+    repeated = [frechet_distance(*map(moments, draw())) for _ in range(60)]
+    widths = []
+    for _ in range(5):
+        real, generated = draw()
+        a, b = moments(real), moments(generated)
+        between = transport(a, b)
+        influences = frechet_influence(real, generated, a, b, between)
+        got = moved(frechet_distance(a, b, between), influences)
+        assert got.low < got.value < got.high
+        widths.append(got.high - got.low)
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * np.std(repeated), rel=0.25)
+
+
+def test_influences_are_the_derivatives_of_the_distance():
+    """Against moments that move a little towards one sample."""
+    rng = np.random.default_rng(14)
+    real, generated = rng.normal(size=(600, 5)), rng.normal(0.5, 1.5, size=(700, 5))
+    a, b = moments(real), moments(generated)
+    influences = frechet_influence(real, generated, a, b, transport(a, b))
+
+    def towards(side: Moments, sample: np.ndarray, share: float) -> Moments:
+        step = sample - side.mean
+        covariance = (1 - share) * side.covariance + share * np.outer(step, step)
+        return Moments(side.count, side.mean + share * step, covariance * (side.count - 1))
+
+    share = 1e-6
+    for i in (0, 17, 300):
+        slope = (frechet_distance(towards(a, real[i], share), b) - frechet_distance(a, b)) / share
+        assert slope == pytest.approx(influences[0][i], rel=1e-3, abs=0.02)
+        slope = (frechet_distance(a, towards(b, generated[i], share)) - frechet_distance(a, b)) / share
+        assert slope == pytest.approx(influences[1][i], rel=1e-3, abs=0.02)
 
 
 def test_bad_features_are_refused():
@@ -165,13 +275,15 @@ def test_bad_features_are_refused():
     broken = x.copy()
     broken[3, 1] = np.nan
     with pytest.raises(ValueError, match="hold 3 samples, at least 4"):
-        precision_recall(x[:3], x, k=[3])
+        neighbourhoods(x[:3], x, k=[3])
     with pytest.raises(ValueError, match=r"generated features hold NaN .* first 3"):
-        precision_recall(x, broken)
+        neighbourhoods(x, broken)
     with pytest.raises(ValueError, match="real features have 4 dimensions, generated 3"):
-        precision_recall(x, x[:, :3])
+        neighbourhoods(x, x[:, :3])
     with pytest.raises(ValueError, match="k must name"):
-        precision_recall(x, x, k=[0])
+        neighbourhoods(x, x, k=[0])
+    with pytest.raises(ValueError, match="at least 2"):
+        kernel_distance(x, x[:1])
     with pytest.raises(ValueError, match="NaN"):
         moments(broken)
     with pytest.raises(ValueError, match="4 and 3 dimensions"):

@@ -191,7 +191,7 @@ def load_inception(path: str | Path) -> Inception:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
-    sha256 = _sha256(path)
+    sha256 = file_sha256(path)
     claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     if claimed and not sha256.startswith(claimed[1]):
         raise ValueError(f"{path}: corrupted, its sha256 starts with {sha256[:8]} instead of {claimed[1]}")
@@ -211,7 +211,7 @@ def load_inception(path: str | Path) -> Inception:
     return network
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

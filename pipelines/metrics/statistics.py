@@ -1,7 +1,4 @@
-"""Layout statistics of scenes and distances between two sources by them: no pictures, no weights, never called FID.
-
-One vector of named numbers per scene; sources are compared as sets of such vectors.
-"""
+"""Layout statistics: one vector of named numbers per scene. Sources compare as sets of such vectors, without pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from models.scene import CATEGORIES, Scene
-from pipelines.metrics.generation import frechet_distance, moments
 
 EXTENTS = ("length_m", "width_m", "height_m")
 
@@ -36,51 +32,21 @@ def layout_statistics(scene: Scene) -> np.ndarray:
     return np.concatenate([counts, extents.ravel(), shares])
 
 
-def layout_frechet(reference: np.ndarray, other: np.ndarray) -> float:
-    """Squared Frechet distance of two sources' layout statistics (n, s) and (m, s), standardised by the reference.
+def standardised(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Layout statistics (n, s) and (m, s) as features: shifted and scaled by the reference's mean and deviation.
 
-    Each column is shifted and scaled by the reference's mean and deviation (a constant column only shifted: its unit
-    is 1), so the number has no unit and about one column's weight in each column. A NaN, an absent category's size,
-    says nothing and counts as the reference's mean. Raises ValueError for fewer than 2 scenes or unequal columns.
+    So distances have no unit, and each column about the same weight (a constant column is only shifted: its unit is 1).
+    A NaN, an absent category's size, says nothing and counts as the reference's mean. Raises ValueError for fewer than
+    2 scenes or unequal columns.
     """
     reference, other = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if reference.ndim != 2 or other.ndim != 2 or reference.shape[1] != other.shape[1]:
         raise ValueError(f"layout statistics must be (scenes, columns), alike: {reference.shape}, {other.shape}")
     if min(len(reference), len(other)) < 2:
-        raise ValueError(f"layout_frechet needs at least 2 scenes a side, got {len(reference)} and {len(other)}")
+        raise ValueError(f"layouts compare from 2 scenes a side, got {len(reference)} and {len(other)}")
     known = ~np.isnan(reference)
     number = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, reference, 0).sum(axis=0) / number
     deviation = np.sqrt(np.where(known, np.square(reference - mean), 0).sum(axis=0) / number)
     scale = np.where(deviation > 1e-9 * np.maximum(np.abs(mean), 1), deviation, 1.0)
-    standardised = (np.where(np.isnan(part), 0.0, (part - mean) / scale) for part in (reference, other))
-    return frechet_distance(*(moments(part) for part in standardised))
-
-
-def jensen_shannon(p: np.ndarray, q: np.ndarray) -> float:
-    """Jensen-Shannon divergence in bits, in [0, 1], of two histograms (b,) over the same bins."""
-    p, q = np.asarray(p, np.float64), np.asarray(q, np.float64)
-    if p.shape != q.shape or p.sum() <= 0 or q.sum() <= 0 or min(p.min(), q.min()) < 0:
-        raise ValueError("Jensen-Shannon needs two histograms over the same bins, neither empty nor negative")
-    p, q = p / p.sum(), q / q.sum()
-    middle = (p + q) / 2
-    return float(np.clip((_entropy_bits(middle) - (_entropy_bits(p) + _entropy_bits(q)) / 2), 0.0, 1.0))
-
-
-def count_divergence(reference_counts: np.ndarray, other_counts: np.ndarray) -> dict[str, float]:
-    """Jensen-Shannon divergence (bits) of each category's counts per scene; counts (n, 11) and (m, 11), integers.
-
-    One bin per count. Finite samples differ from themselves: two halves of the reference give the floor to compare
-    with.
-    """
-    divergence = {}
-    for c, category in enumerate(CATEGORIES):
-        sides = np.asarray(reference_counts)[:, c].astype(int), np.asarray(other_counts)[:, c].astype(int)
-        bins = max(side.max(initial=0) for side in sides) + 1
-        divergence[category] = jensen_shannon(*(np.bincount(side, minlength=bins) for side in sides))
-    return divergence
-
-
-def _entropy_bits(p: np.ndarray) -> float:
-    p = p[p > 0]
-    return float(-(p * np.log2(p)).sum())
+    return tuple(np.where(np.isnan(part), 0.0, (part - mean) / scale) for part in (reference, other))

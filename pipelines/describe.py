@@ -1,0 +1,194 @@
+"""Scenes or pictures -> what scores are made of: a Ray Data graph with a Parquet file per part, finished parts kept.
+
+Files hold a row per scene (DESCRIBED names the columns), so that a long description goes on where it stopped and can be
+read by anyone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import pyarrow as pa
+import ray.data
+import torch
+
+from models.scene import Scene
+from models.tensors import ground_on_grid
+from pipelines import storage
+from pipelines.dataset import Dataset
+from pipelines.metrics import distributions, inception, statistics, validity
+from pipelines.scenes.render import bev_picture
+from pipelines.scenes.tables import Shard
+from pipelines.selection import Selection
+
+READER_CPUS = 0.5
+VERSION = 1  # of what a description holds; another one is made anew
+PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
+# The columns besides scene_id: rows of numbers, of these types.
+DESCRIBED = {
+    "statistics": np.float64,
+    "histograms": np.uint32,
+    "validity": np.float64,
+    "fidelity": np.float64,
+    "random": np.float32,
+    "pool3": np.float32,
+    "spatial": np.float32,
+    "logits": np.float32,
+}
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How pictures are made and seen: mean of supersample^2 points a pixel; Inception weights of this file, if any."""
+
+    supersample: int = 1
+    inception: str = ""
+
+
+def features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
+    """Features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and with a network Inception's."""
+    named = {"random": inception.random_features(pictures)}
+    if network is not None:
+        named |= inception.inception_features(network, pictures)._asdict()
+    return named
+
+
+def scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
+    """Statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes, over the dataset's ground classes."""
+    slab_offset_m = validity.SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
+    for scene in scenes:
+        classes = dataset.spec.ground_classes
+        height, occupied = ground_on_grid(scene, classes, scene.grid)
+        scene = replace(scene, ground_classes=classes, height_m=height, occupied=occupied)
+        rows["statistics"].append(statistics.layout_statistics(scene))
+        rows["histograms"].append(distributions.scene_histograms(scene))
+        rows["validity"].append(validity.scene_validity(scene, slab_offset_m).ravel())
+        rows["fidelity"].append(label_fidelity(scene, dataset))
+    return {name: np.stack(values) for name, values in rows.items()}
+
+
+def label_fidelity(scene: Scene, dataset: Dataset) -> np.ndarray:
+    """(6,) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels."""
+    if scene.vegetation_density is None and scene.vehicle_density is None:
+        return np.zeros(2 * len(validity.LABEL_MEASURES))
+    return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle).ravel()
+
+
+class Describer:
+    """Actor. Row in: number of a part, a shard with rows. Row out: the number of its scenes. Writes the part's file."""
+
+    def __init__(self, parts: list[tuple[Shard, list[int]]], dataset: Dataset, looks: Looks, directory: str) -> None:
+        torch.set_num_threads(1)
+        self.parts, self.dataset, self.looks, self.directory = parts, dataset, looks, directory
+        self.network = inception.load_inception(looks.inception) if looks.inception else None
+
+    def __call__(self, row: dict) -> dict:
+        shard, rows = self.parts[row["id"]]
+        scenes = shard.scenes(rows)
+        pictures = np.stack([bev_picture(scene, PICTURE_PX, self.looks.supersample) for scene in scenes])
+        columns = scene_rows(scenes, self.dataset) | features(pictures, self.network)
+        write_part(self.directory, row["id"], [scene.scene_id for scene in scenes], columns)
+        return {"scenes": len(scenes)}
+
+
+def part_path(directory: str, number: int) -> str:
+    return storage.join(directory, f"part-{number:05d}.parquet")
+
+
+def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
+    """One row per scene: its id and lists of numbers."""
+    arrays = {"scene_id": pa.array(scene_ids, pa.string())}
+    for name, values in columns.items():
+        flat = pa.array(np.ascontiguousarray(values, DESCRIBED[name]).ravel())
+        arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    storage.write_parquet(pa.table(arrays), part_path(directory, number))
+
+
+def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
+    """All parts, in order: scene_id (n,) and the columns (n, width)."""
+    table = pa.concat_tables([storage.read_parquet(part_path(directory, number)) for number in range(count)])
+    described = {"scene_id": table["scene_id"].to_numpy()}
+    for name in table.column_names[1:]:
+        column = table[name].combine_chunks()
+        described[name] = column.flatten().to_numpy().reshape(len(table), -1)
+    return described
+
+
+def describe(
+    selection: Selection,
+    dataset: Dataset,
+    looks: Looks,
+    directory: str,
+    num_actors: int = 1,
+    on_scenes: Callable[[int], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Per-scene arrays of a selection, in the order of its shards; fidelity and validity flat, see DESCRIBED.
+
+    Parts that DIRECTORY holds of the same selection and looks are read, the rest is made. Row in: number of a part.
+    Row out: number of scenes. Fan-out: one task per shard.
+    """
+    parts = selection.shards()
+    files = [
+        storage.fingerprint(shard.path(table)) for shard, _ in parts for table in ("scenes", "primitives", "rasters")
+    ]
+    judged_by = [asdict(part) for part in (dataset.vegetation, dataset.vehicle)] + list(dataset.spec.ground_classes)
+    claim(directory, {"selection": asdict(selection), "files": files, "labels": judged_by} | digest(looks))
+    missing = []
+    for number, (_, rows) in enumerate(parts):
+        if storage.exists(part_path(directory, number)):
+            if on_scenes:
+                on_scenes(len(rows))
+        else:
+            missing.append(number)
+    for row in fan_out(missing, Describer, (parts, dataset, looks, directory), num_actors):
+        if on_scenes:
+            on_scenes(row["scenes"])
+    return read_parts(directory, len(parts))
+
+
+def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
+    """Scenes by their number within the described selection, in the order asked for."""
+    counts = np.array([len(rows) for _, rows in parts])
+    starts = np.cumsum(counts) - counts
+    scenes = {}
+    for number in np.unique(np.searchsorted(starts, indices, side="right") - 1):
+        shard, rows = parts[number]
+        wanted = np.unique(indices[(indices >= starts[number]) & (indices < starts[number] + len(rows))])
+        for index, scene in zip(wanted, shard.scenes([rows[i - starts[number]] for i in wanted]), strict=True):
+            scenes[index] = scene
+    return [scenes[index] for index in indices]
+
+
+def fan_out(numbers: list[int], actor: type, arguments: tuple, num_actors: int) -> Iterator[dict]:
+    """Rows that actors return for the numbers {"id": number}, as they come; nothing is started for none."""
+    if numbers:
+        yield from (
+            ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
+            .map(
+                actor,
+                fn_constructor_args=arguments,
+                compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(numbers))),
+                num_cpus=READER_CPUS,
+            )
+            .iter_rows()
+        )
+
+
+def digest(looks: Looks) -> dict:
+    """What tells one description from another; weights count by content, not by name."""
+    return asdict(looks) | {
+        "version": VERSION,
+        "inception": inception.file_sha256(looks.inception) if looks.inception else "",
+    }
+
+
+def claim(directory: str, options: dict) -> None:
+    """Empty a directory of parts unless they were made with the same options."""
+    record = storage.join(directory, "described.json")
+    if storage.exists(record) and storage.read_json(record) == options:
+        return
+    storage.delete_directory(directory)
+    storage.write_json(options, record)

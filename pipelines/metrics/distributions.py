@@ -1,0 +1,164 @@
+"""How layouts are made, as histograms per scene, and how far two sources differ in them; no pictures, no weights.
+
+A scene gives a vector of counts over fixed bins. Vectors add up to the histogram of a source, and resampled scenes to
+its draws. Sources differ by the Wasserstein distance in the histogram's own unit, or where bins have no order by the
+Jensen-Shannon divergence in bits. Bins bound how fine a difference can be seen; they are narrow where objects are small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from models.scene import CATEGORIES, GROUND_CLASSES, Scene
+from pipelines.metrics.intervals import Estimate, estimate, weights
+
+EXTENT_EDGES_M = np.geomspace(0.1, 60, 49)
+PAIR_EDGES_M = np.geomspace(0.25, 100, 33)
+ROAD_DISTANCE_EDGES_M = np.linspace(0, 40, 41)
+ROAD_WIDTH_EDGES_M = np.linspace(0, 40, 81)
+NO_GROUND = "none"
+MIN_ROAD_WIDTH_M = 2.0  # narrower stretches are frayed borders
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """A named histogram: `edges` in metres (values beyond go to the end bins), or `bins` by name."""
+
+    name: str
+    edges: np.ndarray | None = None
+    bins: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.bins) if self.edges is None else len(self.edges) - 1
+
+    @property
+    def unit(self) -> str:
+        return "bits" if self.edges is None else "m"
+
+    def count(self, values: np.ndarray) -> np.ndarray:
+        """(bins,) int64 of values in metres, or of bin numbers."""
+        if self.edges is not None:
+            values = np.searchsorted(self.edges[1:-1], values, side="right")
+        return np.bincount(values, minlength=len(self))
+
+
+def _histograms() -> Iterator[Histogram]:
+    for category in CATEGORIES:
+        for extent in ("length", "width", "height"):
+            yield Histogram(f"{category}.{extent}_m", EXTENT_EDGES_M)
+        yield Histogram(f"{category}.ground_below", bins=(*GROUND_CLASSES, NO_GROUND))
+        yield Histogram(f"{category}.to_road_m", ROAD_DISTANCE_EDGES_M)
+        yield Histogram(f"{category}.pair_distance_m", PAIR_EDGES_M)
+    yield Histogram("road_width_m", ROAD_WIDTH_EDGES_M)
+
+
+HISTOGRAMS = tuple(_histograms())
+ENDS = np.cumsum([len(histogram) for histogram in HISTOGRAMS])
+
+
+def scene_histograms(scene: Scene) -> np.ndarray:
+    """(ENDS[-1],) uint32 counts of one scene over the bins of HISTOGRAMS, side by side.
+
+    Per category: extents; the ground class under the centre; distance of the centre from the nearest road pixel, where
+    the scene has road; distances between the centres of each pair, seen from above. And widths of the road.
+    """
+    width_m, to_road_m = road_widths(scene)
+    row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
+    inside = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
+    pixel = row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1)
+    class_bin = np.array([*(GROUND_CLASSES.index(name) for name in scene.ground_classes), len(GROUND_CLASSES)])
+    below = np.where(inside, class_bin[scene.surface()[1][pixel]], len(GROUND_CLASSES))
+    parts = []
+    for index in range(len(CATEGORIES)):
+        members = scene.category == index
+        parts += [*scene.size_m[members].T.astype(np.float64), below[members]]
+        parts.append(to_road_m[pixel][members & inside] if to_road_m is not None else np.zeros(0))
+        parts.append(pair_distances(scene.center_m[members, :2]))
+    parts.append(width_m)
+    counted = [histogram.count(part) for histogram, part in zip(HISTOGRAMS, parts, strict=True)]
+    return np.concatenate(counted).astype(np.uint32)
+
+
+def pair_distances(xy_m: np.ndarray) -> np.ndarray:
+    """(n (n - 1) / 2,) distances between points (n, 2)."""
+    first, second = np.triu_indices(len(xy_m), 1)
+    return np.hypot(*(xy_m[first] - xy_m[second]).T.astype(np.float64))
+
+
+def road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
+    """Widths of the road (p,) in metres along its middle, and each pixel's distance from road (H, W), None without road.
+
+    The middle is where the distance from the border is greatest nearby; the width is twice that distance, to a pixel.
+    The scene's edge is no border.
+    """
+    road = np.zeros(scene.occupied.shape[1:], bool)
+    if "road" in scene.ground_classes:
+        road = scene.occupied[scene.ground_classes.index("road")]
+    if not road.any():
+        return np.zeros(0), None
+    to_road_m = ndimage.distance_transform_edt(~road) * scene.grid.resolution_m
+    if road.all():
+        return np.zeros(0), to_road_m
+    depth_px = ndimage.distance_transform_edt(road)
+    middle = road & (depth_px == ndimage.maximum_filter(depth_px, 3))
+    width_m = (2 * depth_px[middle] - 1) * scene.grid.resolution_m
+    return width_m[width_m >= MIN_ROAD_WIDTH_M], to_road_m
+
+
+# --------------------------------------------------------------------------------------------------- two sources
+
+
+def histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
+    """By name, the distance of each histogram in its unit, from scenes (n, bins) and (m, bins).
+
+    A histogram that is empty on either side is left out.
+    """
+    drawn = [weights(len(side), key) for key, side in enumerate((real, generated))]
+    found = {}
+    for histogram, end in zip(HISTOGRAMS, ENDS, strict=True):
+        columns = slice(end - len(histogram), end)
+        sums = [w @ side[:, columns].astype(np.float64) for w, side in zip(drawn, (real, generated), strict=True)]
+        if min(part[0].sum() for part in sums) == 0:
+            continue
+        p, q = (normalised(part) for part in sums)
+        found[histogram.name] = estimate(
+            jensen_shannon(p, q) if histogram.edges is None else wasserstein(p, q, histogram.edges)
+        )
+    return found
+
+
+def count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
+    """By category, the Wasserstein distance of its numbers per scene, in objects; counts (n, 11) and (m, 11)."""
+    drawn = [weights(len(side), key) for key, side in enumerate((real, generated))]
+    found = {}
+    for index, category in enumerate(CATEGORIES):
+        sides = real[:, index].astype(int), generated[:, index].astype(int)
+        bins = 1 + max(side.max() for side in sides)
+        p, q = (w @ np.eye(bins)[side] for w, side in zip(drawn, sides, strict=True))
+        found[category] = estimate(wasserstein(p, q, np.arange(bins + 1) - 0.5))
+    return found
+
+
+def normalised(counts: np.ndarray) -> np.ndarray:
+    """Rows (b, bins) of sum 1; NaN for a row of zeros."""
+    total = counts.sum(axis=1, keepdims=True)
+    return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
+
+
+def wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(b,) W1 distance of distributions (b, bins), mass at the middles of the bins, in the unit of the edges."""
+    step = np.diff((edges[1:] + edges[:-1]) / 2)
+    return (np.abs(np.cumsum(p - q, axis=1)[:, :-1]) * step).sum(axis=1)
+
+
+def jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(b,) divergence in bits, in [0, 1], of distributions (b, bins)."""
+    return np.clip(entropy_bits((p + q) / 2) - (entropy_bits(p) + entropy_bits(q)) / 2, 0.0, 1.0)
+
+
+def entropy_bits(p: np.ndarray) -> np.ndarray:
+    return -(p * np.log2(np.where(p > 0, p, 1.0))).sum(axis=-1)

@@ -1,0 +1,64 @@
+"""95 % confidence intervals by the bootstrap: scenes are drawn anew, with replacement, and the score taken again.
+
+A draw is a vector of weights (how often each scene was drawn, over the number of scenes), so scores that are made of
+sums over scenes are one matrix product for all draws. Row 0 of the weights is the sample as it is: its score is the
+value, the others give the interval. The same number of scenes gives the same draws.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+DRAWS = 500
+LEVEL = 0.95
+
+
+class Estimate(NamedTuple):
+    """A score with the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def weights(count: int, key: int = 0) -> np.ndarray:
+    """(1 + DRAWS, count) float64, rows of sum 1: every scene once, then the draws.
+
+    `key` tells the draws of one side from those of another.
+    """
+    random = np.random.default_rng([count, key])
+    picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
+    picked += count * np.arange(DRAWS)[:, None]
+    drawn = np.bincount(picked.ravel(), minlength=DRAWS * count).reshape(DRAWS, count)
+    return np.vstack([np.ones((1, count)), drawn]) / count
+
+
+def estimate(scores: np.ndarray) -> Estimate:
+    """From the scores (1 + DRAWS,) under `weights`. Draws that have none, NaN, do not count."""
+    value, drawn = float(scores[0]), scores[1:]
+    low, high = np.quantile(drawn[np.isfinite(drawn)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def mean_estimate(values: np.ndarray, key: int = 0) -> Estimate:
+    """Mean of values (n,), a value per scene."""
+    return estimate(weights(len(values), key) @ np.asarray(values, np.float64))
+
+
+def ratio_estimates(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
+    """Sum over sum for each column of (n, m) and (n, m), a row per scene; None where nothing is to be judged.
+
+    Covers shares of objects (bad ones over all) and means over the scenes that have a value (values over ones).
+    """
+    drawn = weights(len(numerators), key)
+    above, below = (drawn @ np.asarray(part, np.float64) for part in (numerators, denominators))
+    scores = np.divide(above, below, out=np.full_like(above, np.nan), where=below > 0)
+    return [estimate(scores[:, m]) if below[0, m] > 0 else None for m in range(scores.shape[1])]
+
+
+def moved(value: float, influences: tuple[np.ndarray, np.ndarray]) -> Estimate:
+    """A score of two sides that moves, to first order, by the mean of what each side's samples add to it."""
+    shifts = sum(weights(len(part), key) @ part for key, part in enumerate(influences))
+    return estimate(value + shifts)

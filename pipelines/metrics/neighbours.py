@@ -1,0 +1,250 @@
+"""Precision, recall, density and coverage from nearest neighbours of features, exactly, without all exact distances.
+
+Filter and verify. Features are turned into their first principal coordinates, with the length of what is left over as
+one more. Distances of these short vectors never exceed the true ones, and come from a float32 matrix product. A true
+distance is computed, in float64 by differences, only where a bound does not decide. So results are those of the full
+float64 distance matrix, ties included, in a fraction of its time and without ever holding it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.metrics.frechet import checked_features
+
+BLOCK_ROWS = 1024  # rows of a distance matrix held at once: 4 kB x number of columns
+SPARE_NEIGHBOURS = 8  # candidates beyond the k-th that are measured to bound its distance
+PAIRS_PER_BLOCK = 2048  # of plainly computed distances
+BASIS_SAMPLES = 1024  # that the principal axes are taken from
+KEPT_VARIANCE = 0.99  # of them; more axes cost time in the filter, fewer leave more to verify
+FLOAT32_ROUNDING = 2.0**-24
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Scores at one neighbourhood size. A ball reaches from a sample to its k-th nearest other sample of its side.
+
+    Precision and recall: Kynkaanniemi et al. 2019, and the paper's supplement; density and coverage: Naeem et al. 2020.
+    """
+
+    k: int
+    in_real: np.ndarray  # (m,) int64: real balls that each generated sample lies in
+    in_generated: np.ndarray  # (n,) bool: each real sample lies in some generated sample's ball
+    covered: np.ndarray  # (n,) bool: each real sample's ball holds some generated sample
+
+    @property
+    def precision(self) -> float:
+        """Share of generated samples in some real ball."""
+        return float((self.in_real > 0).mean())
+
+    @property
+    def recall(self) -> float:
+        return float(self.in_generated.mean())
+
+    @property
+    def density(self) -> float:
+        """Real balls that a generated sample lies in, on average, over k. Not bounded by 1."""
+        return float(self.in_real.mean() / self.k)
+
+    @property
+    def coverage(self) -> float:
+        return float(self.covered.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Principal axes (p, d) of a sample of both sides and their mean (d,), float64; orthonormal rows."""
+
+    mean: np.ndarray
+    axes: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One side's features (n, d) with their short vectors.
+
+    left (n, p + 3) and right (n, p + 3), float32: left[i] . right[j] is the squared distance of the short vectors.
+    rest (n,): length of what the axes leave over; slack (n,): bound of a product's rounding, per sample of a pair.
+    """
+
+    features: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    rest: np.ndarray
+    slack: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def prepare(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[Side, Side]:
+    """Both sides in the filter's form.
+
+    Raises ValueError for features that are not finite, of unequal width, or of max(k) samples or fewer.
+    """
+    real, generated = comparable(real, generated, at_least=checked_k(k) + 1)
+    basis = principal_axes(real, generated)
+    return short_vectors(real, basis), short_vectors(generated, basis)
+
+
+def neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int] = (3,)) -> list[Neighbourhood]:
+    """A Neighbourhood for each k, from features (n, d) and (m, d) (paper, supplement, Evaluation).
+
+    Memory: BLOCK_ROWS x max(n, m) float32, besides the features. The paper's protocol takes n = m; other sizes work.
+    Raises ValueError as `prepare` does.
+    """
+    sides = prepare(real, generated, k)
+    radii = [ball_radii(side, range(len(side)), k) for side in sides]
+    return judged(k, [within(*sides, *radii, range(len(real)))])
+
+
+def judged(k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[Neighbourhood]:
+    """A Neighbourhood for each k from what `within` gave for all parts of the real samples, in order."""
+    in_real, in_generated, covered = zip(*parts, strict=True)
+    found = sum(in_real), np.concatenate(in_generated, axis=1), np.concatenate(covered, axis=1)
+    return [Neighbourhood(size, *(part[index] for part in found)) for index, size in enumerate(k)]
+
+
+def checked_k(k: Sequence[int]) -> int:
+    """The largest of the neighbourhood sizes; ValueError if there is none or one is below 1."""
+    if not k or min(k) < 1:
+        raise ValueError(f"k must name neighbourhood sizes of at least 1, got {list(k)}")
+    return max(k)
+
+
+def comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both sides, checked. Raises ValueError as `checked_features` does, and for unequal dimensions."""
+    real, generated = checked_features(real, "real", at_least), checked_features(generated, "generated", at_least)
+    if real.shape[1] != generated.shape[1]:
+        raise ValueError(f"real features have {real.shape[1]} dimensions, generated {generated.shape[1]}")
+    return real, generated
+
+
+# ------------------------------------------------------------------------------------------------------- filter
+
+
+def principal_axes(real: np.ndarray, generated: np.ndarray) -> Basis:
+    """As many principal axes as hold KEPT_VARIANCE of some samples of both sides, evenly taken."""
+    count = min(BASIS_SAMPLES // 2, len(real), len(generated))
+    some = np.concatenate([side[np.arange(count) * len(side) // count] for side in (real, generated)])
+    some = some.astype(np.float64)
+    mean = some.mean(axis=0)
+    _, strength, axes = np.linalg.svd(some - mean, full_matrices=False)
+    held = np.cumsum(strength**2)
+    return Basis(mean, axes[: 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))])
+
+
+def short_vectors(features: np.ndarray, basis: Basis) -> Side:
+    """The filter's form of features (n, d).
+
+    For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2, and |r - r'| lies between the difference and the
+    sum of |r| and |r'|. With v = (c, |r|), (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2 in one product.
+    """
+    short = np.empty((len(features), len(basis.axes) + 1))
+    for start in range(0, len(features), BLOCK_ROWS):
+        rows = slice(start, start + BLOCK_ROWS)
+        centred = features[rows] - basis.mean
+        coordinates = centred @ basis.axes.T
+        short[rows, :-1] = coordinates
+        short[rows, -1] = np.linalg.norm(centred - coordinates @ basis.axes, axis=1)
+    norm, one = np.square(short).sum(axis=1, keepdims=True), np.ones((len(short), 1))
+    left = np.hstack([-2 * short, norm, one]).astype(np.float32)
+    right = np.hstack([short, one, norm]).astype(np.float32)
+    # |rounding of a product of t terms| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2), and t + 4 grants the terms' own.
+    slack = 2 * (left.shape[1] + 4) * FLOAT32_ROUNDING * norm[:, 0]
+    return Side(features, left, right, short[:, -1], slack)
+
+
+# ------------------------------------------------------------------------------------------------------- verify
+
+
+def ball_radii(side: Side, rows: range, k: Sequence[int]) -> np.ndarray:
+    """(len(k), len(rows)) squared distance of each sample of `rows` to its k-th nearest other sample."""
+    radii = np.empty((len(k), len(rows)))
+    for block in blocks(rows):
+        radii[:, block.start - rows.start : block.stop - rows.start] = nearest(
+            side, side, block, checked_k(k), themselves=True
+        )[0][:, [size - 1 for size in k]].T
+    return radii
+
+
+def nearest(
+    side: Side, others: Side, rows: range, count: int, themselves: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Squared distances (rows, count) of samples of `side` to the nearest of `others`, ascending, and their indices.
+
+    `themselves`: both are one side, and no sample is its own neighbour. Of equal distances the lower index comes first.
+    """
+    bound = torch.from_numpy(side.left[rows.start : rows.stop] @ others.right.T)
+    own = torch.arange(len(rows))
+    if themselves:
+        bound[own, own + rows.start] = torch.inf
+    spare = min(count + SPARE_NEIGHBOURS, len(others) - themselves)
+    column = bound.topk(spare, largest=False).indices.numpy()
+    row = np.repeat(np.arange(rows.start, rows.stop), spare)
+    known = squared_distances(side.features, row, others.features, column.ravel()).reshape(len(rows), spare)
+    reach = np.sort(known, axis=1)[:, count - 1] + side.slack[rows.start : rows.stop] + others.slack.max()
+    row, column = torch.nonzero(bound <= upper_float32(reach)[:, None]).numpy().T
+    squared = squared_distances(side.features, row + rows.start, others.features, column)
+    order = np.lexsort((column, squared, row))
+    first = np.searchsorted(row, np.arange(len(rows)))
+    chosen = order[first[:, None] + np.arange(count)]
+    return squared[chosen], column[chosen]
+
+
+def within(
+    real: Side, generated: Side, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the balls of both sides hold, for the real samples of `rows`; radii squared, (len(k), n) and (len(k), m).
+
+    Returns in_real (len(k), m), balls of `rows` that hold each generated sample: add them over parts; in_generated and
+    covered (len(k), len(rows)).
+    """
+    in_real = np.zeros(generated_radii.shape, np.int64)
+    in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))
+    to_column = upper_float32(generated_radii.max(axis=0) + generated.slack + real.slack.max())
+    to_row = upper_float32(real_radii.max(axis=0) + real.slack + generated.slack.max())
+    for block in blocks(rows):
+        bound = torch.from_numpy(real.left[block.start : block.stop] @ generated.right.T)
+        close = bound <= torch.maximum(to_row[block.start : block.stop, None], to_column)
+        row, column = torch.nonzero(close).numpy().T
+        low = bound[close].numpy().astype(np.float64)
+        row += block.start
+        slack = real.slack[row] + generated.slack[column]
+        squared, low, high = low, low - slack, low + slack + 4 * real.rest[row] * generated.rest[column]
+        unsure = np.zeros(len(row), bool)
+        for radii in (real_radii[:, row], generated_radii[:, column]):
+            unsure |= ((low <= radii) & (radii <= high)).any(axis=0)
+        squared[unsure] = squared_distances(real.features, row[unsure], generated.features, column[unsure])
+        for index in range(len(real_radii)):
+            held = squared <= real_radii[index, row]
+            in_real[index] += np.bincount(column[held], minlength=len(generated))
+            covered[index, row[held] - rows.start] = True
+            in_generated[index, row[squared <= generated_radii[index, column]] - rows.start] = True
+    return in_real, in_generated, covered
+
+
+def squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """(p,) squared distances of a[i] and b[j] in float64, by differences: the same bits whichever side comes first."""
+    squared = np.empty(len(i))
+    for start in range(0, len(i), PAIRS_PER_BLOCK):
+        block = slice(start, start + PAIRS_PER_BLOCK)
+        difference = np.subtract(a[i[block]], b[j[block]], dtype=np.float64)
+        squared[block] = np.square(difference, out=difference).sum(axis=1)
+    return squared
+
+
+def upper_float32(values: np.ndarray) -> Tensor:
+    """As float32, not smaller."""
+    rounded = values.astype(np.float32)
+    return torch.from_numpy(np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded))
+
+
+def blocks(rows: range) -> list[range]:
+    """Parts of BLOCK_ROWS rows."""
+    return [range(start, min(start + BLOCK_ROWS, rows.stop)) for start in range(rows.start, rows.stop, BLOCK_ROWS)]
