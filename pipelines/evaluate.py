@@ -57,24 +57,23 @@ def frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
 
 
 def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """frechet, mmd, and for each k precision, recall, density and coverage.
-
-    The intervals of these four are over the judged samples; the balls are held fixed, as a sample drawn twice would be
-    its own neighbour. Neighbourhoods that there are too few samples for are left out.
-    """
+    """frechet, mmd, and `neighbourhood_scores`."""
     found = {"frechet": frechet(real, generated), "mmd": kernel_distance(real, generated)}
+    return found | neighbourhood_scores(real, generated, k)
+
+
+def neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
+    """precision_k3, recall_k3, density_k3 and coverage_k3, for each k that there are enough samples for.
+
+    Intervals are over the judged samples; the balls are held fixed, as a sample drawn twice would be its own neighbour.
+    """
     sizes = [size for size in k if size < min(len(real), len(generated))]
+    found = {}
     for one in spread_neighbourhoods(real, generated, sizes) if sizes else ():
-        judged_samples = {
-            "precision": one.in_real > 0,
-            "recall": one.in_generated,
-            "density": one.in_real / one.k,
-            "coverage": one.covered,
-        }
-        found |= {
-            f"{name}_k{one.k}": mean_estimate(values, int(name in ("precision", "density")))
-            for name, values in judged_samples.items()
-        }
+        found[f"precision_k{one.k}"] = mean_estimate(one.in_real > 0, key=1)
+        found[f"recall_k{one.k}"] = mean_estimate(one.in_generated)
+        found[f"density_k{one.k}"] = mean_estimate(one.in_real / one.k, key=1)
+        found[f"coverage_k{one.k}"] = mean_estimate(one.covered)
     return found
 
 

@@ -65,9 +65,19 @@ class Selection:
             kept = apart(*poses(scenes, source), self.apart_m)
             return kept[evenly(len(kept), min(wanted, len(kept)))]
         if self.pick == "balanced":
-            labels = [str(pair) for pair in zip(*(scenes[name].to_pylist() for name in COLUMNS[-2:]), strict=True)]
-            return balanced(np.array(labels), wanted)
+            return balanced(label_pairs(scenes), wanted)
         return evenly(total, wanted)
+
+
+def described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
+    """COLUMNS of the scenes of some shards' rows, in that order, and the source (n,) of each."""
+    table = pa.concat_tables([shard.read("scenes", COLUMNS).take(rows) for shard, rows in parts])
+    return table, np.repeat([shard.source for shard, _ in parts], [len(rows) for _, rows in parts])
+
+
+def label_pairs(scenes: pa.Table) -> np.ndarray:
+    """(n,) both density labels of each scene as one word."""
+    return np.array([str(pair) for pair in zip(*(scenes[name].to_pylist() for name in COLUMNS[-2:]), strict=True)])
 
 
 def evenly(total: int, count: int) -> np.ndarray:
