@@ -181,7 +181,7 @@ def digest(looks: Looks) -> dict:
     """What tells one description from another; weights count by content, not by name."""
     return asdict(looks) | {
         "version": VERSION,
-        "inception": inception.file_sha256(looks.inception) if looks.inception else "",
+        "inception": inception.weights_sha256(looks.inception) if looks.inception else "",
     }
 
 

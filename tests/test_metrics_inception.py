@@ -1,19 +1,25 @@
-"""The Inception network against its published parameter names, a literal resize and torch's own layers."""
+"""The Inception network against published parameter names, a literal resize, torch's layers and torch-fidelity."""
 
 import hashlib
+import warnings
 
+import golden_recipe
 import numpy as np
 import pytest
+import safetensors.numpy
 import safetensors.torch
 import torch
 import torch.nn.functional as F
+from safetensors import safe_open
 
+from pipelines.metrics import inception
 from pipelines.metrics.inception import (
     Inception,
     inception_features,
     load_inception,
     random_features,
     resize_like_tensorflow1,
+    weights_line,
 )
 
 
@@ -173,7 +179,7 @@ def test_features_equal_a_literal_forward_pass(network):
     assert x.shape == (1, 2048, 8, 8)
     expected = x.mean((2, 3))
 
-    pool3, logits = inception_features(network, images)
+    pool3, _, logits = inception_features(network, images)
     scale = expected.abs().max().item()
     assert expected.std().item() > 0.01 * scale  # the network is alive
     np.testing.assert_allclose(pool3, expected, atol=1e-4 * scale)
@@ -207,10 +213,91 @@ def test_resize_equals_tensorflows_arithmetic(height, width, size):
 
 def test_features_do_not_depend_on_the_batch(network):
     images = pictures(3)
-    together, _ = inception_features(network, images, batch_size=3)
-    alone, _ = inception_features(network, images, batch_size=1)
-    np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-4)
-    assert inception_features(network, images[:0])[0].shape == (0, 2048)
+    together = inception_features(network, images, batch_size=3)
+    alone = inception_features(network, images, batch_size=1)
+    for got, expected in zip(together, alone, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
+    assert [part.shape for part in inception_features(network, images[:0])] == [(0, 2048), (0, 2023), (0, 1008)]
+
+
+def test_spatial_features_are_seven_channels_of_mixed_6_conv_channels_last(network):
+    """TensorFlow flattens row, column, channel; precomputed moments of ADM's reference batches are in that order."""
+    maps = []
+    hook = network.Mixed_6d.branch1x1.register_forward_hook(lambda module, inputs, output: maps.append(output))
+    spatial = inception_features(network, pictures()).spatial
+    hook.remove()
+    assert maps[0].shape == (2, 192, 17, 17) and maps[0].min() == 0  # after the ReLU
+    for row, column, channel in ((0, 0, 0), (0, 0, 6), (0, 1, 0), (3, 5, 2), (16, 16, 6)):
+        np.testing.assert_array_equal(spatial[:, (row * 17 + column) * 7 + channel], maps[0][:, channel, row, column])
+
+
+# ------------------------------------------------------------------------------------------ torch-fidelity
+
+
+@pytest.fixture(scope="module")
+def golden_network() -> Inception:
+    network = Inception()
+    state = golden_recipe.random_state_dict({name: value.shape for name, value in network.state_dict().items()})
+    with safe_open(golden_recipe.GOLDEN, "numpy") as golden:
+        made_from = golden.metadata()["recipe_sha256"]
+    assert golden_recipe.recipe_sha256(state) == made_from, "run tests/golden/make_inception_golden.py again"
+    network.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})
+    return network
+
+
+def golden_difference(network: Inception) -> dict[str, float]:
+    """Per layer the largest difference to torch-fidelity's features, as a share of the layer's largest feature."""
+    layers: dict[str, list[torch.Tensor]] = {"64": [], "192": [], "768": []}
+    hooks = [
+        getattr(network, module).register_forward_hook(lambda m, i, x, layer=layer: layers[layer].append(x))
+        for layer, module in (("64", "Conv2d_2b_3x3"), ("192", "Conv2d_4a_3x3"), ("768", "Mixed_6e"))
+    ]
+    features = [inception_features(network, golden_recipe.picture(k)[None]) for k in range(len(golden_recipe.PICTURES))]
+    for hook in hooks:
+        hook.remove()
+    got = {"2048": "pool3", "spatial": "spatial", "logits_unbiased": "logits"}
+    got = {layer: np.concatenate([getattr(part, name) for part in features]) for layer, name in got.items()}
+    for layer, maps in layers.items():
+        pooled = maps if layer == "768" else [F.max_pool2d(x, 3, stride=2) for x in maps]
+        got[layer] = torch.cat([x.mean((2, 3)) for x in pooled]).numpy()
+    expected = safetensors.numpy.load_file(golden_recipe.GOLDEN)
+    assert got.keys() == expected.keys()
+    return {layer: np.abs(got[layer] - expected[layer]).max() / np.abs(expected[layer]).max() for layer in expected}
+
+
+def test_features_are_torch_fidelitys(golden_network):
+    """Every layer that torch-fidelity gives, for enlarged and for reduced pictures, to 1e-5 of its scale."""
+    difference = golden_difference(golden_network)
+    assert max(difference.values()) < 1e-5, difference
+
+
+def test_golden_pictures_are_told_apart_by_every_layer():
+    for layer, features in safetensors.numpy.load_file(golden_recipe.GOLDEN).items():
+        assert 0.1 < np.abs(features).max() < 100, layer
+        gaps = np.abs(features[:, None] - features[None]).max(axis=-1) / features.std()
+        assert gaps[~np.eye(len(features), dtype=bool)].min() > 0.1, layer
+
+
+def test_a_half_pixel_shift_would_be_noticed(golden_network, monkeypatch):
+    def torchs_own(x, size):
+        return F.interpolate(x, (size, size), mode="bilinear", align_corners=False)
+
+    monkeypatch.setattr(inception, "resize_like_tensorflow1", torchs_own)
+    assert min(golden_difference(golden_network).values()) > 1e-3
+
+
+@pytest.mark.parametrize("mistake", ["7c averages", "padding counts", "epsilon"])
+def test_another_layer_would_be_noticed(golden_network, monkeypatch, mistake):
+    if mistake == "7c averages":
+        monkeypatch.setattr(golden_network.Mixed_7c, "max_pool", False)
+    elif mistake == "padding counts":
+        average = F.avg_pool2d
+        monkeypatch.setattr(F, "avg_pool2d", lambda x, *a, count_include_pad, **k: average(x, *a, **k))
+    else:
+        for module in golden_network.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                monkeypatch.setattr(module, "eps", 1e-5)
+    assert golden_difference(golden_network)["2048"] > 1e-3
 
 
 # ------------------------------------------------------------------------------------------ weight files
@@ -224,7 +311,8 @@ def test_weights_load_from_pth_and_safetensors(network, tmp_path):
     images = pictures(1)
     expected = inception_features(network, images)
     for name in ("weights.pth", "weights.safetensors"):
-        loaded = load_inception(tmp_path / name)
+        with pytest.warns(UserWarning, match="no score of theirs compares with published ones"):
+            loaded = load_inception(tmp_path / name)
         assert loaded.weights_sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
         for got, want in zip(inception_features(loaded, images), expected, strict=True):
             np.testing.assert_array_equal(got, want)
@@ -247,6 +335,28 @@ def test_a_missing_corrupted_or_foreign_file_is_refused(tmp_path):
     torch.save([torch.zeros(3)], tmp_path / "list.pth")
     with pytest.raises(ValueError, match=r"list\.pth"):
         load_inception(tmp_path / "list.pth")
+
+
+def test_the_published_weights_are_known_by_their_sha_whatever_their_name(network, tmp_path, monkeypatch):
+    path = tmp_path / "mine.pth"
+    torch.save(network.state_dict(), path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert f"{path}, sha256 {sha256}: not weights-inception-2015-12-05-6726825d.pth" in weights_line(path)
+    monkeypatch.setattr(inception, "KNOWN_SHA256", sha256)
+    assert weights_line(path) == f"Inception weights {path}, sha256 {sha256}: the published ones"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_inception(path).weights_sha256 == sha256
+
+
+def test_gpu_convolutions_keep_all_their_digits(network):
+    allowed = []
+    hook = network.Mixed_7c.register_forward_hook(lambda *_: allowed.append(torch.backends.cudnn.allow_tf32))
+    before = torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled
+    inception_features(network, pictures(1))
+    hook.remove()
+    assert allowed == [False]
+    assert (torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled) == before
 
 
 def test_pictures_of_another_kind_are_refused(network):

@@ -51,8 +51,8 @@ def ratios(scenes, **lines) -> dict:
 def test_a_line_that_does_not_show_has_ratio_one():
     got = ratios([speckled(seed, block_px=1) for seed in range(60)], rows=[64, 130], cols=[100])
     for name in ("class_changes", "height_step"):
-        assert got[name].low < 1 < got[name].high
-        assert got[name].high - got[name].low < 0.3
+        assert got[name].low < 1.02 and got[name].high > 0.98
+        assert got[name].high - got[name].low < 0.1
     assert got["cut_objects"] is None  # no objects, nothing to judge
 
 

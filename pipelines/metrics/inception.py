@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,9 @@ from torch import Tensor, nn
 
 INPUT_SIZE = 299
 FEATURES, CLASSES = 2048, 1008
+SPATIAL_CHANNELS, SPATIAL_FEATURES = 7, 7 * 17 * 17
 KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's release v0.2.0"
+KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"  # pytorch-fid's file is the same
 
 # A branch is a chain of convolutions (output channels, kernel height x width); SPLIT ends it with a 1x3 and a 3x1
 # side by side. One-step chains bear the branch's name, others name_1, name_2, ...
@@ -58,8 +61,11 @@ CHAINS_7 = {
 
 
 class InceptionFeatures(NamedTuple):
-    pool3: Tensor  # (n, 2048)
-    logits: Tensor  # (n, 1008), without the bias: what ADM's Inception score takes
+    """Of n pictures: Tensors out of the network, float32 arrays out of `inception_features`."""
+
+    pool3: Tensor | np.ndarray  # (n, 2048): FID, precision and recall
+    spatial: Tensor | np.ndarray  # (n, 2023), row, column, channel: ADM's sFID, first 7 channels of mixed_6/conv
+    logits: Tensor | np.ndarray  # (n, 1008), without the bias: what ADM's Inception score takes
 
 
 class Conv(nn.Module):
@@ -160,18 +166,21 @@ class Inception(nn.Module):
         x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(x))  # n 192 71 71
         x = F.max_pool2d(x, 3, stride=2)  # n 192 35 35
         x = self.Mixed_5d(self.Mixed_5c(self.Mixed_5b(x)))  # n 288 35 35
-        x = self.Mixed_6e(self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(self.Mixed_6a(x)))))  # n 768 17 17
-        x = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(x)))  # n 2048 8 8
+        x = self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(self.Mixed_6a(x))))  # n 768 17 17
+        # TensorFlow's mixed_6 is Mixed_6d, which begins with branch1x1, TensorFlow's mixed_6/conv after its ReLU.
+        spatial = x[:, :SPATIAL_CHANNELS].permute(0, 2, 3, 1).flatten(1)
+        x = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(self.Mixed_6e(x))))  # n 2048 8 8
         pool3 = x.mean(dim=(2, 3))
-        return InceptionFeatures(pool3, pool3 @ self.fc.weight.T)
+        return InceptionFeatures(pool3, spatial, pool3 @ self.fc.weight.T)
 
 
 def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
     """(n, c, size, size) bilinear, as TF1's ResizeBilinear: corners not aligned, no half-pixel shift.
 
-    Output i reads input i * (in / out), so an enlarged picture sits half a pixel up and left of torch's own.
+    Output i reads input i * (in / out), so an enlarged picture sits half a pixel up and left of torch's own. Columns
+    before rows, as there, so that rounding is the same too.
     """
-    for dim in (2, 3):
+    for dim in (3, 2):
         length = x.shape[dim]
         position = torch.arange(size, dtype=torch.float32, device=x.device) * np.float32(length / size).item()
         low = position.long()
@@ -185,16 +194,12 @@ def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
 def load_inception(path: str | Path) -> Inception:
     """The network with the weights of a local state dict (.pth, .pt or .safetensors).
 
-    A name like that of KNOWN_FILE ends in the start of the file's sha256, which is checked.
-    Raises ValueError, naming the file, for a missing or corrupted file and for weights of another network.
+    A name like that of KNOWN_FILE ends in the start of the file's sha256, which is checked; weights other than those
+    raise a warning. Raises ValueError, naming the file, for a missing or corrupted file and for weights of another
+    network.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
-    sha256 = file_sha256(path)
-    claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
-    if claimed and not sha256.startswith(claimed[1]):
-        raise ValueError(f"{path}: corrupted, its sha256 starts with {sha256[:8]} instead of {claimed[1]}")
+    sha256 = weights_sha256(path)
     try:
         if path.suffix == ".safetensors":
             state = safetensors.torch.load_file(path)
@@ -207,24 +212,42 @@ def load_inception(path: str | Path) -> Inception:
         network.load_state_dict(state)
     except (RuntimeError, TypeError) as error:
         raise ValueError(f"{path}: not the weights of the FID Inception network ({error})") from error
+    if sha256 != KNOWN_SHA256:
+        warnings.warn(weights_line(path), stacklevel=2)
     network.weights_sha256 = sha256
     return network
 
 
-def file_sha256(path: Path) -> str:
+def weights_sha256(path: str | Path) -> str:
+    """sha256 of a weight file, hexadecimal. ValueError if it is missing or its name claims another one."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
+    if claimed and not sha256.startswith(claimed[1]):
+        raise ValueError(f"{path}: corrupted, its sha256 starts with {sha256[:8]} instead of {claimed[1]}")
+    return sha256
+
+
+def weights_line(path: str | Path) -> str:
+    """Which file numbers come from, for a report: its path, its sha256, and whether it is the published one."""
+    sha256 = weights_sha256(path)
+    known = sha256 == KNOWN_SHA256
+    verdict = "the published ones" if known else f"not {KNOWN_FILE}: no score of theirs compares with published ones"
+    return f"Inception weights {path}, sha256 {sha256}: {verdict}"
 
 
 @torch.inference_mode()
-def inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> tuple[np.ndarray, np.ndarray]:
-    """pool3 (n, 2048) and logits without bias (n, 1008), float32, of uint8 pictures (n, height, width, 3)."""
+def inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> InceptionFeatures:
+    """pool3 (n, 2048), spatial (n, 2023) and logits (n, 1008), float32, of uint8 pictures (n, height, width, 3)."""
     device = network.fc.weight.device
-    parts = [network(batch.to(device)) for batch in _batches(images, batch_size)]
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 would keep 10 of 23 bits on a GPU
+        parts = [network(batch.to(device)) for batch in _batches(images, batch_size)]
     if not parts:
-        return np.empty((0, FEATURES), np.float32), np.empty((0, CLASSES), np.float32)
-    pool3, logits = (torch.cat(part).float().cpu().numpy() for part in zip(*parts, strict=True))
-    return pool3, logits
+        return InceptionFeatures(*(np.empty((0, size), np.float32) for size in (FEATURES, SPATIAL_FEATURES, CLASSES)))
+    return InceptionFeatures(*(torch.cat(part).float().cpu().numpy() for part in zip(*parts, strict=True)))
 
 
 def random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:

@@ -1,0 +1,167 @@
+"""Pictures in ADM's .npz sample batches, read and written in pieces, and the moments of its reference batches.
+
+ADM (guided-diffusion, evaluations/) keeps N pictures as array `arr_0`, uint8 (N, height, width, 3); its reference
+batches also hold the whole dataset's `mu`, `sigma` (pool3) and `mu_s`, `sigma_s` (spatial features). Its evaluator
+reads what `write_npz` writes.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
+from pipelines.storage import resolve, write_whole
+
+PICTURES = "arr_0"
+
+
+class Gaussian(NamedTuple):
+    """What `frechet.frechet_distance` needs of a set of features."""
+
+    mean: np.ndarray  # (d,) float64
+    covariance: np.ndarray  # (d, d) float64
+
+
+class ReferenceMoments(NamedTuple):
+    pool3: Gaussian  # 2048-d
+    spatial: Gaussian | None  # 2023-d; None in files of other evaluators, which hold `mu` and `sigma` only
+
+
+# -------------------------------------------------------------------------------------------------------- reading
+
+
+@contextmanager
+def _opened(path: str) -> Iterator[zipfile.ZipFile]:
+    """The archive. ValueError naming the file for a missing, truncated or damaged one, whenever that shows."""
+    fs, inside = resolve(path)
+    try:
+        with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
+            yield archive
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, pa.ArrowInvalid) as error:
+        raise ValueError(f"{path}: damaged or not an .npz archive ({error}); copy or write it again") from error
+
+
+@contextmanager
+def _array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
+    """Stream at the first number, shape and type of a C-ordered array; ValueError if it is anything else."""
+    if f"{name}.npy" not in archive.namelist():
+        raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
+    with archive.open(f"{name}.npy") as stream:
+        try:
+            version = np.lib.format.read_magic(stream)
+            readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, fortran, dtype = readers[version](stream)
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{path}: {name} is not a plain numpy array ({error})") from error
+        if dtype.hasobject:
+            raise ValueError(f"{path}: {name} holds pickled objects, which are never read; save it as plain numbers")
+        if fortran and len(shape) > 1:
+            raise ValueError(f"{path}: {name} is in Fortran order; save numpy.ascontiguousarray of it")
+        needed, held = math.prod(shape) * dtype.itemsize, archive.getinfo(f"{name}.npy").file_size - stream.tell()
+        if held != needed:
+            raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write it again")
+        yield stream, shape, dtype
+
+
+def picture_shape(path: str) -> tuple[int, int, int, int]:
+    """(N, height, width, 3) of the pictures in an ADM .npz, checked without reading them; ValueError as below."""
+    with _opened(path) as archive, _array(archive, PICTURES, path) as (_, shape, dtype):
+        if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3:
+            raise ValueError(
+                f"{path}: {PICTURES} is {dtype} {shape}; pictures are uint8 (N, height, width, 3), values 0 to 255"
+            )
+    return shape
+
+
+def pictures_in_npz(path: str, batch: int) -> Iterator[np.ndarray]:
+    """uint8 arrays (batch, height, width, 3), the last one shorter, in the order of the file; one in memory at a time.
+
+    path is local or a URI; the archive may be compressed. Raises ValueError, naming the file, at once if it is
+    missing, truncated, of another type or pickled, and while reading if its checksum does not fit.
+    """
+    if batch < 1:
+        raise ValueError(f"a batch holds at least 1 picture, got {batch}")
+    return _pictures(path, picture_shape(path), batch)
+
+
+def _pictures(path: str, shape: tuple[int, int, int, int], batch: int) -> Iterator[np.ndarray]:
+    with _opened(path) as archive, _array(archive, PICTURES, path) as (stream, _, _):
+        for start in range(0, shape[0], batch):
+            pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
+            if (read := stream.readinto(pictures)) != pictures.nbytes:
+                raise ValueError(f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write it again")
+            yield pictures
+
+
+def reference_moments(path: str) -> ReferenceMoments | None:
+    """Precomputed moments of an ADM reference batch, float64; None if it holds pictures only.
+
+    ValueError naming the file if they are incomplete, of other sizes or not finite.
+    """
+    with _opened(path) as archive:
+        held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if f"{name}.npy" in archive.namelist()}
+        if not held:
+            return None
+        if held not in ({"mu", "sigma"}, {"mu", "sigma", "mu_s", "sigma_s"}):
+            raise ValueError(f"{path}: holds {sorted(held)} only; mean and covariance (mu, sigma) go together")
+        pool3 = Gaussian(_numbers(archive, "mu", (FEATURES,), path), _numbers(archive, "sigma", (FEATURES,) * 2, path))
+        if "mu_s" not in held:
+            return ReferenceMoments(pool3, None)
+        size = SPATIAL_FEATURES
+        spatial = Gaussian(_numbers(archive, "mu_s", (size,), path), _numbers(archive, "sigma_s", (size, size), path))
+    return ReferenceMoments(pool3, spatial)
+
+
+def _numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
+    with _array(archive, name, path) as (stream, found, dtype):
+        if found != shape or dtype.kind != "f":
+            raise ValueError(f"{path}: {name} is {dtype} {found}, features of this network need floats {shape}")
+        numbers = np.frombuffer(stream.read(), dtype).reshape(shape).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
+    return numbers
+
+
+# -------------------------------------------------------------------------------------------------------- writing
+
+
+def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
+    """An ADM sample batch of `count` pictures, from uint8 arrays (n, height, width, 3); one in memory at a time.
+
+    The file appears whole or not at all. ValueError if the batches differ in size or do not add up to `count`.
+    """
+    batches = iter(batches)
+    first = next(batches, None)
+    if first is None or count < 1:
+        raise ValueError(f"{path}: no pictures to write")
+    size = first.shape[1:]
+
+    def write(file) -> None:
+        written = 0
+        # Not compressed, as numpy.savez; zip64, since nothing says beforehand that an entry exceeds 2 GiB.
+        with zipfile.ZipFile(file, "w") as archive, archive.open(f"{PICTURES}.npy", "w", force_zip64=True) as stream:
+            header = {"descr": "|u1", "fortran_order": False, "shape": (count, *size)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            for pictures in chain([first], batches):
+                if pictures.dtype != np.uint8 or pictures.shape[1:] != size or len(size) != 3 or size[2] != 3:
+                    raise ValueError(
+                        f"{path}: pictures must be uint8 (n, height, width, 3) of one size, got {pictures.dtype}"
+                        f" {pictures.shape} after {written} of {size}"
+                    )
+                written += len(pictures)
+                stream.write(np.ascontiguousarray(pictures).data)
+            if written != count:
+                raise ValueError(f"{path}: got {written} pictures, {count} were announced")
+
+    write_whole(path, write)
