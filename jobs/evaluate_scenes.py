@@ -4,6 +4,7 @@
     jobs/evaluate_scenes.py --real DIR --generated DIR
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
     jobs/evaluate_scenes.py --real DIR --generated DIR --samples 10000 --k 3 5 --reference apart --apart-m 10
+    jobs/evaluate_scenes.py --real DIR --generated samples.npz --inception FILE
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
 By default as in the paper: at most 1,000 training scenes with poses as far apart as can be, as many generated ones with
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from pipelines.dataset import Dataset
+    from pipelines.describe import Looks
     from pipelines.evaluation_report import Shown
     from pipelines.metrics.intervals import Estimate
     from pipelines.selection import Selection
@@ -40,11 +42,12 @@ SHOWN = 12  # pictures of either side on the page
 @dataclass(frozen=True)
 class Config:
     real: str = ""
-    """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
+    """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town), or an .npz of pictures, as ADM's."""
     real_split: str = "train"
     """Split that generated scenes are compared with; the paper takes the training split."""
     generated: str = ""
-    """Dataset directory of the generated scenes (default with neither --lvae nor this: $PRITTI_HOME/generated)."""
+    """Dataset directory of the generated scenes (default with neither --lvae nor this: $PRITTI_HOME/generated), or an
+    .npz of pictures, as ADM's; of those, the first --samples."""
     generated_split: str = ""
     """Only this split of them (default: whatever is there); --generated may be any dataset directory."""
     run: str = ""
@@ -90,7 +93,9 @@ def evaluate(config: Config) -> dict:
     for name, least in (("pictures", 0), ("samples", 2), ("supersample", 1)):
         if (given := getattr(config, name)) < least:
             raise ValueError(f"--{name} is {given}, expected {least} or more")
-    dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
+    dataset = None
+    if config.lvae or not config.real.endswith(".npz"):
+        dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     wanted = config.generated or ("" if config.lvae else home("generated"))
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
     scores: dict = {}
@@ -99,12 +104,12 @@ def evaluate(config: Config) -> dict:
         if config.lvae:
             scores["reconstruction"] = reconstruction(config, dataset, output, bar)
         if wanted:
-            scores["generation"] = generation(config, dataset, absolute(wanted), output, bar)
+            scores["generation"] = generation(config, dataset, output, bar)
     nested, flat = plain(scores), flattened(scores)
     storage.write_json(nested, storage.join(output, "metrics.json"))
     storage.write_parquet(pa.Table.from_pylist(metric_rows(flat)), storage.join(output, "metrics.parquet"))
     tags = {
-        "real": dataset.root,
+        "real": config.real or home("datasets", "town"),
         "split": config.real_split,
         "generated": wanted,
         "lvae": config.lvae and absolute(config.lvae),
@@ -123,93 +128,161 @@ def metric_rows(flat: dict[str, Estimate | float]) -> list[dict]:
     return rows
 
 
-def generation(config: Config, dataset: Dataset, root: str, output: str, bar: Progress) -> dict:
+def generation(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
     """Scores of the generated scenes; writes evaluation.html and what is known of each scene, under described/."""
-    from dataclasses import replace
-
     from pipelines import storage
-    from pipelines.describe import Looks, describe
+    from pipelines.describe import Looks
     from pipelines.evaluate import compare, memorisation, plain
     from pipelines.evaluation_report import evaluation_html
-    from pipelines.selection import Selection
+    from pipelines.metrics.adm_npz import reference_moments
 
-    source = f"generated-{config.run}" if config.run else None
-    sides = {
-        "real": Selection(
-            dataset.root, dataset.source, config.real_split, config.samples, config.reference, config.apart_m
-        ),
-        "generated": Selection(
-            root, source, config.generated_split or None, config.samples, "balanced" if config.balance else "spread"
-        ),
-    }
-    count = min(sum(len(rows) for _, rows in side.shards()) for side in sides.values())
-    sides = {name: replace(side, limit=count) for name, side in sides.items()}
     looks = Looks(config.supersample, config.inception and absolute(config.inception))
-    described = {}
-    for name, side in sides.items():
-        bar_task = bar.add_task(f"describe {name}", total=count)
-        directory = storage.join(output, "described", name)
-        described[name] = describe(
-            side, dataset, looks, directory, config.actors, lambda n, task=bar_task: bar.advance(task, n)
-        )
+    sides = chosen_sides(config, dataset)
+    described = {
+        name: described_side(side, dataset, looks, storage.join(output, "described", name), config.actors, bar, name)
+        for name, side in sides.items()
+    }
     task = bar.add_task("compare", total=2)
-    scores = compare(described["real"], described["generated"], dataset.spec.ground_classes, config.k)
+    reference = reference_moments(sides["real"].path) if isinstance(sides["real"], PictureFile) else None
+    classes = dataset.spec.ground_classes if dataset else ()
+    scores = compare(described["real"], described["generated"], classes, config.k, reference)
     bar.advance(task)
-    if count > 3:
+    if scores["scenes"]["generated"] > 3:
         features = "pool3" if "pool3" in described["real"] else "random"
         found = memorisation(described["real"][features], described["generated"][features])
         scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
     bar.advance(task)
-    counts = {name: part["statistics"][:, :11] for name, part in described.items()}
-    html = evaluation_html(
-        plain(scores), counts, shown(sides, described, scores, looks), protocol(config, sides, count)
-    )
+    counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
+    html = evaluation_html(plain(scores), counts, shown(sides, described, scores), protocol(config, sides, looks))
     storage.write_whole(storage.join(output, "evaluation.html"), lambda stream: stream.write(html.encode()))
     return scores
 
 
-def protocol(config: Config, sides: dict[str, Selection], count: int) -> list[str]:
+@dataclass(frozen=True)
+class PictureFile:
+    """The first `limit` pictures of an .npz in ADM's form."""
+
+    path: str
+    limit: int
+
+    @property
+    def root(self) -> str:
+        return self.path
+
+
+def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Selection | PictureFile]:
+    """Both sides, of equal number. Raises ValueError for pictures of unequal size."""
+    from dataclasses import replace
+
+    from pipelines.metrics.adm_npz import picture_shape
+    from pipelines.selection import Selection
+
+    source = f"generated-{config.run}" if config.run else None
+    generated = absolute(config.generated) if config.generated else home("generated")
+    labels = "balanced" if config.balance else "spread"
+    sides, counts, sizes = {}, {}, {}
+    for name, path in (("real", absolute(config.real) if config.real else ""), ("generated", generated)):
+        if path.endswith(".npz"):
+            count, *sizes[name], _ = picture_shape(path)
+            counts[name], sides[name] = min(count, config.samples), PictureFile(path, count)
+            continue
+        if name == "real":
+            side = Selection(
+                dataset.root, dataset.source, config.real_split, config.samples, config.reference, config.apart_m
+            )
+        else:
+            side = Selection(path, source, config.generated_split or None, config.samples, labels)
+        sizes[name], sides[name] = [256, 256], side
+        counts[name] = sum(len(rows) for _, rows in side.shards())
+    if sizes["real"] != sizes["generated"]:
+        raise ValueError(
+            f"real pictures are {sizes['real']} pixels, generated ones {sizes['generated']}: make them alike"
+        )
+    return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
+
+
+def described_side(
+    side: Selection | PictureFile,
+    dataset: Dataset | None,
+    looks: Looks,
+    directory: str,
+    actors: int,
+    bar: Progress,
+    name: str,
+) -> dict[str, np.ndarray]:
+    """What is known of each scene or picture of a side."""
+    from pipelines.describe import describe, describe_pictures
+
+    task = bar.add_task(f"describe {name}", total=side.limit)
+    if isinstance(side, PictureFile):
+        return describe_pictures(side.path, side.limit, looks, directory, actors, lambda n: bar.advance(task, n))
+    return describe(side, dataset, looks, directory, actors, lambda n: bar.advance(task, n))
+
+
+def protocol(config: Config, sides: dict[str, Selection | PictureFile], looks: Looks) -> list[str]:
     """How it was done, in words."""
+    from pipelines.metrics.inception import weights_line
+
     how = {
         "farthest": "poses as far apart as can be (farthest point sampling)",
         "apart": f"poses at least {config.apart_m:g} m apart",
         "spread": "evenly spread",
     }[config.reference]
-    labels = "labels in equal parts as far as they go" if config.balance else "evenly spread"
-    drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
-    return [
-        f"Real: {count} scenes of {sides['real'].root}, split {config.real_split}, {how}. "
-        f"Generated: {count} scenes of {sides['generated'].root}, {labels}. Equal numbers on both sides.",
-        f"Pictures: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.",
+    chosen = {
+        "real": f"split {config.real_split}, {how}",
+        "generated": "labels in equal parts as far as they go" if config.balance else "evenly spread",
+    }
+    words = [
+        f"{name.capitalize()}: {side.limit} of {side.root}, {'the first' if isinstance(side, PictureFile) else chosen[name]}."
+        for name, side in sides.items()
     ]
+    drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
+    words.append(f"Pictures of scenes: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.")
+    return [*words, weights_line(looks.inception)] if looks.inception else words
 
 
-def shown(sides: dict[str, Selection], described: dict, scores: dict, looks: object) -> Shown:
+def shown(sides: dict[str, Selection | PictureFile], described: dict, scores: dict) -> Shown:
     """The page's pictures: evenly chosen ones, those nearest to real scenes, and those with most faults."""
+    import numpy as np
 
-    from pipelines.describe import chosen_scenes
     from pipelines.evaluation_report import Shown
-    from pipelines.scenes.render import bev_picture
     from pipelines.selection import evenly
-
-    parts = {name: side.shards() for name, side in sides.items()}
-
-    def drawn(side: str, indices: np.ndarray) -> list[np.ndarray]:
-        return [bev_picture(scene, supersample=2) for scene in chosen_scenes(parts[side], indices)]
 
     count = len(described["generated"]["scene_id"])
     even = evenly(count, min(SHOWN, count))
-    neighbours = []
+    neighbours, worst = [], []
     if "memorisation" in scores:
         found = scores["memorisation"]
         alike = found["distance"][:, 0].argsort(kind="stable")[: SHOWN // 3]
-        for index, picture in zip(alike, drawn("generated", alike), strict=True):
-            neighbours.append((picture, drawn("real", found["nearest"][index]), found["distance"][index].tolist()))
-    faults = described["generated"]["validity"][:, :-2:2]  # road connectivity, the last, is no fault
-    most = (-faults.sum(axis=1)).argsort(kind="stable")[: SHOWN // 2]
-    reasons = [f"{faults[index].sum():.0f} faults" for index in most]
-    worst = list(zip(drawn("generated", most), reasons, strict=True))
-    return Shown(drawn("real", even), drawn("generated", even), neighbours, worst)
+        for index, picture in zip(alike, drawn(sides["generated"], alike), strict=True):
+            neighbours.append(
+                (picture, drawn(sides["real"], found["nearest"][index]), found["distance"][index].tolist())
+            )
+    if "validity" in described["generated"]:
+        faults = described["generated"]["validity"][:, :-2:2].sum(axis=1)  # road connectivity, the last, is no fault
+        most = np.argsort(-faults, kind="stable")[: SHOWN // 2]
+        reasons = [f"{faults[index]:.0f} faults" for index in most]
+        worst = list(zip(drawn(sides["generated"], most), reasons, strict=True))
+    return Shown(drawn(sides["real"], even), drawn(sides["generated"], even), neighbours, worst)
+
+
+def drawn(side: Selection | PictureFile, indices: np.ndarray) -> list[np.ndarray]:
+    """Pictures of a side by number."""
+    from itertools import islice
+
+    from pipelines.describe import chosen_scenes
+    from pipelines.metrics.adm_npz import pictures_in_npz
+    from pipelines.scenes.render import bev_picture
+
+    if isinstance(side, PictureFile):
+        wanted = set(indices.tolist())
+        found = {
+            index: batch[0]
+            for index, batch in enumerate(islice(pictures_in_npz(side.path, 1), max(wanted) + 1))
+            if index in wanted
+        }
+        return [found[index] for index in indices.tolist()]
+    return [bev_picture(scene, supersample=2) for scene in chosen_scenes(side.shards(), indices)]
 
 
 def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:

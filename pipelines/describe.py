@@ -1,4 +1,5 @@
-"""Scenes or pictures -> what scores are made of: a Ray Data graph with a Parquet file per part, finished parts kept.
+"""Scenes, or pictures of an .npz -> what scores are made of: a Ray Data graph with a Parquet file per part; finished
+parts are kept.
 
 Files hold a row per scene (DESCRIBED names the columns), so that a long description goes on where it stopped and can be
 read by anyone.
@@ -19,11 +20,13 @@ from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.dataset import Dataset
 from pipelines.metrics import distributions, inception, statistics, validity
+from pipelines.metrics.adm_npz import pictures_in_npz
 from pipelines.scenes.render import bev_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
 
 READER_CPUS = 0.5
+PICTURES_PER_PART = 512
 VERSION = 1  # of what a description holds; another one is made anew
 PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
 # The columns besides scene_id: rows of numbers, of these types.
@@ -80,7 +83,9 @@ def label_fidelity(scene: Scene, dataset: Dataset) -> np.ndarray:
 class Describer:
     """Actor. Row in: number of a part, a shard with rows. Row out: the number of its scenes. Writes the part's file."""
 
-    def __init__(self, parts: list[tuple[Shard, list[int]]], dataset: Dataset, looks: Looks, directory: str) -> None:
+    def __init__(
+        self, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: Looks, directory: str
+    ) -> None:
         torch.set_num_threads(1)
         self.parts, self.dataset, self.looks, self.directory = parts, dataset, looks, directory
         self.network = inception.load_inception(looks.inception) if looks.inception else None
@@ -89,9 +94,36 @@ class Describer:
         shard, rows = self.parts[row["id"]]
         scenes = shard.scenes(rows)
         pictures = np.stack([bev_picture(scene, PICTURE_PX, self.looks.supersample) for scene in scenes])
-        columns = scene_rows(scenes, self.dataset) | features(pictures, self.network)
+        columns = features(pictures, self.network)
+        if self.dataset:
+            columns = scene_rows(scenes, self.dataset) | columns
         write_part(self.directory, row["id"], [scene.scene_id for scene in scenes], columns)
         return {"scenes": len(scenes)}
+
+
+class PictureDescriber:
+    """Actor. Row in: number of a part, a range of pictures of an .npz. Row out: their number. Writes the part's file.
+
+    The file is read forward, past what other actors describe; a part before the last one begins it anew.
+    """
+
+    def __init__(self, path: str, parts: list[range], looks: Looks, directory: str) -> None:
+        torch.set_num_threads(1)
+        self.path, self.parts, self.directory = path, parts, directory
+        self.network = inception.load_inception(looks.inception) if looks.inception else None
+        self.batches, self.next_part = iter(()), len(parts)
+
+    def __call__(self, row: dict) -> dict:
+        number = row["id"]
+        if number < self.next_part:
+            self.batches, self.next_part = pictures_in_npz(self.path, PICTURES_PER_PART), 0
+        while self.next_part <= number:
+            pictures = next(self.batches)
+            self.next_part += 1
+        part = self.parts[number]
+        names = [f"{index:07d}" for index in part]
+        write_part(self.directory, number, names, features(pictures[: len(part)], self.network))
+        return {"scenes": len(part)}
 
 
 def part_path(directory: str, number: int) -> str:
@@ -119,7 +151,7 @@ def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
 
 def describe(
     selection: Selection,
-    dataset: Dataset,
+    dataset: Dataset | None,
     looks: Looks,
     directory: str,
     num_actors: int = 1,
@@ -127,26 +159,50 @@ def describe(
 ) -> dict[str, np.ndarray]:
     """Per-scene arrays of a selection, in the order of its shards; fidelity and validity flat, see DESCRIBED.
 
-    Parts that DIRECTORY holds of the same selection and looks are read, the rest is made. Row in: number of a part.
+    Without a dataset, whose ground classes and label thresholds scenes are judged by, only features. Parts that DIRECTORY holds of the same selection and looks are read, the rest is made. Row in: number of a part.
     Row out: number of scenes. Fan-out: one task per shard.
     """
     parts = selection.shards()
     files = [
         storage.fingerprint(shard.path(table)) for shard, _ in parts for table in ("scenes", "primitives", "rasters")
     ]
-    judged_by = [asdict(part) for part in (dataset.vegetation, dataset.vehicle)] + list(dataset.spec.ground_classes)
+    judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
     claim(directory, {"selection": asdict(selection), "files": files, "labels": judged_by} | digest(looks))
-    missing = []
-    for number, (_, rows) in enumerate(parts):
-        if storage.exists(part_path(directory, number)):
-            if on_scenes:
-                on_scenes(len(rows))
-        else:
-            missing.append(number)
-    for row in fan_out(missing, Describer, (parts, dataset, looks, directory), num_actors):
+    counts = [len(rows) for _, rows in parts]
+    return describe_parts(counts, Describer, (parts, dataset, looks, directory), directory, num_actors, on_scenes)
+
+
+def describe_pictures(
+    path: str,
+    count: int,
+    looks: Looks,
+    directory: str,
+    num_actors: int = 1,
+    on_scenes: Callable[[int], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Features of the first `count` pictures of an .npz (adm_npz.py), by number; resumable as `describe`."""
+    parts = [range(at, min(at + PICTURES_PER_PART, count)) for at in range(0, count, PICTURES_PER_PART)]
+    claim(directory, {"file": storage.fingerprint(path), "count": count} | digest(looks))
+    counts = [len(part) for part in parts]
+    return describe_parts(counts, PictureDescriber, (path, parts, looks, directory), directory, num_actors, on_scenes)
+
+
+def describe_parts(
+    counts: list[int],
+    actor: type,
+    arguments: tuple,
+    directory: str,
+    num_actors: int,
+    on_scenes: Callable[[int], None] | None,
+) -> dict[str, np.ndarray]:
+    """All parts, those that are missing made by actors first; `counts` scenes each."""
+    missing = [number for number in range(len(counts)) if not storage.exists(part_path(directory, number))]
+    if on_scenes:
+        on_scenes(sum(counts) - sum(counts[number] for number in missing))
+    for row in fan_out(missing, actor, arguments, num_actors):
         if on_scenes:
             on_scenes(row["scenes"])
-    return read_parts(directory, len(parts))
+    return read_parts(directory, len(counts))
 
 
 def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:

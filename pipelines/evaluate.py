@@ -15,6 +15,7 @@ import ray
 
 from models.scene import CATEGORIES
 from pipelines.metrics import distributions, statistics, validity
+from pipelines.metrics.adm_npz import Gaussian, ReferenceMoments
 from pipelines.metrics.frechet import frechet_distance, frechet_influence, moments, transport
 from pipelines.metrics.inception_score import inception_score
 from pipelines.metrics.intervals import Estimate, mean_estimate, moved, ratio_estimates
@@ -27,8 +28,18 @@ NEIGHBOURS = 3  # of each generated scene that are named
 MEMORISED_QUANTILE = 0.01  # of real scenes' distances to their nearest other
 
 
-def compare(real: Described, generated: Described, ground_classes: Sequence[str], k: Sequence[int] = (3,)) -> dict:
-    """Scores of `generated` against `real`, nested, Estimates at the leaves where an interval can be given."""
+def compare(
+    real: Described,
+    generated: Described,
+    ground_classes: Sequence[str] = (),
+    k: Sequence[int] = (3,),
+    reference: ReferenceMoments | None = None,
+) -> dict:
+    """Scores of `generated` against `real`, nested, Estimates at the leaves where an interval can be given.
+
+    `reference` are moments of all real pictures where only some are at hand: fid and sfid are then taken to them, as
+    ADM's evaluator does.
+    """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
     if "statistics" in real and "statistics" in generated:
         layout = statistics.standardised(real["statistics"], generated["statistics"])
@@ -42,6 +53,9 @@ def compare(real: Described, generated: Described, ground_classes: Sequence[str]
         found = feature_scores(real["pool3"], generated["pool3"], k)
         scores |= {names.get(name, name): value for name, value in found.items()}
         scores["sfid"] = frechet(real["spatial"], generated["spatial"])
+        if reference:
+            scores["fid"] = frechet_to(reference.pool3, generated["pool3"])
+            scores["sfid"] = frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
         scores["inception_score"] = inception_score(generated["logits"])
         scores["inception_score_real"] = inception_score(real["logits"])
     return scores
@@ -54,6 +68,15 @@ def frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
     a, b = moments(real), moments(generated)
     between = transport(a, b)
     return moved(frechet_distance(a, b, between), frechet_influence(real, generated, a, b, between))
+
+
+def frechet_to(reference: Gaussian, generated: np.ndarray) -> Estimate:
+    """Distance to moments that are given; only the generated samples vary."""
+    b = moments(generated)
+    between = transport(reference, b)
+    nothing = np.zeros((0, len(b.mean)))
+    influences = frechet_influence(nothing, generated, reference, b, between)
+    return moved(frechet_distance(reference, b, between), (np.zeros(1), influences[1]))
 
 
 def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:

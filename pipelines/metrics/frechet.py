@@ -111,5 +111,5 @@ def frechet_influence(
             centred = features[rows] - own.mean
             values[rows] = np.square(centred).sum(axis=1) - np.square(centred @ through).sum(axis=1)
             values[rows] += 2 * centred @ (own.mean - other.mean)
-        parts.append(values - values.mean())
+        parts.append(values - values.mean() if len(values) else values)
     return parts[0], parts[1]
