@@ -350,12 +350,7 @@ def table_bytes(chunks: list[Chunk]) -> float:
     """Mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
     total, scenes = 0.0, 0
     for shard, rows in chunks:
-        written = sum(file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))
+        written = sum(storage.file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))
         total += written / shard.read("scenes", ["scene_id"]).num_rows * len(rows)
         scenes += len(rows)
     return total / scenes
-
-
-def file_bytes(uri: str) -> int:
-    fs, path = storage.resolve(uri)
-    return fs.get_file_info(path).size

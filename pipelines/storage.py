@@ -106,6 +106,22 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
     return table
 
 
+def read_bytes(uri: str) -> bytes:
+    """A whole file. Raises ValueError naming it if it cannot be read."""
+    fs, path = resolve(uri)
+    try:
+        with fs.open_input_stream(path, compression=None) as stream:
+            return stream.read()
+    except OSError as error:
+        raise ValueError(f"{uri}: cannot be read ({error})") from error
+
+
+def file_bytes(uri: str) -> int:
+    """Size of a file."""
+    fs, path = resolve(uri)
+    return fs.get_file_info(path).size
+
+
 def write_json(value: Any, uri: str) -> None:
     write_whole(uri, lambda stream: stream.write(json.dumps(value, indent=1, allow_nan=False).encode()))
 
@@ -133,6 +149,13 @@ def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) ->
         with suppress(FileNotFoundError):  # its writer was alive after all, and is done
             fs.delete_file(name)
     return len(stale)
+
+
+def delete_file(uri: str) -> None:
+    """Delete a file if it is there."""
+    fs, path = resolve(uri)
+    if fs.get_file_info(path).is_file:
+        fs.delete_file(path)
 
 
 def delete_directory(uri: str) -> None:

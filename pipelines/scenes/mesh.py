@@ -8,6 +8,7 @@ diagonal. A primitive is a unit cuboid or a unit ellipsoid (diameter 1) under T 
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,10 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, ground_ids
 
 GROUND = -1  # "primitive" of a ground triangle
+ABOUT = (  # what a file says of the scene as a whole
+    *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
+    *("vegetation_density", "vehicle_density", "ground_classes"),
+)
 
 # Cyclic, hence a proper rotation: glTF's +z is forward, +y up and +x left, ours are x, z and y.
 GLTF_FROM_SCENE = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
@@ -106,13 +111,17 @@ def scene_glb(scene: Scene) -> bytes:
 
     Node `scene` carries the turn from z up to y up, so that its children are in the scene frame: `ground`
     (vertex colours; absent where nothing is occupied) and one node per primitive, `<category>_<index>`, with
-    category, class id, colour, label, instance id and the exact parameters in its extras. Colours are stored
-    in linear light, as glTF demands: a viewer shows the palette's sRGB values.
+    category, class id, colour, label, instance id and the exact parameters in its extras. The extras of the whole say
+    what ABOUT names and the grid: `mesh_import.scene_from_glb` makes the same scene of it, less all but the fused ground.
+    Colours are stored in linear light, as glTF demands: a viewer shows the palette's sRGB values.
     """
-    world = trimesh.Scene(metadata={name: getattr(scene, name) for name in ("scene_id", "source", "sequence")})
+    about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
+    world = trimesh.Scene(metadata=about)
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = ground_mesh(scene)
-    if len(triangles):
+    if len(vertices):
+        # A triangle without area keeps pixels that have no neighbours: files leave meshes without triangles out.
+        triangles = triangles if len(triangles) else np.zeros((1, 3), int)
         world.geometry["ground"] = _painted_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
