@@ -25,18 +25,15 @@ from typing import TYPE_CHECKING, Literal
 from jobs.command import absolute, home, run, start_ray
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.progress import Progress
 
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks
-    from pipelines.evaluation_report import Shown
     from pipelines.metrics.intervals import Estimate
-    from pipelines.selection import Selection
+    from pipelines.sides import Side
 
 METRICS_PER_CALL = 1000  # MLflow's limit
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
-SHOWN = 12  # pictures of either side on the page
 
 
 @dataclass(frozen=True)
@@ -135,13 +132,16 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
     from pipelines.evaluate import compare, memorisation, plain
     from pipelines.evaluation_report import evaluation_html
     from pipelines.metrics.adm_npz import reference_moments
+    from pipelines.sides import PictureFile, describe_side, pictures_shown
 
     looks = Looks(config.supersample, config.inception and absolute(config.inception))
     sides = chosen_sides(config, dataset)
-    described = {
-        name: described_side(side, dataset, looks, storage.join(output, "described", name), config.actors, bar, name)
-        for name, side in sides.items()
-    }
+    described = {}
+    for name, side in sides.items():
+        task, directory = bar.add_task(f"describe {name}", total=side.limit), storage.join(output, "described", name)
+        described[name] = describe_side(
+            side, dataset, looks, directory, config.actors, lambda n, task=task: bar.advance(task, n)
+        )
     task = bar.add_task("compare", total=2)
     reference = reference_moments(sides["real"].path) if isinstance(sides["real"], PictureFile) else None
     classes = dataset.spec.ground_classes if dataset else ()
@@ -153,29 +153,19 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
         scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
     bar.advance(task)
     counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
-    html = evaluation_html(plain(scores), counts, shown(sides, described, scores), protocol(config, sides, looks))
+    shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores.get("memorisation"))
+    html = evaluation_html(plain(scores), counts, shown, protocol(config, sides, looks))
     storage.write_whole(storage.join(output, "evaluation.html"), lambda stream: stream.write(html.encode()))
     return scores
 
 
-@dataclass(frozen=True)
-class PictureFile:
-    """The first `limit` pictures of an .npz in ADM's form."""
-
-    path: str
-    limit: int
-
-    @property
-    def root(self) -> str:
-        return self.path
-
-
-def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Selection | PictureFile]:
+def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     """Both sides, of equal number. Raises ValueError for pictures of unequal size."""
     from dataclasses import replace
 
     from pipelines.metrics.adm_npz import picture_shape
     from pipelines.selection import Selection
+    from pipelines.sides import PictureFile
 
     source = f"generated-{config.run}" if config.run else None
     generated = absolute(config.generated) if config.generated else home("generated")
@@ -201,27 +191,10 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Selection
     return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
 
 
-def described_side(
-    side: Selection | PictureFile,
-    dataset: Dataset | None,
-    looks: Looks,
-    directory: str,
-    actors: int,
-    bar: Progress,
-    name: str,
-) -> dict[str, np.ndarray]:
-    """What is known of each scene or picture of a side."""
-    from pipelines.describe import describe, describe_pictures
-
-    task = bar.add_task(f"describe {name}", total=side.limit)
-    if isinstance(side, PictureFile):
-        return describe_pictures(side.path, side.limit, looks, directory, actors, lambda n: bar.advance(task, n))
-    return describe(side, dataset, looks, directory, actors, lambda n: bar.advance(task, n))
-
-
-def protocol(config: Config, sides: dict[str, Selection | PictureFile], looks: Looks) -> list[str]:
+def protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
     """How it was done, in words."""
     from pipelines.metrics.inception import weights_line
+    from pipelines.sides import PictureFile
 
     how = {
         "farthest": "poses as far apart as can be (farthest point sampling)",
@@ -241,50 +214,6 @@ def protocol(config: Config, sides: dict[str, Selection | PictureFile], looks: L
     return [*words, weights_line(looks.inception)] if looks.inception else words
 
 
-def shown(sides: dict[str, Selection | PictureFile], described: dict, scores: dict) -> Shown:
-    """The page's pictures: evenly chosen ones, those nearest to real scenes, and those with most faults."""
-    import numpy as np
-
-    from pipelines.evaluation_report import Shown
-    from pipelines.selection import evenly
-
-    count = len(described["generated"]["scene_id"])
-    even = evenly(count, min(SHOWN, count))
-    neighbours, worst = [], []
-    if "memorisation" in scores:
-        found = scores["memorisation"]
-        alike = found["distance"][:, 0].argsort(kind="stable")[: SHOWN // 3]
-        for index, picture in zip(alike, drawn(sides["generated"], alike), strict=True):
-            neighbours.append(
-                (picture, drawn(sides["real"], found["nearest"][index]), found["distance"][index].tolist())
-            )
-    if "validity" in described["generated"]:
-        faults = described["generated"]["validity"][:, :-2:2].sum(axis=1)  # road connectivity, the last, is no fault
-        most = np.argsort(-faults, kind="stable")[: SHOWN // 2]
-        reasons = [f"{faults[index]:.0f} faults" for index in most]
-        worst = list(zip(drawn(sides["generated"], most), reasons, strict=True))
-    return Shown(drawn(sides["real"], even), drawn(sides["generated"], even), neighbours, worst)
-
-
-def drawn(side: Selection | PictureFile, indices: np.ndarray) -> list[np.ndarray]:
-    """Pictures of a side by number."""
-    from itertools import islice
-
-    from pipelines.describe import chosen_scenes
-    from pipelines.metrics.adm_npz import pictures_in_npz
-    from pipelines.scenes.render import bev_picture
-
-    if isinstance(side, PictureFile):
-        wanted = set(indices.tolist())
-        found = {
-            index: batch[0]
-            for index, batch in enumerate(islice(pictures_in_npz(side.path, 1), max(wanted) + 1))
-            if index in wanted
-        }
-        return [found[index] for index in indices.tolist()]
-    return [bev_picture(scene, supersample=2) for scene in chosen_scenes(side.shards(), indices)]
-
-
 def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Scores; writes reconstruction.parquet, a row per scene, and reconstruction.html with the best and worst of them."""
     from pipelines import storage
@@ -296,7 +225,12 @@ def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress)
     lvae = absolute(config.lvae)
     shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
     rebuilt = rebuild(
-        real, lvae, config.actors, voxel_range_m=config.voxel_range_m, on_scene=lambda: bar.advance(shown)
+        real,
+        lvae,
+        config.actors,
+        voxel_range_m=config.voxel_range_m,
+        dataset=dataset,
+        on_scene=lambda: bar.advance(shown),
     )
     storage.write_parquet(rebuilt.scenes, storage.join(output, "reconstruction.parquet"))
     count = min(config.pictures, len(rebuilt.places) // 2)

@@ -69,15 +69,15 @@ def scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
         rows["statistics"].append(statistics.layout_statistics(scene))
         rows["histograms"].append(distributions.scene_histograms(scene))
         rows["validity"].append(validity.scene_validity(scene, slab_offset_m).ravel())
-        rows["fidelity"].append(label_fidelity(scene, dataset))
+        rows["fidelity"].append(label_fidelity(scene, dataset).ravel())
     return {name: np.stack(values) for name, values in rows.items()}
 
 
-def label_fidelity(scene: Scene, dataset: Dataset) -> np.ndarray:
-    """(6,) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels."""
-    if scene.vegetation_density is None and scene.vehicle_density is None:
-        return np.zeros(2 * len(validity.LABEL_MEASURES))
-    return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle).ravel()
+def label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
+    """(3, 2) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels, or without a dataset."""
+    if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
+        return np.zeros((len(validity.LABEL_MEASURES), 2))
+    return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle)
 
 
 class Describer:

@@ -19,7 +19,8 @@ from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
 from pipelines import storage
-from pipelines.describe import READER_CPUS
+from pipelines.dataset import Dataset
+from pipelines.describe import READER_CPUS, label_fidelity
 from pipelines.encode import gpus_per_actor, load_lvae
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
@@ -40,6 +41,7 @@ from pipelines.metrics.reconstruction import (
     voxel_confusion,
     voxel_scores,
 )
+from pipelines.metrics.validity import LABEL_MEASURES, validity_rates
 from pipelines.scenes.render import bev_picture, picture_3d
 from pipelines.scenes.tables import Shard
 from pipelines.scenes.voxels import NUM_CLASSES, Outside, VoxelGrid, outside, voxelise
@@ -120,10 +122,11 @@ class SceneRecord:
     confusion: np.ndarray  # (classes, classes) voxels
     outside: Outside
     memory: np.ndarray  # bytes of each of MEMORY
+    labels: np.ndarray  # (measures, 2) label fidelity: is the reconstruction's own label the truth's? Zeros: not known
 
     def to_row(self) -> dict:
         """Flat arrays, for Arrow."""
-        out = {"confusion": self.confusion.ravel(), "memory": self.memory}
+        out = {"confusion": self.confusion.ravel(), "memory": self.memory, "labels": self.labels.ravel()}
         for part in ("ground", "raster", "matches", "pairs", "outside"):
             value = getattr(self, part)
             out |= {f"{part}_{name}": np.ravel(getattr(value, name)) for name in value.__dataclass_fields__}
@@ -143,11 +146,17 @@ class SceneRecord:
             confusion=np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES),
             outside=part("outside", Outside, objects=(-1, 3)),
             memory=np.asarray(row["memory"]),
+            labels=np.asarray(row["labels"]).reshape(-1, 2),
         )
 
 
 def scene_record(
-    truth: Scene, layout: DecodedLayout, latent: np.ndarray, spec: LayoutSpec, voxels: VoxelGrid
+    truth: Scene,
+    layout: DecodedLayout,
+    latent: np.ndarray,
+    spec: LayoutSpec,
+    voxels: VoxelGrid,
+    dataset: Dataset | None = None,
 ) -> SceneRecord:
     """A scene against its reconstruction; the ground on the truth's pixels and on the model's.
 
@@ -170,14 +179,17 @@ def scene_record(
         confusion=voxel_confusion(true_voxels, voxelise(rebuilt, voxels)),
         outside=outside(truth, voxels),
         memory=memory_bytes(layout_batch([truth], spec), latent, true_voxels),
+        labels=label_fidelity(rebuilt, dataset),
     )
 
 
-def score_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid) -> list[dict]:
+def score_chunk(
+    row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
+) -> list[dict]:
     """Row in: what a Rebuilder put out. Rows out: one record per scene."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
-        | scene_record(scene, layout, latent, spec, voxels).to_row()
+        | scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
         for number, scene, layout, latent in unstacked(row, chunks)
     ]
 
@@ -221,13 +233,19 @@ def rebuild(
     num_actors: int = 1,
     batch_size: int = 8,
     voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
+    dataset: Dataset | None = None,
     on_scene: Callable[[], None] | None = None,
 ) -> Rebuilt:
-    """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means."""
+    """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
+
+    With a dataset, whose thresholds labels go by, also whether reconstructions keep their density labels.
+    """
     spec, chunks = load_lvae(lvae).spec, chunks_of(selection, batch_size)
     voxels = voxel_grid(spec, voxel_range_m)
     graph = rebuilt_chunks(chunks, lvae, num_actors).flat_map(
-        score_chunk, fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels}, num_cpus=READER_CPUS
+        score_chunk,
+        fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset},
+        num_cpus=READER_CPUS,
     )
     rows = []
     for row in graph.iter_rows():
@@ -307,6 +325,7 @@ def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: 
             "category_outside": {CATEGORIES[c]: float(num_wholly[c] / num_objects[c]) for c in present},
         },
         "memory_bytes": dict(zip(MEMORY, np.mean([r.memory for r in records], axis=0).tolist(), strict=True)),
+        "label_fidelity": validity_rates(np.stack([r.labels for r in records]), LABEL_MEASURES),
         "truths": {CATEGORIES[c]: int(num_objects[c]) for c in present},
     }
 

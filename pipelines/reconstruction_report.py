@@ -151,6 +151,7 @@ def overall(scores: Mapping) -> Table:
         ("right", matched["right"], None, "share of reconstructed boxes that overlap the true one they are matched with"),
         ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty"),
         ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over classes, empty left out"),
+        ("density labels kept", scores["label_fidelity"]["joint_fidelity"], None, "share of scenes whose reconstruction has both density labels of the truth: what generated scenes can reach"),
         ("size, MiB", (memory["rasters"] + memory["vectors"]) / MIB, PAPER["MiB"], f"rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors of one scene, as tensors; the paper's rasters have 256 x 256"),
     ]  # fmt: skip
     return Table(

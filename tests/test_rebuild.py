@@ -11,6 +11,7 @@ from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import DecodedLayout, compact_layout, layout_batch
 from pipelines import storage
+from pipelines.evaluate import flattened
 from pipelines.rebuild import (
     Rebuilt,
     SceneRecord,
@@ -24,7 +25,7 @@ from pipelines.rebuild import (
 )
 from pipelines.reconstruction_report import reconstruction_html
 from pipelines.scenes.tables import Shard
-from pipelines.selection import Selection, flattened
+from pipelines.selection import Selection
 
 LATENT = np.zeros((4, 8, 8), np.float32)
 SPEC = replace(
