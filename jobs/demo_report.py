@@ -12,6 +12,7 @@ from jobs.command import home
 from jobs.tracking import Tracker, client, tracking_uri
 from models.scene import Scene
 from pipelines.chart import Chart
+from pipelines.evaluation_report import score_table, validity_table
 from pipelines.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, write_report
 from pipelines.scenes.render import bev_picture, picture_3d
 from pipelines.scenes.tables import read_scenes
@@ -23,25 +24,11 @@ if TYPE_CHECKING:
 SHOWN = 4
 
 MEANINGS = {
-    "reconstruction.ground_iou": "pixels on which truth and reconstruction agree that a ground class is there, over all that either claims; 1 is perfect (the paper on KITTI-360: 0.9996)",
-    "reconstruction.height_rmse_m": "typical error of the reconstructed ground height, in metres, where there is ground",
-    "reconstruction.height_mse_normalised": "the same squared, heights scaled to [0, 1] by the data's range (the paper: 0.0075)",
-    "reconstruction.ap3d": "average precision of reconstructed boxes over ten IoU thresholds 0.05 to 0.50, all categories but ellipsoids (the paper: 0.621)",
-    "reconstruction.ap3d_50": "the same at IoU 0.50 (the paper: 0.470)",
-    "generation.layout_frechet": "distance between the distributions of counts, sizes and areas of real and generated scenes; 0 is equal. Not an FID",
-    "generation.random_frechet": "distance between pictures of real and generated scenes as a fixed, untrained network sees them; 0 is equal. Not an FID",
-    "generation.random_precision_k3": "share of generated pictures that lie among the real ones, in the untrained network's features",
-    "generation.random_recall_k3": "share of real pictures that lie among the generated ones",
-    "generation.label_fidelity.vegetation_fidelity": "share of scenes whose vegetation is as dense as was asked for",
-}
-VALIDITY = {
-    "overlapping": "solid objects that stand in one another (IoU3D > 0.05)",
-    "floating": "standing objects more than half a metre above the ground",
-    "sunken": "standing objects more than half a metre below the ground",
-    "over_unknown_ground": "standing objects over no ground at all",
-    "off_road_vehicles": "vehicles beside road and parking",
-    "buildings_on_road": "buildings in the road",
-    "road_connectivity": "road pixels that hang together in one piece",
+    "ground_iou": "pixels on which truth and reconstruction agree that a ground class is there, over all that either claims; 1 is perfect (the paper on KITTI-360: 0.9996)",
+    "height_rmse_m": "typical error of the reconstructed ground height, in metres, where there is ground",
+    "height_mse_normalised": "the same squared, heights scaled to [0, 1] by the data's range (the paper: 0.0075)",
+    "ap3d": "average precision of reconstructed boxes over ten IoU thresholds 0.05 to 0.50, all categories but ellipsoids (the paper: 0.621)",
+    "ap3d_50": "the same at IoU 0.50 (the paper: 0.470)",
 }
 
 
@@ -84,23 +71,13 @@ def curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float
     return {label: tuple(map(list, zip(*h, strict=True))) for label, h in histories.items() if h}
 
 
-def metric_rows(scores: dict) -> list[tuple]:
-    rows = []
-    for name in MEANINGS:
-        value = scores
-        for part in name.split("."):
-            value = value.get(part) if isinstance(value, dict) else None
-        rows.append((name.split(".", 1)[1].replace("label_fidelity.", "").replace("_", " "), value))
-    return rows
-
-
 def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str, float]) -> None:
     """One self-contained page at `path`."""
     data, generated = home("datasets", "town"), home("generated")
     real = list(read_scenes(data, "town", "test"))
     made = list(read_scenes(generated, "generated-samples"))
     outpainted = next(read_scenes(home("outpainted"), "generated-outpainted"))
-    validity = scores["generation"]["validity"]
+    rebuilt, made_of = scores["reconstruction"], scores["generation"]
     total = sum(seconds.values())
     sections: list[Section] = [
         Text(
@@ -120,8 +97,8 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
                     f"{os.cpu_count()} cores, {platform.machine()}",
                 ),
                 Figure(sum(1 for _ in real) + config.num_train, "town scenes"),
-                Figure(scores["reconstruction"]["ground_iou"], "ground IoU", "reconstruction of held-out scenes"),
-                Figure(scores["reconstruction"]["ap3d"], "AP3D", "reconstruction of held-out scenes"),
+                Figure(rebuilt["ground_iou"], "ground IoU", "reconstruction of held-out scenes"),
+                Figure(rebuilt["ap3d"], "AP3D", "reconstruction of held-out scenes"),
                 Figure(len(made), "generated scenes", f"{config.sampling_steps} denoising steps each"),
             ],
         ),
@@ -176,18 +153,13 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
             ],
         ),
         Table(
-            "Scores",
+            "Reconstruction",
             ("measure", "value"),
-            metric_rows(scores),
+            [(name.replace("_", " "), rebuilt[name]) for name in MEANINGS],
             meanings=list(MEANINGS.values()),
-            note="FID, Inception score, precision and recall need local Inception weights: jobs/evaluate_scenes.py --inception FILE.",
         ),
-        Table(
-            "Do scenes make sense?",
-            ("share of", "real", "generated"),
-            [(meaning, validity[name]["real"], validity[name]["generated"]) for name, meaning in VALIDITY.items()],
-            note="Real scenes give the level to compare with; it is not zero.",
-        ),
+        score_table(made_of),
+        validity_table(made_of["validity"]),
         Table(
             "The town against KITTI-360",
             ("what", "vegetation", "target", "measured", "within tolerance"),
