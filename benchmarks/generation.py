@@ -26,14 +26,14 @@ ROUNDS = 3
 
 
 def features(count: int, seed: int, falling: bool) -> np.ndarray:
-    """(count, 2048) float32; `falling`: mean squares along a random basis fall as 1 / rank^1.5 and features are >= 0."""
+    """(count, 2048) float32; `falling`: mean squares along a random basis fall as 1 / rank^2, and features are >= 0."""
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((count, DIMENSIONS), dtype=np.float32)
     if not falling:
         return values
     mix = np.random.default_rng(7).standard_normal((DIMENSIONS, DIMENSIONS), dtype=np.float32) / DIMENSIONS**0.5
-    strength = np.arange(1, DIMENSIONS + 1, dtype=np.float32) ** -0.75
-    return np.maximum(0.4 + 0.02 * seed + (values * strength) @ mix, 0)
+    strength = np.arange(1, DIMENSIONS + 1, dtype=np.float32) ** -1.0
+    return np.maximum(0.1 + 0.001 * seed + (values * strength) @ mix, 0)
 
 
 def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:

@@ -18,10 +18,11 @@ from torch import Tensor
 from pipelines.metrics.frechet import checked_features
 
 BLOCK_ROWS = 1024  # rows of a distance matrix held at once: 4 kB x number of columns
-SPARE_NEIGHBOURS = 8  # candidates beyond the k-th that are measured to bound its distance
-PAIRS_PER_BLOCK = 2048  # of plainly computed distances
-BASIS_SAMPLES = 1024  # that the principal axes are taken from
-KEPT_VARIANCE = 0.99  # of them; more axes cost time in the filter, fewer leave more to verify
+SPARE_NEIGHBOURS = 8  # candidates beyond the k-th whose upper bounds bound its distance
+PAIRS_PER_BLOCK = 128  # of plainly computed distances: 2 MB at 2048-d, what a cache holds
+BASIS_SAMPLES = 512  # that the principal axes are taken from
+KEPT_VARIANCE = 0.997  # of them; more axes cost time in the filter, fewer leave more to verify
+MOST_LEFT_OVER = 0.02  # of the variance of all; beyond it too much is to verify, and the filter takes whole features
 FLOAT32_ROUNDING = 2.0**-24
 
 
@@ -58,10 +59,13 @@ class Neighbourhood:
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Principal axes (p, d) of a sample of both sides and their mean (d,), float64; orthonormal rows."""
+    """Principal axes (p, d) of a sample of both sides, orthonormal rows, and their mean (d,), float64.
+
+    None for the features' own axes, all of them.
+    """
 
     mean: np.ndarray
-    axes: np.ndarray
+    axes: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +73,14 @@ class Side:
     """One side's features (n, d) with their short vectors.
 
     left (n, p + 3) and right (n, p + 3), float32: left[i] . right[j] is the squared distance of the short vectors.
-    rest (n,): length of what the axes leave over; slack (n,): bound of a product's rounding, per sample of a pair.
+    length (n,): of the features about their mean; rest (n,): of what the axes leave over; slack (n,): bound of a
+    product's rounding, per sample of a pair.
     """
 
     features: np.ndarray
     left: np.ndarray
     right: np.ndarray
+    length: np.ndarray
     rest: np.ndarray
     slack: np.ndarray
 
@@ -89,6 +95,12 @@ def prepare(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[
     """
     real, generated = comparable(real, generated, at_least=checked_k(k) + 1)
     basis = principal_axes(real, generated)
+    sides = short_vectors(real, basis), short_vectors(generated, basis)
+    whole = sum(np.square(side.length).sum() for side in sides)
+    rest = sum(np.square(side.rest).sum() for side in sides)
+    if rest <= MOST_LEFT_OVER * whole:
+        return sides
+    basis = Basis(basis.mean, None)
     return short_vectors(real, basis), short_vectors(generated, basis)
 
 
@@ -134,9 +146,12 @@ def principal_axes(real: np.ndarray, generated: np.ndarray) -> Basis:
     some = np.concatenate([side[np.arange(count) * len(side) // count] for side in (real, generated)])
     some = some.astype(np.float64)
     mean = some.mean(axis=0)
-    _, strength, axes = np.linalg.svd(some - mean, full_matrices=False)
-    held = np.cumsum(strength**2)
-    return Basis(mean, axes[: 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))])
+    centred = some - mean
+    strength, vectors = np.linalg.eigh(centred @ centred.T)  # ascending; far smaller than a decomposition of `centred`
+    held = np.cumsum(strength[::-1].clip(0))
+    count = 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))
+    axes, _ = np.linalg.qr(centred.T @ vectors[:, -count:])
+    return Basis(mean, axes.T)
 
 
 def short_vectors(features: np.ndarray, basis: Basis) -> Side:
@@ -145,19 +160,22 @@ def short_vectors(features: np.ndarray, basis: Basis) -> Side:
     For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2, and |r - r'| lies between the difference and the
     sum of |r| and |r'|. With v = (c, |r|), (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2 in one product.
     """
-    short = np.empty((len(features), len(basis.axes) + 1))
+    width = 1 + (len(basis.mean) if basis.axes is None else len(basis.axes))
+    left, right = (np.empty((len(features), width + 2), np.float32) for _ in range(2))
+    norm, rest = (np.zeros(len(features)) for _ in range(2))
     for start in range(0, len(features), BLOCK_ROWS):
         rows = slice(start, start + BLOCK_ROWS)
-        centred = features[rows] - basis.mean
-        coordinates = centred @ basis.axes.T
-        short[rows, :-1] = coordinates
-        short[rows, -1] = np.linalg.norm(centred - coordinates @ basis.axes, axis=1)
-    norm, one = np.square(short).sum(axis=1, keepdims=True), np.ones((len(short), 1))
-    left = np.hstack([-2 * short, norm, one]).astype(np.float32)
-    right = np.hstack([short, one, norm]).astype(np.float32)
+        coordinates = centred = features[rows] - basis.mean
+        if basis.axes is not None:
+            coordinates = centred @ basis.axes.T
+            rest[rows] = np.linalg.norm(centred - coordinates @ basis.axes, axis=1)
+        short = np.column_stack([coordinates, rest[rows]])
+        norm[rows] = np.square(short).sum(axis=1)
+        left[rows, :-2], right[rows, :-2] = -2 * short, short
+    left[:, -2], left[:, -1], right[:, -2], right[:, -1] = norm, 1, 1, norm
     # |rounding of a product of t terms| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2), and t + 4 grants the terms' own.
-    slack = 2 * (left.shape[1] + 4) * FLOAT32_ROUNDING * norm[:, 0]
-    return Side(features, left, right, short[:, -1], slack)
+    slack = 2 * (width + 6) * FLOAT32_ROUNDING * norm
+    return Side(features, left, right, np.sqrt(norm), rest, slack)
 
 
 # ------------------------------------------------------------------------------------------------------- verify
@@ -184,11 +202,10 @@ def nearest(
     own = torch.arange(len(rows))
     if themselves:
         bound[own, own + rows.start] = torch.inf
-    spare = min(count + SPARE_NEIGHBOURS, len(others) - themselves)
-    column = bound.topk(spare, largest=False).indices.numpy()
-    row = np.repeat(np.arange(rows.start, rows.stop), spare)
-    known = squared_distances(side.features, row, others.features, column.ravel()).reshape(len(rows), spare)
-    reach = np.sort(known, axis=1)[:, count - 1] + side.slack[rows.start : rows.stop] + others.slack.max()
+    low, column = bound.topk(min(count + SPARE_NEIGHBOURS, len(others) - themselves), largest=False)
+    here, slack = slice(rows.start, rows.stop), side.slack[rows.start : rows.stop] + others.slack.max()
+    high = low.numpy() + 4 * side.rest[here, None] * others.rest[column.numpy()]
+    reach = np.sort(high, axis=1)[:, count - 1] + 2 * slack
     row, column = torch.nonzero(bound <= upper_float32(reach)[:, None]).numpy().T
     squared = squared_distances(side.features, row + rows.start, others.features, column)
     order = np.lexsort((column, squared, row))
@@ -235,7 +252,7 @@ def squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray
     for start in range(0, len(i), PAIRS_PER_BLOCK):
         block = slice(start, start + PAIRS_PER_BLOCK)
         difference = np.subtract(a[i[block]], b[j[block]], dtype=np.float64)
-        squared[block] = np.square(difference, out=difference).sum(axis=1)
+        np.einsum("pd,pd->p", difference, difference, out=squared[block])
     return squared
 
 
