@@ -147,10 +147,9 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
     classes = dataset.spec.ground_classes if dataset else ()
     scores = compare(described["real"], described["generated"], classes, config.k, reference)
     bar.advance(task)
-    if scores["scenes"]["generated"] > 3:
-        features = "pool3" if "pool3" in described["real"] else "random"
-        found = memorisation(described["real"][features], described["generated"][features])
-        scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
+    features = "pool3" if "pool3" in described["real"] else "random"
+    found = memorisation(described["real"][features], described["generated"][features])
+    scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
     bar.advance(task)
     counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
     shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores.get("memorisation"))

@@ -74,7 +74,8 @@ def sweep_references(config: Config) -> list[dict]:
             features[name] = described["pool3" if config.inception else "random"]
         places = poses(*described_columns(parts["real"]))
         labels = label_pairs(described_columns(parts["generated"])[0])
-        chosen = list(references(*places, config.sizes, config.apart_m, most=len(features["generated"])))
+        least, most = max(config.k) + 1, len(features["generated"])
+        chosen = list(references(*places, config.sizes, config.apart_m, least, most))
         task = bar.add_task("compare", total=len(chosen))
         rows = sweep(features["real"], features["generated"], labels, chosen, config.k, lambda: bar.advance(task))
     storage.write_json(rows, storage.join(output, "sweep.json"))

@@ -20,7 +20,7 @@ from pipelines.metrics.frechet import frechet_distance, frechet_influence, momen
 from pipelines.metrics.inception_score import inception_score
 from pipelines.metrics.intervals import Estimate, mean_estimate, moved, ratio_estimates
 from pipelines.metrics.kernel_distance import kernel_distance
-from pipelines.metrics.neighbours import Neighbourhood, Side, ball_radii, judged, nearest, prepare, within
+from pipelines.metrics.neighbours import Neighbourhood, Side, ball_radii, comparable, judged, nearest, prepare, within
 
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
@@ -80,19 +80,24 @@ def frechet_to(reference: Gaussian, generated: np.ndarray) -> Estimate:
 
 
 def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """frechet, mmd, and `neighbourhood_scores`."""
+    """frechet, mmd, and `neighbourhood_scores`. ValueError for features that are not finite, naming side and sample."""
+    real, generated = comparable(real, generated, at_least=2)
     found = {"frechet": frechet(real, generated), "mmd": kernel_distance(real, generated)}
     return found | neighbourhood_scores(real, generated, k)
 
 
 def neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """precision_k3, recall_k3, density_k3 and coverage_k3, for each k that there are enough samples for.
+    """precision_k3, recall_k3, density_k3 and coverage_k3, for each k. ValueError if there are too few samples for it.
 
     Intervals are over the judged samples; the balls are held fixed, as a sample drawn twice would be its own neighbour.
     """
-    sizes = [size for size in k if size < min(len(real), len(generated))]
+    if max(k) >= min(len(real), len(generated)):
+        raise ValueError(
+            f"--k {max(k)} needs more than {max(k)} scenes on each side, got {len(real)} and {len(generated)}; "
+            "give a smaller one or more scenes"
+        )
     found = {}
-    for one in spread_neighbourhoods(real, generated, sizes) if sizes else ():
+    for one in spread_neighbourhoods(real, generated, k):
         found[f"precision_k{one.k}"] = mean_estimate(one.in_real > 0, key=1)
         found[f"recall_k{one.k}"] = mean_estimate(one.in_generated)
         found[f"density_k{one.k}"] = mean_estimate(one.in_real / one.k, key=1)

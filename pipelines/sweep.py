@@ -10,7 +10,6 @@ import numpy as np
 
 from pipelines.chart import Chart
 from pipelines.evaluate import neighbourhood_scores
-from pipelines.metrics.intervals import Estimate
 from pipelines.report import Charts, Table, Text, report_html
 from pipelines.selection import apart, balanced, farthest
 
@@ -27,16 +26,16 @@ class Reference:
 
 
 def references(
-    xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], most: int
+    xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
 ) -> Iterator[Reference]:
-    """Choices among poses (n, 2); those of more than `most` scenes are left out, or of more than there are."""
-    fitting = [size for size in sorted(sizes) if size <= min(len(xy_m), most)]
+    """Choices among poses (n, 2) of `least` to `most` scenes; sizes beyond what there is are left out."""
+    fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
     order = farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
     for size in fitting:
         yield Reference("farthest", size, order[:size])
     for distance_m in sorted(distances_m, reverse=True):
         rows = apart(xy_m, world, distance_m)
-        if len(rows) <= most:
+        if least <= len(rows) <= most:
             yield Reference("apart", distance_m, rows)
 
 
@@ -50,7 +49,7 @@ def score_reference(
     for size in k:
         row = {"strategy": reference.strategy, "setting": float(reference.setting), "samples": count, "k": size}
         for name in MEASURES:
-            value = found.get(f"{name}_k{size}", Estimate(None, None, None))
+            value = found[f"{name}_k{size}"]
             row |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
         rows.append(row)
     return rows
@@ -64,16 +63,14 @@ def sweep_charts(rows: Sequence[dict]) -> list[Chart]:
         for name in ("precision", "recall"):
             for k in sorted({row["k"] for row in rows}):
                 points = [(r["samples"], r[name]) for r in rows if (r["strategy"], r["k"]) == (strategy, k)]
-                points = sorted(point for point in points if point[1] is not None)
+                points.sort()
                 series[f"{name}, k = {k}"] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
         charts.append(Chart(title, series, "scenes on each side", "share"))
     return charts
 
 
 def sweep_table(rows: Sequence[dict]) -> Table:
-    def shown(row: dict, name: str) -> str | None:
-        if row[name] is None:
-            return None
+    def shown(row: dict, name: str) -> str:
         return f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
 
     how = {"farthest": "farthest", "apart": "at least {:g} m apart"}

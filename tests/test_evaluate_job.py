@@ -1,6 +1,7 @@
 """jobs/evaluate_scenes.py with Inception weights (random ones) and with pictures instead of tables."""
 
 import json
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -8,10 +9,15 @@ import safetensors.numpy
 from golden_recipe import random_state_dict
 
 from jobs.evaluate_scenes import Config, evaluate
+from pipelines.dataset import Dataset
+from pipelines.describe import Looks, describe
+from pipelines.evaluate import compare, memorisation
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.metrics.inception import Inception
+from pipelines.metrics.intervals import Estimate
 from pipelines.scenes.render import bev_picture
 from pipelines.scenes.tables import read_scenes
+from pipelines.selection import Selection
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +60,52 @@ def test_pictures_of_another_size_are_refused(home, tmp_path):
     write_npz(str(tmp_path / "small.npz"), [np.zeros((4, 64, 64, 3), np.uint8)], 4)
     with pytest.raises(ValueError, match=r"real pictures are \[256, 256\] pixels, generated ones \[64, 64\]"):
         evaluate(Config(real=str(home / "datasets/smoke"), generated=str(tmp_path / "small.npz"), output=str(tmp_path)))
+
+
+def test_a_killed_worker_changes_nothing(home, tmp_path):
+    """Its process is killed as soon as the first part is written."""
+    from test_faults import psutil
+
+    dataset = Dataset.open(str(home / "datasets/smoke"))
+    chosen = Selection(dataset.root, "town", "train")
+    whole = describe(chosen, dataset, Looks(), str(tmp_path / "whole"))
+    killed = []
+
+    def kill(scenes: int) -> None:
+        for process in psutil.Process().children(recursive=True) if scenes and not killed else ():
+            with suppress(psutil.Error, IndexError):
+                if "Describer" in process.cmdline()[0]:
+                    process.kill()
+                    killed.append(process.pid)
+
+    again = describe(chosen, dataset, Looks(), str(tmp_path / "killed"), on_scenes=kill)
+    assert len(killed) == 1 and whole.keys() == again.keys()
+    assert all(np.array_equal(whole[name], again[name], equal_nan=name == "statistics") for name in whole)
+
+
+def scores_of(real: np.ndarray, generated: np.ndarray) -> dict:
+    sides = [{"scene_id": np.arange(len(side)), "random": side} for side in (real, generated)]
+    return compare(*sides)
+
+
+def test_degenerate_features_get_the_right_number_or_a_clear_error(cluster):
+    rng = np.random.default_rng(0)
+    some, constant = rng.normal(size=(20, 6)), np.ones((20, 6))
+    same = scores_of(constant, constant)
+    assert same["random_frechet"].value == 0 and same["random_precision_k3"].value == 1
+    apart = scores_of(constant, constant + 1)
+    assert apart["random_frechet"].value == pytest.approx(6) and apart["random_recall_k3"].value == 0
+    twice = scores_of(some, np.concatenate([some, some]))  # unequal numbers, each scene twice
+    assert twice["random_precision_k3"].value == 1 and twice["random_recall_k3"].value == 1
+    assert twice["random_frechet"].value < 0.2
+    for values in (same, apart, twice):
+        assert all(np.isfinite(score).all() for score in values.values() if isinstance(score, Estimate))
+    with pytest.raises(ValueError, match=r"generated features hold NaN .* first 4"):
+        scores_of(some, np.where(np.arange(20)[:, None] == 4, np.nan, some))
+    with pytest.raises(ValueError, match="--k 3 needs more than 3 scenes on each side, got 20 and 3"):
+        scores_of(some, some[:3])
+    found = memorisation(some, np.concatenate([some[:5], some[5:] + 9]))
+    assert found["copies"].value == 0.25 and found["memorised"].value == 0.25 and found["nearest"][3, 0] == 3
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """95 % confidence intervals by the bootstrap: scenes are drawn anew, with replacement, and the score taken again.
 
-A draw is a vector of weights (how often each scene was drawn, over the number of scenes), so scores that are made of
-sums over scenes are one matrix product for all draws. Row 0 of the weights is the sample as it is: its score is the
+A draw says how often each scene was drawn, so scores that are made of sums over scenes are one matrix product for all
+draws. Row 0 is the sample as it is: its score is the
 value, the others give the interval. The same number of scenes gives the same draws.
 """
 
@@ -23,8 +23,8 @@ class Estimate(NamedTuple):
     high: float
 
 
-def weights(count: int, key: int = 0) -> np.ndarray:
-    """(1 + DRAWS, count) float64, rows of sum 1: every scene once, then the draws.
+def draws(count: int, key: int = 0) -> np.ndarray:
+    """(1 + DRAWS, count) how often each scene is taken: every one once, then the draws. float64, but whole numbers.
 
     `key` tells the draws of one side from those of another.
     """
@@ -32,7 +32,12 @@ def weights(count: int, key: int = 0) -> np.ndarray:
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
     picked += count * np.arange(DRAWS)[:, None]
     drawn = np.bincount(picked.ravel(), minlength=DRAWS * count).reshape(DRAWS, count)
-    return np.vstack([np.ones((1, count)), drawn]) / count
+    return np.vstack([np.ones((1, count)), drawn])
+
+
+def weights(count: int, key: int = 0) -> np.ndarray:
+    """`draws` in rows of sum 1."""
+    return draws(count, key) / count
 
 
 def estimate(scores: np.ndarray) -> Estimate:
@@ -44,7 +49,7 @@ def estimate(scores: np.ndarray) -> Estimate:
 
 def mean_estimate(values: np.ndarray, key: int = 0) -> Estimate:
     """Mean of values (n,), a value per scene."""
-    return estimate(weights(len(values), key) @ np.asarray(values, np.float64))
+    return estimate(draws(len(values), key) @ np.asarray(values, np.float64) / len(values))
 
 
 def ratio_estimates(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
@@ -52,7 +57,7 @@ def ratio_estimates(numerators: np.ndarray, denominators: np.ndarray, key: int =
 
     Covers shares of objects (bad ones over all) and means over the scenes that have a value (values over ones).
     """
-    drawn = weights(len(numerators), key)
+    drawn = draws(len(numerators), key)
     above, below = (drawn @ np.asarray(part, np.float64) for part in (numerators, denominators))
     scores = np.divide(above, below, out=np.full_like(above, np.nan), where=below > 0)
     return [estimate(scores[:, m]) if below[0, m] > 0 else None for m in range(scores.shape[1])]
