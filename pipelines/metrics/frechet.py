@@ -5,7 +5,9 @@ float64 throughout. Features come from anywhere; only distances of Inception's p
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -53,8 +55,13 @@ class Moments:
 
 
 def moments(features: np.ndarray) -> Moments:
-    """Moments of features (n, d), n >= 1."""
+    """Moments of features (n, d), n >= 1; block by block, so that no copy in float64 is held."""
     features = checked_features(features, "moment", at_least=1)
+    starts = range(0, len(features), BLOCK_ROWS)
+    return reduce(operator.add, (block_moments(features[start : start + BLOCK_ROWS]) for start in starts))
+
+
+def block_moments(features: np.ndarray) -> Moments:
     mean = features.mean(axis=0, dtype=np.float64)
     centred = features - mean
     return Moments(len(features), mean, centred.T @ centred)
