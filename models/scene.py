@@ -200,8 +200,10 @@ class Scene:
         winner = np.full(top.shape, -1, np.int8)
         for k, (height, occupied) in enumerate(zip(self.height_m, self.occupied, strict=True)):
             higher = occupied & (height >= top)
-            top[higher], winner[higher] = height[higher], k
-        return np.where(winner < 0, np.float32(0), top), winner
+            np.copyto(top, height, where=higher)
+            np.copyto(winner, k, where=higher)
+        np.copyto(top, 0, where=winner < 0)
+        return top, winner
 
     def select(self, keep: np.ndarray) -> Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""

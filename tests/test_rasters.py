@@ -38,6 +38,16 @@ def test_cast_down_agrees_with_ray_casting():
     assert ((hit[0] >= 0) == np.isfinite(height[0])).all()
 
 
+def test_of_equal_heights_the_last_triangle_wins():
+    grid = Grid(rows=64, cols=64, resolution_m=1.0)
+    level = random_triangles(np.random.default_rng(3), 60)
+    level[..., 2] = 1.5
+    height, hit = cast_down(level, grid)
+    alone = np.stack([cast_down(triangle[None], grid)[1][0] == 0 for triangle in level])
+    assert (height[0][alone.any(axis=0)] == 1.5).all() and (alone.sum(axis=0) > 3).any()
+    assert np.array_equal(hit[0], np.where(alone, np.arange(60)[:, None, None], -1).max(axis=0))
+
+
 def test_layers_are_cast_apart():
     rng = np.random.default_rng(1)
     grid = Grid(rows=64, cols=64, resolution_m=1.0)

@@ -1,15 +1,101 @@
 """Pictures show what trimesh's rays hit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from scenes import random_scene
 from test_mesh import empty_scene, example_scene
 
-from models.scene import ELLIPSOID, Grid
-from pipelines.scenes.casting import cast_ellipsoids, looking_at, looking_down
+from models.scene import CATEGORY_INDEX, ELLIPSOID, Grid, Scene
+from pipelines.scenes.casting import cast_ellipsoids, ellipsoids_over, looking_at, looking_down
 from pipelines.scenes.mesh import cuboid_triangles, scene_from_unit, scene_triangles
-from pipelines.scenes.palette import CLASS_COLORS, ground_ids
+from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
 from pipelines.scenes.render import bev_picture, contact_sheet, picture_3d
+
+
+def literal(scene: Scene, view: Grid) -> np.ndarray:
+    """(H, W) class ids: every primitive against the vertical line through every pixel centre.
+
+    Of equal heights the ground counts, then the last box; an ellipsoid must be higher than everything.
+    """
+    x, y = np.meshgrid(view.x_m(), view.y_m(), indexing="ij")
+    height, winner = scene.surface()
+    below = scene.grid.pixel(x, y)
+    class_id = ground_ids(scene)[winner[below]]
+    top = np.where(class_id == EMPTY, -np.inf, height[below])
+    for k in sorted(range(len(scene)), key=lambda k: (scene.category[k] == ELLIPSOID, -k)):
+        center, rotation, size = (part[k].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m))
+        # In half axes the line is foot + (z - center z) along.
+        foot = 2 * ((x - center[0])[..., None] * rotation[0] + (y - center[1])[..., None] * rotation[1]) / size
+        along = 2 * rotation[2] / size
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if scene.category[k] == ELLIPSOID:
+                a, b, c = along @ along, foot @ along, (foot**2).sum(axis=-1) - 1
+                z, inside = (np.sqrt(b**2 - a * c) - b) / a, b**2 >= a * c
+            else:
+                ends = np.stack([(-1 - foot) / along, (1 - foot) / along])
+                z = ends.max(axis=0).min(axis=-1)
+                inside = z >= ends.min(axis=0).max(axis=-1)
+        higher = inside & (center[2] + z > top)
+        top[higher], class_id[higher] = center[2] + z[higher], CATEGORY_IDS[scene.category[k]]
+    return class_id
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.05, np.pi])
+@pytest.mark.parametrize("rows, cols, size_px", [(32, 32, 32), (32, 32, 50), (24, 48, 30), (37, 25, 37)])
+def test_bev_equals_testing_every_primitive_at_every_pixel(tilt_rad, rows, cols, size_px):
+    for seed in range(4):
+        grid = Grid(front_m=40, left_m=10, resolution_m=0.5, rows=rows, cols=cols)
+        low, high = [grid.back_m, grid.right_m, -2], [grid.front_m, grid.left_m, 3]
+        center_m = np.random.default_rng(seed).uniform(low, high, (60, 3)).astype(np.float32)
+        scene = random_scene(seed, 60, grid, tilt_rad, center_m=center_m)
+        step_m = max(rows, cols) * 0.5 / size_px
+        view = Grid(40, 10, step_m, round(rows * 0.5 / step_m), round(cols * 0.5 / step_m))
+        np.testing.assert_array_equal(bev_picture(scene, size_px), CLASS_COLORS[literal(scene, view)])
+        fine = Grid(40, 10, step_m / 2, 2 * view.rows, 2 * view.cols)
+        blocks = CLASS_COLORS[literal(scene, fine)].reshape(view.rows, 2, view.cols, 2, 3)
+        np.testing.assert_array_equal(bev_picture(scene, size_px, supersample=2), np.round(blocks.mean(axis=(1, 3))))
+
+
+def test_of_equal_heights_the_ground_then_the_last_box_is_shown():
+    grid = Grid(front_m=4, left_m=4, resolution_m=0.5, rows=16, cols=16)
+    car, bus, pole = (CATEGORY_INDEX[name] for name in ("vehicle_small", "vehicle_big", "pole"))
+    upright = replace(random_scene(0, 5, grid), rotation=np.tile(np.eye(3, dtype=np.float32), (5, 1, 1)))
+    scene = replace(
+        upright,
+        occupied=np.ones_like(upright.occupied),
+        height_m=np.full_like(upright.height_m, 1.0),
+        category=np.array([car, bus, ELLIPSOID, car, pole], np.int8),
+        center_m=np.array([[0, 0, 1], [1, 0, 1], [0.25, 0.25, 1], [-2, -2, 0.5], [3.25, 3.25, 1]], np.float32),
+        size_m=np.array([[2, 2, 2], [2, 2, 2], [3, 3, 2], [2, 2, 1], [0.3, 0.3, 0.1]], np.float32),
+    )
+    picture = bev_picture(scene, 16)
+    np.testing.assert_array_equal(picture, CLASS_COLORS[literal(scene, grid)])
+
+    def shown(x_m: float, y_m: float) -> list[int]:
+        row, col = grid.pixel(x_m, y_m)
+        return picture[row, col].tolist()
+
+    ground = CLASS_COLORS[ground_ids(scene)[-2]].tolist()
+    assert shown(-2, -2) == ground and shown(-3.9, 3.9) == ground  # a car as high as the ground, and no car
+    assert shown(0.25, 0.25) == shown(1.25, 0.25) == CLASS_COLORS[CATEGORY_IDS[bus]].tolist()
+    assert shown(-0.75, 0.25) == CLASS_COLORS[CATEGORY_IDS[car]].tolist()  # the ellipsoid's top is no higher
+    assert shown(3.25, 3.25) == CLASS_COLORS[CATEGORY_IDS[pole]].tolist()
+    assert shown(0.25, 1.5) == CLASS_COLORS[CATEGORY_IDS[ELLIPSOID]].tolist()
+
+
+@pytest.mark.parametrize("elevation_deg", [90, 38])
+def test_ellipsoids_over_a_surface_are_those_cast_above_it(elevation_deg):
+    scene = random_scene(0, 300, tilt_rad=np.pi)
+    camera = looking_at(scene.grid, 200, 150, 30, elevation_deg)
+    depth, _ = cast_ellipsoids(scene, camera)
+    rng = np.random.default_rng(0)
+    for surface in (np.full(depth.shape, -np.inf), depth, depth + rng.uniform(-1, 1, depth.shape), depth + 20):
+        over = np.zeros(depth.shape, bool)
+        over.reshape(-1)[ellipsoids_over(scene, camera, surface)] = True
+        np.testing.assert_array_equal(over, depth > surface)
 
 
 def test_bev_shows_what_vertical_rays_hit():

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.scenes.rasters import ranges
+from pipelines.scenes.rasters import draw, integers_between, ranges
 
 FILL = 0.95  # of the picture's width or height, whichever is tighter
+ROUNDING_M = 1e-6  # far more than rounding adds to a depth
 BELOW_M, ABOVE_M = 2.0, 14.0  # what a camera frames below and above the ego vehicle's ground
 
 
@@ -55,9 +57,8 @@ def looking_at(grid: Grid, width: int, height: int, azimuth_deg: float, elevatio
 
 def facing(corners_m: np.ndarray) -> np.ndarray:
     """Indices of the triangles (t, 3, 3), counter-clockwise from outside, whose outside is seen from +z."""
-    x1, y1 = (corners_m[:, 1, :2] - corners_m[:, 0, :2]).T
-    x2, y2 = (corners_m[:, 2, :2] - corners_m[:, 0, :2]).T
-    return np.flatnonzero(x1 * y2 - x2 * y1 > 1e-9)
+    x, y, _ = corners_m.T  # (3, t) each
+    return np.flatnonzero((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]) > 1e-9)
 
 
 def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -65,6 +66,39 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
     Returns depth_m (H, W) float64, z in the camera frame, -inf where nothing is hit, and primitive (H, W)
     int64, its index in the scene, -1 for none.
+    """
+    pixel, chord, chords = _chords(scene, camera)
+    shape = camera.view.rows, camera.view.cols
+    depth, primitive = np.full(shape, -np.inf), np.full(shape, -1, np.int64)
+    value = _depth_m(pixel, chord, chords, camera.view)
+    draw(pixel, chords.primitive.take(chord), value, depth.reshape(-1), primitive.reshape(-1))
+    return depth, primitive
+
+
+def ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
+    """Flat indices of the pixels where `cast_ellipsoids` has more than depth_m (H, W), some more than once.
+
+    The least depth of an ellipsoid decides most of its hits; the depths of the others are worked out.
+    """
+    pixel, chord, chords = _chords(scene, camera)
+    there_m = depth_m.reshape(-1).take(pixel)
+    over = chords.least_m.take(chord) > there_m
+    unsure = np.flatnonzero(~over)
+    over[unsure] = _depth_m(pixel.take(unsure), chord.take(unsure), chords, camera.view) > there_m.take(unsure)
+    return pixel[over]
+
+
+class _Chords(NamedTuple):
+    """Rows of pixel centres across ellipsoids, seen from a camera; m chords, by ellipsoid."""
+
+    primitive: np.ndarray  # (m,) index into the scene
+    row_start: np.ndarray  # (m,) flat index of the row's first pixel
+    least_m: np.ndarray  # (m,) less than the depth of any hit
+    terms: tuple[np.ndarray, ...]  # (m,) each, of `_depth_m`
+
+
+def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
+    """Every pixel centre over every ellipsoid: flat pixel index and chord (k,), and the chords.
 
     With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| = 1. L is lower
     triangular: x gives the first entry of s, y then the second, and the positive root the third.
@@ -77,26 +111,27 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
     row_middle = (view.front_m - x) / view.resolution_m - 0.5
     col_middle = (view.left_m - y) / view.resolution_m - 0.5
 
-    row, one = _pixel_spans(row_middle, lower[:, 0, 0] / view.resolution_m, view.rows)
-    s0 = (view.x_m()[row] - x[one]) / lower[one, 0, 0]
-    middle = col_middle[one] - lower[one, 1, 0] * s0 / view.resolution_m
-    reach = lower[one, 1, 1] * np.sqrt((1 - s0**2).clip(0)) / view.resolution_m
-    col, span = _pixel_spans(middle, reach, view.cols)
-    one, row, s0 = one[span], row[span], s0[span]
-    s1 = (view.y_m()[col] - y[one] - lower[one, 1, 0] * s0) / lower[one, 1, 1]
-    s2 = np.sqrt((1 - s0**2 - s1**2).clip(0))
-    value = z[one] + lower[one, 2, 0] * s0 + lower[one, 2, 1] * s1 + lower[one, 2, 2] * s2
+    reach = lower[:, 0, 0] / view.resolution_m
+    first, count = integers_between(row_middle - reach, row_middle + reach, view.rows)
+    row, primitive = ranges(first, count), np.repeat(primitive, count)
+    x, y, z, col_middle, l00, _, _, l10, l11, _, l20, l21, l22 = np.repeat(
+        [x, y, z, col_middle, *lower.reshape(-1, 9).T], count, axis=1
+    )
+    s0 = (view.x_m()[row] - x) / l00
+    shift, rest = l10 * s0, 1 - s0**2
+    middle, reach = col_middle - shift / view.resolution_m, l11 * np.sqrt(np.maximum(rest, 0)) / view.resolution_m
+    first, count = integers_between(middle - reach, middle + reach, view.cols)
+    least_m = z - np.hypot(l20, l21) - ROUNDING_M
+    terms = y, shift, l11, rest, z + l20 * s0, l21, l22
+    row_start = row * view.cols
+    chord = np.repeat(np.arange(len(count)), count)
+    return ranges(row_start + first, count), chord, _Chords(primitive, row_start, least_m, terms)
 
-    depth, hit = np.full(view.rows * view.cols, -np.inf), np.full(view.rows * view.cols, -1, np.int64)
-    pixel = row * view.cols + col
-    np.maximum.at(depth, pixel, value)
-    wins = value == depth[pixel]
-    np.maximum.at(hit, pixel[wins], primitive[one[wins]])
-    return depth.reshape(view.rows, view.cols), hit.reshape(view.rows, view.cols)
 
-
-def _pixel_spans(middle: np.ndarray, reach: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """All integers in [0, count) within middle[i] ± reach[i], and the i of each."""
-    first = np.ceil(middle - reach).clip(0, count).astype(np.int64)
-    beyond = (np.floor(middle + reach).clip(-1, count - 1) + 1).astype(np.int64)
-    return ranges(first, (beyond - first).clip(0))
+def _depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
+    """(k,) depth of the ellipsoids at flat pixels on their chords."""
+    y, shift, l11, rest, middle, l21, l22 = chords.terms
+    col = pixel - chords.row_start.take(chord)
+    s1 = (view.y_m().take(col) - y.take(chord) - shift.take(chord)) / l11.take(chord)
+    s2 = np.sqrt(np.maximum(rest.take(chord) - s1**2, 0))
+    return middle.take(chord) + l21.take(chord) * s1 + l22.take(chord) * s2

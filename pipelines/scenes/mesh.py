@@ -54,9 +54,10 @@ def unit_ellipsoid() -> tuple[np.ndarray, np.ndarray]:
 
 def scene_from_unit(scene: Scene) -> np.ndarray:
     """(n, 4, 4) T = [R diag(l, w, h) | t] of each primitive (paper, supplement B.2)."""
-    transform = np.tile(np.eye(4), (len(scene), 1, 1))
+    transform = np.zeros((len(scene), 4, 4))
     transform[:, :3, :3] = scene.rotation * scene.size_m[:, None, :]
     transform[:, :3, 3] = scene.center_m
+    transform[:, 3, 3] = 1
     return transform
 
 
@@ -103,7 +104,8 @@ def _instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, triang
     transform = scene_from_unit(scene)[primitive]
     placed = vertices @ transform[:, :3, :3].transpose(0, 2, 1) + transform[:, None, :3, 3]  # (p, v, 3)
     class_id = np.repeat(CATEGORY_IDS[scene.category[primitive]], len(triangles))
-    return Triangles(placed[:, triangles].reshape(-1, 3, 3), class_id, np.repeat(primitive, len(triangles)))
+    corners = placed.take(triangles, axis=1).reshape(-1, 3, 3)
+    return Triangles(corners, class_id, np.repeat(primitive, len(triangles)))
 
 
 def scene_glb(scene: Scene) -> bytes:

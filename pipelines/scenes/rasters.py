@@ -15,61 +15,72 @@ EDGE_PX = 1e-7  # a centre this close to an edge is inside: abutting triangles l
 STEEP = 1e3  # metres a pixel: planes of sliver triangles, whose hits are kept within their own triangle's heights
 
 
-def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Concatenated integer ranges first[i] .. first[i] + count[i] - 1, with the owner i of each value."""
-    owner = np.repeat(np.arange(len(count), dtype=np.int32), count)
-    start = first - (np.cumsum(count) - count)
-    return start.astype(np.int32)[owner] + np.arange(len(owner), dtype=np.int32), owner
+def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Concatenated integer ranges first[i] .. first[i] + count[i] - 1; np.repeat(x, count) is x along them."""
+    return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
-def _row_spans(u: np.ndarray, v: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Column intervals of triangles per pixel row.
-
-    u, v (3, t): row and column coordinates of the corners, in pixels, a centre at each integer. Returns the row, the
-    triangle and the low and high column coordinate of each span.
-    """
-    first = np.ceil(u.min(axis=0) - EDGE_PX).clip(0, rows).astype(np.int64)
-    last = np.floor(u.max(axis=0) + EDGE_PX).clip(-1, rows - 1).astype(np.int64)
-    row, triangle = ranges(first, (last - first + 1).clip(0))
-    low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        ua, ub, va, vb = u[a], u[b], v[a], v[b]
-        level = ua == ub  # an edge along a row: its ends are those of the other two
-        per_row = np.where(level, 0.0, (vb - va) / np.where(level, 1.0, ub - ua))
-        top, bottom = np.minimum(ua, ub) - EDGE_PX, np.where(level, -np.inf, np.maximum(ua, ub) + EDGE_PX)
-        column = va[triangle] + (row - ua[triangle]) * per_row[triangle]
-        # Within EDGE_PX beyond an end, the end itself.
-        column = column.clip(np.minimum(va, vb)[triangle], np.maximum(va, vb)[triangle])
-        crosses = (row >= top[triangle]) & (row <= bottom[triangle])
-        np.minimum(low, column, out=low, where=crosses)
-        np.maximum(high, column, out=high, where=crosses)
-    return row, triangle, low, high
+def integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first integer in [0, size) and in [low[i], high[i]], and how many there are."""
+    first = np.minimum(np.maximum(np.ceil(low), 0), size)
+    count = np.maximum(np.minimum(np.floor(high) + 1, size) - first, 0)
+    return first.astype(np.int64), count.astype(np.int64)
 
 
-def _hits(triangles_m: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every pixel centre under every triangle (t, 3, 3): flat pixel index, triangle and height (m,) of each."""
-    x, y, z = np.ascontiguousarray(np.asarray(triangles_m, np.float64).reshape(-1, 3, 3).T)  # (3, t) each
+def hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every pixel centre under every triangle (t, 3, 3), in turn: flat pixel index, owner (of (t,)) and height (m,)."""
+    x, y, z = np.ascontiguousarray(triangles_m.astype(np.float64).T)  # (3, t) each
     u = (grid.front_m - x) / grid.resolution_m - 0.5
     v = (grid.left_m - y) / grid.resolution_m - 0.5
     # Plane z = z0 + du (u - u0) + dv (v - v0) by Cramer's rule.
     (u1, u2), (v1, v2), (z1, z2) = [(w[1] - w[0], w[2] - w[0]) for w in (u, v, z)]
     area = u1 * v2 - u2 * v1
-    seen = (np.abs(area) > 1e-9) & (u.min(0) < grid.rows) & (u.max(0) > -1) & (v.min(0) < grid.cols) & (v.max(0) > -1)
-    index = np.flatnonzero(seen)
-    u, v, z, area = u[:, index], v[:, index], z[:, index], area[index]
-    slope_u = (z1[index] * v2[index] - z2[index] * v1[index]) / area
-    slope_v = (u1[index] * z2[index] - u2[index] * z1[index]) / area
+    first, rows = integers_between(u.min(axis=0) - EDGE_PX, u.max(axis=0) + EDGE_PX, grid.rows)
+    _, cols = integers_between(v.min(axis=0) - EDGE_PX, v.max(axis=0) + EDGE_PX, grid.cols)
+    index = np.flatnonzero((np.abs(area) > 1e-9) & (rows > 0) & (cols > 0))
+    slope_u = (z1 * v2 - z2 * v1).take(index) / area.take(index)
+    slope_v = (u1 * z2 - u2 * z1).take(index) / area.take(index)
+    u, v, z = u.take(index, axis=1), v.take(index, axis=1), z.take(index, axis=1)
+    plane = [z[0] - slope_u * u[0] - slope_v * v[0], slope_u, slope_v, z.min(axis=0), z.max(axis=0)]
 
-    row, triangle, low, high = _row_spans(u, v, grid.rows)
-    first = np.ceil(low - EDGE_PX).clip(0, grid.cols)
-    count = (np.floor(high + EDGE_PX).clip(-1, grid.cols - 1) - first + 1).clip(0)
+    spans = rows.take(index)
+    row = ranges(first.take(index), spans)
+    low, high = _column_intervals(row, spans, u, v)
+    first, count = integers_between(low - EDGE_PX, high + EDGE_PX, grid.cols)
+    col = ranges(first, count)
     # Along a row the height is linear: start + slope_v col.
-    start = (z[0] - slope_u * u[0] - slope_v * v[0])[triangle] + slope_u[triangle] * row
-    col, span = ranges(first.astype(np.int64), count.astype(np.int64))
-    height = start[span] + slope_v[triangle][span] * col
+    start, along_u, along_v, lowest, highest = np.repeat(plane, spans, axis=1)
+    height = np.repeat(start + along_u * row, count) + np.repeat(along_v, count) * col
     if np.abs(slope_u).max(initial=0) > STEEP or np.abs(slope_v).max(initial=0) > STEEP:
-        height = height.clip(z.min(axis=0)[triangle][span], z.max(axis=0)[triangle][span])
-    return row[span] * np.int32(grid.cols) + col, index[triangle][span], height
+        height = np.minimum(np.maximum(height, np.repeat(lowest, count)), np.repeat(highest, count))
+    return np.repeat(row * grid.cols, count) + col, np.repeat(np.repeat(owner.take(index), spans), count), height
+
+
+def _column_intervals(
+    row: np.ndarray, spans: np.ndarray, u: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high column coordinate of triangles in pixel rows (s,); spans (t,): how many of the rows are each one's.
+
+    u, v (3, t): row and column coordinates of the corners, in pixels, a centre at each integer.
+    """
+    u_end, v_end = u[[1, 2, 0]], v[[1, 2, 0]]  # an edge goes from a corner to the next
+    per_row = (v_end - v) / np.where(u == u_end, 1.0, u_end - u)
+    edges = [u, v, per_row, np.minimum(u, u_end), np.maximum(u, u_end)]
+    u, v, per_row, top, bottom = np.repeat(edges, spans, axis=2)
+    nearest = np.minimum(np.maximum(row, top), bottom)
+    column = v + (nearest - u) * per_row
+    misses = np.abs(row - nearest) > EDGE_PX
+    return np.where(misses, np.inf, column).min(axis=0), np.where(misses, -np.inf, column).max(axis=0)
+
+
+def draw(pixel: np.ndarray, owner: np.ndarray, value: np.ndarray, height: np.ndarray, winner: np.ndarray) -> None:
+    """Draws hits (m,) over what is there, in place: each pixel keeps the highest value and its owner.
+
+    Of equal values the last one wins, and any of them over what was there.
+    """
+    np.maximum.at(height, pixel, value)
+    wins = value == height.take(pixel)
+    winner[pixel[wins]] = owner[wins]
 
 
 def cast_down(
@@ -82,23 +93,20 @@ def cast_down(
     the index of the triangle hit, -1 for none. Of equal heights the last triangle wins. Vertical triangles cast no
     shadow and are skipped.
     """
-    pixel, triangle, value = _hits(triangles_m, grid)
+    pixel, triangle, value = hits(triangles_m, grid, np.arange(len(triangles_m)))
     if layer is not None:
-        pixel = pixel + np.asarray(layer, np.int64)[triangle] * (grid.rows * grid.cols)
+        pixel += np.asarray(layer, np.int64)[triangle] * (grid.rows * grid.cols)
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf)
-    np.maximum.at(height.reshape(-1), pixel, value)
     hit = np.full(height.shape, -1, np.int64)
-    wins = value == height.reshape(-1)[pixel]
-    np.maximum.at(hit.reshape(-1), pixel[wins], triangle[wins])
+    draw(pixel, triangle, value, height.reshape(-1), hit.reshape(-1))
     return height, hit
 
 
 def height_map(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
     """(num_layers, H, W) float32 of `cast_down`: the heights alone, in half the memory and less time."""
-    pixel, triangle, value = _hits(triangles_m, grid)
+    pixel, layer_start, value = hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
-    pixel += np.asarray(layer, np.int32)[triangle] * np.int32(grid.rows * grid.cols)
-    np.maximum.at(height.reshape(-1), pixel, value.astype(np.float32))
+    np.maximum.at(height.reshape(-1), layer_start + pixel, value.astype(np.float32))
     return height
 
 
@@ -110,7 +118,7 @@ def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
     beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)  # half-open: a vertex on a row counts once
-    row, edge = ranges(first, beyond - first)
+    row, edge = ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])
     col = np.ceil(crossing).clip(0, grid.cols).astype(np.int64)
     toggles = np.bincount(row * (grid.cols + 1) + col, minlength=grid.rows * (grid.cols + 1))

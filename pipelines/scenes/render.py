@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.scenes.casting import cast_ellipsoids, facing, looking_at, looking_down
+from pipelines.scenes.casting import ellipsoids_over, facing, looking_at, looking_down
 from pipelines.scenes.light import lit_picture
 from pipelines.scenes.mesh import cuboid_triangles
 from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
-from pipelines.scenes.rasters import cast_down
+from pipelines.scenes.rasters import draw, hits
 
 
 def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
@@ -23,23 +24,35 @@ def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nd
     the metrics: the same to the last bit on every call.
     """
     view = _view_from_above(scene.grid, size_px * supersample)
-    surface, winner = scene.surface()
-    row, col = scene.grid.pixel(view.x_m(), view.y_m())
-    winner = winner.take(row, axis=0).take(col, axis=1)
-    top = np.where(winner < 0, -np.inf, surface.take(row, axis=0).take(col, axis=1))
-    class_id = ground_ids(scene).take(winner, mode="wrap")
-
+    ground_m, ground = scene.surface()
+    if view != scene.grid:
+        row, col = scene.grid.pixel(view.x_m(), view.y_m())
+        ground_m, ground = (raster.take(row, axis=0).take(col, axis=1) for raster in (ground_m, ground))
+    top, class_id = np.full(ground_m.shape, -np.inf), np.full(ground_m.shape, EMPTY, np.uint8)
     boxes = cuboid_triangles(scene)
     seen = facing(boxes.corners_m)
-    (height,), (hit,) = cast_down(boxes.corners_m[seen], view)
-    box_id = np.append(boxes.class_id[seen], np.uint8(EMPTY)).take(hit, mode="wrap")
-    class_id = np.where(height > top, box_id, class_id)
-    top = np.maximum(top, height)
-
-    height, _ = cast_ellipsoids(scene, looking_down(view))
-    class_id = np.where(height > top, CATEGORY_IDS[ELLIPSOID], class_id)
-    picture = CLASS_COLORS.take(class_id, axis=0)
+    box_hits = hits(boxes.corners_m.take(seen, axis=0), view, boxes.class_id.take(seen))
+    draw(*box_hits, top.reshape(-1), class_id.reshape(-1))
+    bare = (ground >= 0) & (top <= ground_m)
+    np.copyto(top, ground_m, where=bare)
+    np.copyto(class_id, ground_ids(scene).take(ground), where=bare)
+    class_id.reshape(-1)[ellipsoids_over(scene, looking_down(view), top)] = CATEGORY_IDS[ELLIPSOID]
+    picture = _painted(class_id)
     return picture if supersample == 1 else np.round(block_mean(picture, supersample)).astype(np.uint8)
+
+
+@cache
+def _color_pairs() -> np.ndarray:
+    """(18 x 256, 6): the colours of two neighbouring pixels, by the class id of the first plus 256 that of the second."""
+    first, second = np.zeros((2, len(CLASS_COLORS), 256, 3), np.uint8)
+    first[:, : len(CLASS_COLORS)], second[:] = CLASS_COLORS, CLASS_COLORS[:, None]
+    return np.concatenate([first, second], axis=2).reshape(-1, 6)
+
+
+def _painted(class_id: np.ndarray) -> np.ndarray:
+    """(H, W, 3): CLASS_COLORS[class_id (H, W) uint8]; two pixels at a time, since six bytes are copied as fast as three."""
+    pair = np.resize(class_id, class_id.size + class_id.size % 2).view("<u2")
+    return _color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
 
 
 def _view_from_above(grid: Grid, size_px: int) -> Grid:

@@ -177,7 +177,8 @@ def _pixels(
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
     beyond = (np.floor(at - (low_m - EDGE_M) / step_m) + 1).clip(0, count).astype(np.int64)
-    return ranges(first, (beyond - first).clip(0))
+    count = (beyond - first).clip(0)
+    return ranges(first, count), np.repeat(np.arange(len(count)), count)
 
 
 def _box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:

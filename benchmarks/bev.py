@@ -1,0 +1,95 @@
+"""Pictures from above at 256 x 256: all primitives at once against primitive by primitive.
+
+python benchmarks/bev.py                      dense towns
+python benchmarks/bev.py --dataset DIRECTORY  scenes spread over a dataset
+
+The plain way is vectorised within a primitive, on the pixels of its bounds, and knows no tolerance at edges. CPU
+seconds of one thread; reading is not counted. Workers of the jobs keep freed memory, so set MALLOC_MMAP_MAX_=0 and
+MALLOC_TRIM_THRESHOLD_=-1 as jobs/command.py does.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import tyro
+from common import DENSE_SEEDS, interleaved, ratios, spread, where
+
+from models.scene import ELLIPSOID, Grid, Scene
+from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, GROUND_CLASS_ID
+from pipelines.scenes.render import bev_picture
+from pipelines.selection import Selection
+from pipelines.sources.town import town_drive
+
+ROUNDS = 7
+SCENES = 32
+PICTURES, CORES = 50_000, 2  # what an evaluation on the paper's scale draws
+
+
+def plain(scene: Scene, supersample: int) -> np.ndarray:
+    """`bev_picture` at one pixel per raster pixel, as one would write it first."""
+    grid = scene.grid
+    fine = Grid(grid.front_m, grid.left_m, grid.resolution_m / supersample, grid.rows * supersample, grid.cols * supersample)  # fmt: skip
+    x, y = fine.x_m(), fine.y_m()
+    height, class_id = np.full((grid.rows, grid.cols), -np.inf), np.full((grid.rows, grid.cols), EMPTY)
+    for k, name in enumerate(scene.ground_classes):
+        higher = scene.occupied[k] & (scene.height_m[k] >= height)
+        height[higher], class_id[higher] = scene.height_m[k][higher], GROUND_CLASS_ID[name]
+    height, class_id = (np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id))  # fmt: skip
+    # Boxes before ellipsoids, the last box first: what comes later must lie higher.
+    for i in sorted(range(len(scene)), key=lambda i: (scene.category[i] == ELLIPSOID, -i)):
+        center, rotation, half = (part[i].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m / 2))
+        reach = np.abs(rotation) @ half
+        rows, cols = (
+            np.flatnonzero(np.abs(x - center[0]) <= reach[0]),
+            np.flatnonzero(np.abs(y - center[1]) <= reach[1]),
+        )
+        if len(rows) == 0 or len(cols) == 0:
+            continue
+        part = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
+        dx, dy = (x[part[0]] - center[0])[:, None, None], (y[part[1]] - center[1])[:, None]
+        # A vertical line in units of the primitive's half axes: foot + z along.
+        foot, along = (dx * rotation[0] + dy * rotation[1]) / half, rotation[2] / half
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if scene.category[i] == ELLIPSOID:
+                a, b, c = (along**2).sum(), (foot * along).sum(-1), (foot**2).sum(-1) - 1
+                top = center[2] + (np.sqrt(b**2 - a * c) - b) / a
+                hit = b**2 >= a * c
+            else:
+                ends = np.stack([(-1 - foot) / along, (1 - foot) / along])
+                top = center[2] + ends.max(0).min(-1)
+                hit = ends.max(0).min(-1) >= ends.min(0).max(-1)
+        hit &= top > height[part]
+        height[part] = np.where(hit, top, height[part])
+        class_id[part] = np.where(hit, CATEGORY_IDS[scene.category[i]], class_id[part])
+    blocks = CLASS_COLORS[class_id].reshape(grid.rows, supersample, grid.cols, supersample, 3)
+    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def main(dataset: str = "") -> None:
+    print(where())
+    if dataset:
+        chosen = Selection(dataset, limit=SCENES).shards()
+        scenes = [scene for shard, rows in chosen for scene in shard.scenes(rows)]
+    else:
+        scenes = [drive.scene(k) for drive in map(town_drive, DENSE_SEEDS) for k in np.linspace(0, len(drive) - 1, SCENES // len(DENSE_SEEDS)).astype(int)]  # fmt: skip
+    print(f"{len(scenes)} scenes with {np.mean([len(s) for s in scenes]):.0f} primitives and {np.mean([s.occupied.any(axis=(1, 2)).sum() for s in scenes]):.1f} ground classes each")  # fmt: skip
+    for supersample in (1, 2):
+        differ = [(plain(s, supersample) != bev_picture(s, supersample=supersample)).any(axis=-1) for s in scenes]
+        seconds = interleaved(
+            {
+                "plain": lambda _, k=supersample: [plain(s, k) for s in scenes],
+                "ours": lambda _, k=supersample: [bev_picture(s, supersample=k) for s in scenes],
+            },
+            ROUNDS,
+        )
+        per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
+        minutes = [ms / 1e3 * PICTURES / CORES / 60 for ms in per_scene["ours"]]
+        print(f"supersampling {supersample}: plain {spread(per_scene['plain'], 1, 1)} ms, ours {spread(per_scene['ours'])} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {PICTURES:,} pictures on {CORES} cores {spread(minutes, 1, 1)} minutes; {np.sum(differ)} of {np.size(differ)} pixels differ")  # fmt: skip
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
