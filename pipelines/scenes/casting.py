@@ -114,14 +114,14 @@ def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chor
     reach = lower[:, 0, 0] / view.resolution_m
     first, count = integers_between(row_middle - reach, row_middle + reach, view.rows)
     row, primitive = ranges(first, count), np.repeat(primitive, count)
-    x, y, z, col_middle, l00, _, _, l10, l11, _, l20, l21, l22 = np.repeat(
-        [x, y, z, col_middle, *lower.reshape(-1, 9).T], count, axis=1
+    least_m = z - np.hypot(lower[:, 2, 0], lower[:, 2, 1]) - ROUNDING_M
+    x, y, z, col_middle, least_m, l00, _, _, l10, l11, _, l20, l21, l22 = np.repeat(
+        [x, y, z, col_middle, least_m, *lower.reshape(-1, 9).T], count, axis=1
     )
     s0 = (view.x_m()[row] - x) / l00
     shift, rest = l10 * s0, 1 - s0**2
     middle, reach = col_middle - shift / view.resolution_m, l11 * np.sqrt(np.maximum(rest, 0)) / view.resolution_m
     first, count = integers_between(middle - reach, middle + reach, view.cols)
-    least_m = z - np.hypot(l20, l21) - ROUNDING_M
     terms = y, shift, l11, rest, z + l20 * s0, l21, l22
     row_start = row * view.cols
     chord = np.repeat(np.arange(len(count)), count)
