@@ -43,7 +43,7 @@ def standardised(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, 
     if reference.ndim != 2 or other.ndim != 2 or reference.shape[1] != other.shape[1]:
         raise ValueError(f"layout statistics must be (scenes, columns), alike: {reference.shape}, {other.shape}")
     if min(len(reference), len(other)) < 2:
-        raise ValueError(f"layouts compare from 2 scenes a side, got {len(reference)} and {len(other)}")
+        raise ValueError(f"layout statistics need at least 2 scenes a side, got {len(reference)} and {len(other)}")
     known = ~np.isnan(reference)
     number = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, reference, 0).sum(axis=0) / number
