@@ -186,7 +186,7 @@ def test_imported_scenes_are_scored_like_any_other(home, tmp_path):
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
     assert generation["random_frechet"]["value"] < 1e-4  # the very same pictures
-    assert sum(generation["count_divergence_bits"].values()) < 1e-9
+    assert all(found["between"]["value"] < 1e-9 for found in generation["count_distance"].values())
 
 
 def test_voxels_become_pictures(cluster, tmp_path, town_scenes):
