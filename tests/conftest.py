@@ -6,6 +6,13 @@ from pathlib import Path
 import pytest
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Under `-n 2 --dist loadgroup` a module stays in one process, and so do all modules that use `home`."""
+    at_home = {item.path for item in items if "home" in item.fixturenames}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("home" if item.path in at_home else item.path.stem))
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data beside the checkout."""
@@ -17,9 +24,10 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def cluster():
-    """One small local Ray for all tests that need it."""
+def cluster(tmp_path_factory):
+    """One small local Ray for all tests that need it, and a $PRITTI_HOME that is nobody's."""
     settings = {
+        "PRITTI_HOME": str(tmp_path_factory.mktemp("nobody")),
         "RAY_AUTH_MODE": "disabled",
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
@@ -29,6 +37,7 @@ def cluster():
         "OMP_WAIT_POLICY": "PASSIVE",
     }
     os.environ.update(settings)
+    os.environ.pop("MLFLOW_TRACKING_URI", None)
     import logging
 
     import ray
@@ -46,7 +55,6 @@ def home(tmp_path_factory, cluster) -> Path:
     """A $PRITTI_HOME of its own, in which the smoke presets have run once: data, models, latents."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
-    os.environ.pop("MLFLOW_TRACKING_URI", None)
     from jobs.train_dit import Config, train
 
     train(Config(preset="smoke"))
