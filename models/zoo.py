@@ -55,6 +55,9 @@ LVAE_PRESETS = {
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
+    # The paper's object encoder with the town's ground branch and cells: the same latent from a fraction of the work.
+    "kitti360-light": LVAEPreset("kitti360", 256, 32, (32,),          8,     8,   512,  6,     8,    1024,  1024, 32,   300_000,
+                           decoder="cells", attention=False, shortcut=True, **QUICK | {"learning_rate": 1e-3}),
 }
 
 
