@@ -62,7 +62,7 @@ class Branches:
     """The layout VAE whole, without latent split, without objects and without ground: equally many steps each."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """smoke, demo, town, kitti360 or av2."""
+    """smoke, demo, town, kitti360, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
@@ -92,7 +92,7 @@ class Decoders(Branches):
     """Cells against the paper's DETR decoder, with and without the shortcuts of ground and objects: equally long each."""
 
     preset: tyro.conf.Positional[str] = "demo"
-    """smoke, demo, town, kitti360 or av2."""
+    """smoke, demo, town, kitti360, kitti360-light or av2."""
     checks: int = 12
     """So many checkpoints and looks at held-out scenes per training: the points of the curves."""
     name: str = "decoders"
@@ -355,7 +355,7 @@ def write_tables(
     import pyarrow as pa
 
     from pipelines import storage
-    from pipelines.ablation import standalone_svg
+    from pipelines.chart import standalone_svg
 
     storage.write_json({"machine": machine(), "rows": rows}, storage.join(output, f"{name}.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, f"{name}.parquet"))

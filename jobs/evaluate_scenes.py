@@ -18,7 +18,6 @@ under their own names. Run it again with the same options to go on after an inte
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -28,11 +27,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from pipelines.dataset import Dataset
-    from pipelines.describe import Looks
-    from pipelines.metrics.intervals import Estimate
-    from pipelines.sides import Side
+    from pipelines.describe import Looks, Side
 
-METRICS_PER_CALL = 1000  # MLflow's limit
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 
 
@@ -80,12 +76,10 @@ class Config:
 
 def evaluate(config: Config) -> dict:
     """Score, write and return the nested metrics, as metrics.json holds them."""
-    import pyarrow as pa
     from rich.progress import Progress
 
-    from pipelines import storage
+    from jobs.tracking import publish_scores
     from pipelines.dataset import Dataset
-    from pipelines.evaluate import flattened, plain
 
     for name, least in (("pictures", 0), ("samples", 2), ("supersample", 1)):
         if (given := getattr(config, name)) < least:
@@ -102,9 +96,6 @@ def evaluate(config: Config) -> dict:
             scores["reconstruction"] = reconstruction(config, dataset, output, bar)
         if wanted:
             scores["generation"] = generation(config, dataset, output, bar)
-    nested, flat = plain(scores), flattened(scores)
-    storage.write_json(nested, storage.join(output, "metrics.json"))
-    storage.write_parquet(pa.Table.from_pylist(metric_rows(flat)), storage.join(output, "metrics.parquet"))
     tags = {
         "real": config.real or home("datasets", "town"),
         "split": config.real_split,
@@ -112,34 +103,24 @@ def evaluate(config: Config) -> dict:
         "lvae": config.lvae and absolute(config.lvae),
     }
     pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
-    track(output, tags, flat, ["metrics.json", *(pages[name] for name in scores)])
-    return nested
-
-
-def metric_rows(flat: dict[str, Estimate | float]) -> list[dict]:
-    """A row per metric: name, value, and the ends of its 95 % interval where it has one."""
-    rows = []
-    for name, value in flat.items():
-        ends = {"value": value, "low": None, "high": None} if isinstance(value, float) else value._asdict()
-        rows.append({"metric": name} | ends)
-    return rows
+    return publish_scores(output, scores, tags, [pages[name] for name in scores])
 
 
 def generation(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
     """Scores of the generated scenes; writes evaluation.html and what is known of each scene, under described/."""
     from pipelines import storage
-    from pipelines.describe import Looks
+    from pipelines.describe import Looks, PictureFile, describe
     from pipelines.evaluate import compare, memorisation, plain
     from pipelines.evaluation_report import evaluation_html
     from pipelines.metrics.adm_npz import reference_moments
-    from pipelines.sides import PictureFile, describe_side, pictures_shown
+    from pipelines.sides import pictures_shown
 
     looks = Looks(config.supersample, config.inception and absolute(config.inception))
     sides = chosen_sides(config, dataset)
     described = {}
     for name, side in sides.items():
         task, directory = bar.add_task(f"describe {name}", total=side.limit), storage.join(output, "described", name)
-        described[name] = describe_side(
+        described[name] = describe(
             side, dataset, looks, directory, config.actors, lambda n, task=task: bar.advance(task, n)
         )
     task = bar.add_task("compare", total=2)
@@ -152,7 +133,7 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
     scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
     bar.advance(task)
     counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
-    shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores.get("memorisation"))
+    shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
     html = evaluation_html(plain(scores), counts, shown, protocol(config, sides, looks))
     storage.write_whole(storage.join(output, "evaluation.html"), lambda stream: stream.write(html.encode()))
     return scores
@@ -162,9 +143,9 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     """Both sides, of equal number. Raises ValueError for pictures of unequal size."""
     from dataclasses import replace
 
+    from pipelines.describe import PictureFile
     from pipelines.metrics.adm_npz import picture_shape
     from pipelines.selection import Selection
-    from pipelines.sides import PictureFile
 
     source = f"generated-{config.run}" if config.run else None
     generated = absolute(config.generated) if config.generated else home("generated")
@@ -192,8 +173,8 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
 
 def protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
     """How it was done, in words."""
+    from pipelines.describe import PictureFile
     from pipelines.metrics.inception import weights_line
-    from pipelines.sides import PictureFile
 
     how = {
         "farthest": "poses as far apart as can be (farthest point sampling)",
@@ -242,31 +223,6 @@ def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress)
     html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
     storage.write_whole(storage.join(output, "reconstruction.html"), lambda stream: stream.write(html.encode()))
     return rebuilt.scores
-
-
-def track(output: str, tags: dict[str, str], metrics: dict[str, Estimate | float], files: list[str]) -> None:
-    """Metrics, tags and files of `output` to MLflow: one run per output directory, brought up to date.
-
-    An interval's ends are metrics of their own, NAME.low and NAME.high.
-    """
-    from jobs.tracking import Tracker
-    from pipelines import storage
-
-    name = output.rstrip("/").rsplit("/", 1)[-1]
-    tracker = Tracker.start("pritti-evaluation", name, {}, storage.join(output, "mlflow.json"))
-    for key, value in tags.items():
-        tracker.client.set_tag(tracker.run_id, key, value)
-    known = {}
-    for row in metric_rows(metrics):
-        named = {"": row["value"], ".low": row["low"], ".high": row["high"]}
-        known |= {row["metric"] + end: value for end, value in named.items() if value is not None}
-    names = [name for name, value in known.items() if math.isfinite(value)]
-    for start in range(0, len(names), METRICS_PER_CALL):
-        tracker.metrics({name: known[name] for name in names[start : start + METRICS_PER_CALL]}, step=0)
-    if "://" not in output:  # MLflow takes local files only
-        for file in files:
-            tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
-    tracker.finish("FINISHED")
 
 
 def main(config: Config) -> None:

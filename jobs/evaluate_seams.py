@@ -9,7 +9,7 @@ A ratio of 1 means that a line does not show: as many changes of class, as great
 objects as on parallel lines 4 to 16 m away. Real scenes, cut across the street, give the level to compare with. Lines
 along the vehicle's own street are no fair ones there: a street has its borders at its sides.
 
-Writes seams.json, seams.parquet (a row per scene) and seams.html. At least 200 seams make a result.
+Writes metrics.json, metrics.parquet, seams.parquet (a row per scene) and seams.html, and to MLflow. At least 200 seams make a result.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ def evaluate_seams(config: Config) -> dict:
     """Score, write and return the ratios of both sides."""
     from rich.progress import Progress
 
+    from jobs.tracking import publish_scores
     from pipelines import storage
     from pipelines.evaluate import plain
     from pipelines.seams import Lines, join_sides, measure, seams_html, seams_table
@@ -79,11 +80,11 @@ def evaluate_seams(config: Config) -> dict:
             task = bar.add_task(f"look at {name}", total=sum(len(rows) for _, rows in selection.shards()))
             measured[name] = measure(selection, lines, config.actors, lambda task=task: bar.advance(task))
     scores = join_sides(measured)
-    storage.write_json(plain(scores), storage.join(output, "seams.json"))
     storage.write_parquet(seams_table(measured), storage.join(output, "seams.parquet"))
     html = seams_html(plain(scores), *sides["generated"], SHOWN)
     storage.write_whole(storage.join(output, "seams.html"), lambda stream: stream.write(html.encode()))
-    return plain(scores)
+    tags = {name: selection.root for name, (selection, _) in sides.items()}
+    return publish_scores(output, scores, tags, ["seams.html"])
 
 
 def main(config: Config) -> None:

@@ -7,7 +7,7 @@
 
 Files hold 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 class ids, coarse ones are repeated (docs/imports.md); every
 voxel of the full grid counts, in one confusion matrix over all scenes. Writes metrics.json, metrics.parquet and
-voxels.parquet, a row per scene.
+voxels.parquet, a row per scene; scores also go to MLflow.
 """
 
 from __future__ import annotations
@@ -41,11 +41,10 @@ class Config:
 
 def evaluate(config: Config) -> dict:
     """Score, write and return the nested metrics."""
-    import pyarrow as pa
     from rich.progress import Progress
 
+    from jobs.tracking import publish_scores
     from pipelines import storage
-    from pipelines.evaluate import flattened
     from pipelines.rebuilt_voxels import files_by_scene, paired, score_voxels, true_scenes
     from pipelines.scenes.axes import scene_from_axes
     from pipelines.scenes.voxel_import import VOXEL_AXES
@@ -65,12 +64,9 @@ def evaluate(config: Config) -> dict:
         scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
     scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
     output = absolute(config.output) if config.output else home("evaluations", "voxels")
-    flat = flattened(scores)
-    storage.write_json(scores, storage.join(output, "metrics.json"))
-    table = pa.table({"metric": list(flat), "value": list(flat.values())})
-    storage.write_parquet(table, storage.join(output, "metrics.parquet"))
     storage.write_parquet(scenes, storage.join(output, "voxels.parquet"))
-    return scores
+    tags = {"truth": absolute(config.truth), "split": config.split, "rebuilt": absolute(config.rebuilt)}
+    return publish_scores(output, scores, tags)
 
 
 def main(config: Config) -> None:

@@ -47,7 +47,7 @@ def sweep_references(config: Config) -> list[dict]:
     from rich.progress import Progress
 
     from pipelines import storage
-    from pipelines.ablation import standalone_svg
+    from pipelines.chart import standalone_svg
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks, describe
     from pipelines.selection import Selection, described_columns, label_pairs, poses

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 
 from jobs.command import home
 from pipelines import storage
+
+METRICS_PER_CALL = 1000  # MLflow's limit
 
 
 def tracking_uri() -> str:
@@ -92,3 +96,39 @@ class Tracker:
     def finish(self, status: str) -> None:
         """FINISHED, FAILED or KILLED."""
         self.client.set_terminated(self.run_id, status)
+
+
+def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files: Sequence[str] = ()) -> dict:
+    """Nested scores as metrics.json (returned) and metrics.parquet of `output`, and with tags and files to MLflow.
+
+    One MLflow run per output directory, brought up to date. Parquet: a row per score, with the ends of its 95 % interval
+    where it has one; in MLflow the ends are metrics of their own, NAME.low and NAME.high.
+    """
+    import pyarrow as pa
+
+    from pipelines.evaluate import flattened, plain
+    from pipelines.metrics.intervals import Estimate
+
+    rows, known = [], {}
+    for name, value in flattened(scores).items():
+        score = value if isinstance(value, Estimate) else Estimate(value, None, None)
+        rows.append({"metric": name} | score._asdict())
+        named = {"": score.value, ".low": score.low, ".high": score.high}
+        known |= {name + end: number for end, number in named.items() if number is not None}
+    nested = plain(scores)
+    storage.write_json(nested, storage.join(output, "metrics.json"))
+    schema = pa.schema({"metric": pa.string(), "value": pa.float64(), "low": pa.float64(), "high": pa.float64()})
+    storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join(output, "metrics.parquet"))
+
+    run_name = output.rstrip("/").rsplit("/", 1)[-1]
+    tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join(output, "mlflow.json"))
+    for key, value in tags.items():
+        tracker.client.set_tag(tracker.run_id, key, value)
+    finite = [(name, number) for name, number in known.items() if isfinite(number)]
+    for start in range(0, len(finite), METRICS_PER_CALL):
+        tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
+    if "://" not in output:  # MLflow takes local files only
+        for file in ("metrics.json", *files):
+            tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
+    tracker.finish("FINISHED")
+    return nested

@@ -29,7 +29,7 @@ class Config:
     """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """smoke, demo, town, kitti360 or av2."""
+    """smoke, demo, town, kitti360, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     name: str = ""

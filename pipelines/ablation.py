@@ -21,7 +21,6 @@ from pipelines.chart import Chart, chart_svg
 from pipelines.dataset_report import Drawing, Drawings, page_html
 from pipelines.metrics.iou3d import boxes, iou3d_pairs
 from pipelines.report import Table, Text
-from pipelines.report_style import STYLE
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
@@ -402,14 +401,6 @@ def yaw_chart(rows: Sequence[dict]) -> Chart:
         label = f"{encoding}, {100 * noise:g} % noise"
         series[label] = ([row["width_share"] for row in chosen], [row["iou3d_lost_with_yaw"] for row in chosen])
     return Chart("IoU3D lost with the angle, by footprint", series, "width / length", "IoU3D lost")
-
-
-def standalone_svg(chart: Chart) -> str:
-    """The chart as a file of its own: with its name space and the page's style."""
-    face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
-    head, rest = chart_svg(chart).split(">", 1)
-    space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
-    return f"{space}><style><![CDATA[{STYLE}{face}]]></style>{rest}"
 
 
 def page(title: str, subtitle: str, tables: Sequence[Table], charts: Sequence[Chart], text: Sequence[str] = ()) -> str:

@@ -10,6 +10,8 @@ from html import escape
 
 import numpy as np
 
+from pipelines.report_style import STYLE
+
 WIDTH, HEIGHT = 640, 360
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 46  # margins around the axes
 MAX_POINTS = 600
@@ -43,6 +45,14 @@ def chart_svg(chart: Chart) -> str:
     for index, (x, y) in enumerate(series.values()):
         parts += _lines(x_axis(x), y_axis(y), index % NUM_COLORS)
     return "".join([*parts, _legend(list(series)), "</svg>"])
+
+
+def standalone_svg(chart: Chart) -> str:
+    """The chart as a file of its own: with its name space and the page's style."""
+    face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
+    head, rest = chart_svg(chart).split(">", 1)
+    space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    return f"{space}><style><![CDATA[{STYLE}{face}]]></style>{rest}"
 
 
 def ticks(low: float, high: float, about: int = 5) -> list[float]:

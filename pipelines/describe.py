@@ -50,6 +50,21 @@ class Looks:
     inception: str = ""
 
 
+@dataclass(frozen=True)
+class PictureFile:
+    """The first `limit` pictures of an .npz in ADM's form."""
+
+    path: str
+    limit: int
+
+    @property
+    def root(self) -> str:
+        return self.path
+
+
+Side = Selection | PictureFile  # of a comparison
+
+
 def features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
     """Features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and with a network Inception's."""
     named = {"random": inception.random_features(pictures)}
@@ -150,59 +165,38 @@ def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
 
 
 def describe(
-    selection: Selection,
+    side: Side,
     dataset: Dataset | None,
     looks: Looks,
     directory: str,
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Per-scene arrays of a selection, in the order of its shards; fidelity and validity flat, see DESCRIBED.
+    """Per-scene arrays of a side, in the order of its shards or pictures; fidelity and validity flat, see DESCRIBED.
 
-    Without a dataset, whose ground classes and label thresholds scenes are judged by, only features. Parts that DIRECTORY holds of the same selection and looks are read, the rest is made. Row in: number of a part.
-    Row out: number of scenes. Fan-out: one task per shard.
+    Pictures have features only; so have scenes without a dataset, whose ground classes and label thresholds they are
+    judged by. Parts that DIRECTORY holds of the same side and looks are read, the rest is made. Row in: number of a part.
+    Row out: number of scenes. Fan-out: one task per shard, or per PICTURES_PER_PART.
     """
-    parts = selection.shards()
-    files = [
-        storage.fingerprint(shard.path(table)) for shard, _ in parts for table in ("scenes", "primitives", "rasters")
-    ]
-    judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
-    claim(directory, {"selection": asdict(selection), "files": files, "labels": judged_by} | digest(looks))
-    counts = [len(rows) for _, rows in parts]
-    return describe_parts(counts, Describer, (parts, dataset, looks, directory), directory, num_actors, on_scenes)
-
-
-def describe_pictures(
-    path: str,
-    count: int,
-    looks: Looks,
-    directory: str,
-    num_actors: int = 1,
-    on_scenes: Callable[[int], None] | None = None,
-) -> dict[str, np.ndarray]:
-    """Features of the first `count` pictures of an .npz (adm_npz.py), by number; resumable as `describe`."""
-    parts = [range(at, min(at + PICTURES_PER_PART, count)) for at in range(0, count, PICTURES_PER_PART)]
-    claim(directory, {"file": storage.fingerprint(path), "count": count} | digest(looks))
-    counts = [len(part) for part in parts]
-    return describe_parts(counts, PictureDescriber, (path, parts, looks, directory), directory, num_actors, on_scenes)
-
-
-def describe_parts(
-    counts: list[int],
-    actor: type,
-    arguments: tuple,
-    directory: str,
-    num_actors: int,
-    on_scenes: Callable[[int], None] | None,
-) -> dict[str, np.ndarray]:
-    """All parts, those that are missing made by actors first; `counts` scenes each."""
-    missing = [number for number in range(len(counts)) if not storage.exists(part_path(directory, number))]
+    if isinstance(side, PictureFile):
+        parts = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
+        counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint(side.path)], None
+        actor, arguments = PictureDescriber, (side.path, parts, looks, directory)
+    else:
+        parts = side.shards()
+        counts = [len(rows) for _, rows in parts]
+        tables = ("scenes", "primitives", "rasters")
+        files = [storage.fingerprint(shard.path(table)) for shard, _ in parts for table in tables]
+        judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
+        actor, arguments = Describer, (parts, dataset, looks, directory)
+    claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | digest(looks))
+    missing = [number for number in range(len(parts)) if not storage.exists(part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
     for row in fan_out(missing, actor, arguments, num_actors):
         if on_scenes:
             on_scenes(row["scenes"])
-    return read_parts(directory, len(counts))
+    return read_parts(directory, len(parts))
 
 
 def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:

@@ -16,7 +16,7 @@ import ray
 from models.scene import CATEGORIES
 from pipelines.metrics import distributions, statistics, validity
 from pipelines.metrics.adm_npz import Gaussian, ReferenceMoments
-from pipelines.metrics.frechet import frechet_distance, frechet_influence, moments, transport
+from pipelines.metrics.frechet import frechet_distance, frechet_influence, influence_maps, moments, transport
 from pipelines.metrics.inception_score import inception_score
 from pipelines.metrics.intervals import Estimate, mean_estimate, moved, ratio_estimates
 from pipelines.metrics.kernel_distance import kernel_distance
@@ -67,16 +67,20 @@ def compare(
 def frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
     a, b = moments(real), moments(generated)
     between = transport(a, b)
-    return moved(frechet_distance(a, b, between), frechet_influence(real, generated, a, b, between))
+    by_real, by_generated = influence_maps(b, between)
+    influences = [
+        frechet_influence(real, a, b.mean, by_real),
+        frechet_influence(generated, b, a.mean, by_generated),
+    ]
+    return moved(frechet_distance(a, b, between), influences)
 
 
 def frechet_to(reference: Gaussian, generated: np.ndarray) -> Estimate:
     """Distance to moments that are given; only the generated samples vary."""
     b = moments(generated)
     between = transport(reference, b)
-    nothing = np.zeros((0, len(b.mean)))
-    influences = frechet_influence(nothing, generated, reference, b, between)
-    return moved(frechet_distance(reference, b, between), (np.zeros(1), influences[1]))
+    influence = frechet_influence(generated, b, reference.mean, influence_maps(b, between)[1])
+    return moved(frechet_distance(reference, b, between), [influence])
 
 
 def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:

@@ -68,8 +68,7 @@ def evaluation_html(scores: Mapping, counts: Mapping[str, np.ndarray], shown: Sh
     if shown.worst:
         worst = [Picture(reason, image, "generated") for image, reason in shown.worst]
         sections.append(Pictures("Where it fails", worst, columns=6, note="The generated scenes with most faults."))
-    if "memorisation" in scores:
-        sections += [neighbour_pictures(shown), memorisation_table(scores["memorisation"])]
+    sections += [neighbour_pictures(shown), memorisation_table(scores["memorisation"])]
     sections.append(Text("How it was measured", [*protocol, INTERVALS]))
     title = f"{scores['scenes']['generated']} generated scenes against {scores['scenes']['real']} real ones"
     return report_html("Evaluation", sections, title)

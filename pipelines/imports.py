@@ -7,11 +7,10 @@ above. A file that cannot be read becomes a row of `rejects`.
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -20,14 +19,14 @@ import ray.data
 from pipelines import storage
 from pipelines.cut import joined_tables
 from pipelines.ingest import per_row
+from pipelines.metrics.adm_npz import write_npz
 from pipelines.scenes.axes import Axes
 from pipelines.scenes.mesh_import import scene_from_glb
 from pipelines.scenes.tables import Shard, rejects_table, scene_tables
-from pipelines.scenes.voxel_import import FULL, read_voxels, voxel_picture
+from pipelines.scenes.voxel_import import read_voxels, voxel_picture
 
 MAX_FILES_PER_SHARD = 64
 WANTED_SHARDS = 8
-PICTURES = "arr_0"  # what the ADM evaluator calls them
 
 
 @dataclass(frozen=True)
@@ -144,20 +143,9 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
     return {"shard": row["shard"], "scenes": names}
 
 
-def join_pictures(parts: list[str], count: int, target: str) -> None:
-    """One .npz of all pictures, arr_0 (count, 256, 256, 3) uint8, as the ADM evaluator takes them; a part at a time."""
-    header = {"descr": "|u1", "fortran_order": False, "shape": (count, *FULL[:2], 3)}
-
-    def write(stream: BinaryIO) -> None:
-        with (
-            zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive,
-            archive.open(f"{PICTURES}.npy", "w", force_zip64=True) as file,
-        ):
-            np.lib.format.write_array_header_1_0(file, header)
-            for part in parts:
-                file.write(np.load(io.BytesIO(storage.read_bytes(part)))["pictures"].tobytes())
-
-    storage.write_whole(target, write)
+def shard_pictures(path: str) -> np.ndarray:
+    """(n, 256, 256, 3) uint8, as `write_pictures` left them."""
+    return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
 
 
 # ------------------------------------------------------------------------------------------------------------ run
@@ -196,7 +184,8 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
         reason = shards[0].read("rejects")["reason"][0]
         raise ValueError(f"none of the {rejects} files could be read; the first: {reason}")
     if request.kind == "npz":
-        join_pictures([request.pictures_path(shard) for shard in shards], len(scenes), request.target)
+        parts = (shard_pictures(request.pictures_path(shard)) for shard in shards)
+        write_npz(request.target, (part for part in parts if len(part)), len(scenes))
     made = options | {"scenes": scenes, "rejects": rejects}
     storage.write_json(made, record)
     if not rejects:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -41,7 +42,11 @@ class Selection:
             raise ValueError(f"apart_m is {self.apart_m}, expected a distance above 0")
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Shards with the rows to take, in order. Raises ValueError where there is none."""
+        """Shards with the rows to take, in order; decided at the first call. Raises ValueError where there is none."""
+        return self._shards
+
+    @cached_property
+    def _shards(self) -> list[tuple[Shard, list[int]]]:
         shards = find_shards(self.root, "scenes", self.source, self.split)
         tables = [shard.read("scenes", COLUMNS) for shard in shards]
         worlds = [shard.source for shard in shards]

@@ -200,6 +200,8 @@ def test_the_glb_has_a_named_node_per_primitive(samples):
 
 def test_outpainting_and_evaluation(home, samples, tmp_path):
     from jobs.evaluate_scenes import Config, evaluate
+    from jobs.evaluate_seams import Config as SeamsConfig
+    from jobs.evaluate_seams import evaluate_seams
     from jobs.outpaint_scenes import Config as OutpaintConfig
     from jobs.outpaint_scenes import outpaint
 
@@ -220,6 +222,13 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
     assert np.array_equal(middle.occupied, small.occupied) and len(middle) == len(small)
     assert np.allclose(middle.height_m, small.height_m, atol=0.006)
     assert (tmp_path / "glb/outpainted").is_dir()
+
+    looked = SeamsConfig(generated=str(tmp_path), real=str(home / "datasets/smoke"), output=str(tmp_path / "seams"))
+    seams = evaluate_seams(looked)
+    assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
+    query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
+    assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
+    assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
 
     scores = evaluate(
         Config(

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from scenes import random_scene, small_spec
 
@@ -12,6 +13,7 @@ from models.scene import CATEGORIES, Scene
 from models.tensors import DecodedLayout, compact_layout, layout_batch
 from pipelines import storage
 from pipelines.evaluate import flattened
+from pipelines.metrics.intervals import Estimate
 from pipelines.rebuild import (
     Rebuilt,
     SceneRecord,
@@ -193,18 +195,21 @@ def test_the_page_shows_truth_beside_reconstruction(dataset, rebuilt):
 
 
 def test_one_mlflow_run_per_output_directory(tmp_path, monkeypatch):
-    from jobs.evaluate_scenes import track
-    from jobs.tracking import client, tracking_uri
+    from jobs.tracking import client, publish_scores, tracking_uri
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     output = str(tmp_path / "scores")
-    storage.write_json({}, f"{output}/metrics.json")
-    many = {f"reconstruction.detection.ranked.ap3d_at.{k}": 0.5 for k in range(1200)}  # more than one call takes
+    many = {str(k): 0.5 for k in range(1200)}  # more than one call takes
     for value, lvae in ((0.25, "one"), (0.75, "two")):
-        track(output, {"lvae": lvae}, many | {"reconstruction.ap3d": value}, ["metrics.json"])
+        scores = {"reconstruction": {"ap3d": Estimate(value, 0.1, 0.9), "many": many, "absent": None}}
+        assert publish_scores(output, scores, {"lvae": lvae}) == storage.read_json(f"{output}/metrics.json")
+    rows = {row["metric"]: row for row in pq.read_table(f"{output}/metrics.parquet").to_pylist()}
+    assert rows["reconstruction.ap3d"] == {"metric": "reconstruction.ap3d", "value": 0.75, "low": 0.1, "high": 0.9}
+    assert rows["reconstruction.many.7"]["value"] == 0.5 and len(rows) == 1201
     api = client(tracking_uri())
     (run,) = api.search_runs([api.get_experiment_by_name("pritti-evaluation").experiment_id])
-    assert run.data.metrics["reconstruction.ap3d"] == 0.75 and len(run.data.metrics) == 1201
+    assert run.data.metrics["reconstruction.ap3d"] == 0.75 and len(run.data.metrics) == 1203
+    assert run.data.metrics["reconstruction.ap3d.high"] == 0.9
     assert run.data.tags["lvae"] == "two" and run.info.status == "FINISHED"
     assert [file.path for file in api.list_artifacts(run.info.run_id)] == ["metrics.json"]

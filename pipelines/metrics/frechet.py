@@ -97,26 +97,27 @@ def frechet_distance(a: Moments, b: Moments, between: Transport | None = None) -
     return float(max(np.square(a.mean - b.mean).sum() + traces - 2 * between.roots.sum(), 0.0))
 
 
-def frechet_influence(
-    real: np.ndarray, generated: np.ndarray, a: Moments, b: Moments, between: Transport
-) -> tuple[np.ndarray, np.ndarray]:
-    """What each sample adds to the distance, to first order: (n,) and (m,), of mean zero; their means over a resample
-    say how far the distance moves.
+def influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
+    """W (d, r) of either side, with the distance's derivative by its covariance I - W W^T.
 
-    The distance's derivatives by the covariances are I - G, with (M = F^T B F = U s^2 U^T)
-        G_b = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2 = (F U) s^-1 (F U)^T,    G_a = (B F U) s^-3 (B F U)^T.
-    A resampled distance itself would be biased upwards, as every Frechet distance of few samples is; this is not.
+    With M = F^T B F = U s^2 U^T, W W^T is (B F U) s^-3 (B F U)^T by A, and (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2
+    A^1/2 by B.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]
-    maps = (b.covariance @ factor) / roots**1.5, factor / np.sqrt(roots)
-    parts = []
-    for features, own, other, through in ((real, a, b, maps[0]), (generated, b, a, maps[1])):
-        values = np.empty(len(features))
-        for start in range(0, len(features), BLOCK_ROWS):
-            rows = slice(start, start + BLOCK_ROWS)
-            centred = features[rows] - own.mean
-            values[rows] = np.square(centred).sum(axis=1) - np.square(centred @ through).sum(axis=1)
-            values[rows] += 2 * centred @ (own.mean - other.mean)
-        parts.append(values - values.mean() if len(values) else values)
-    return parts[0], parts[1]
+    return (b.covariance @ factor) / roots**1.5, factor / np.sqrt(roots)
+
+
+def frechet_influence(features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray) -> np.ndarray:
+    """(n,) what each sample of a side adds to the distance, to first order, with mean zero; `through` is its W.
+
+    Their mean over a resample says how far the distance moves. A resampled distance itself would be biased upwards, as
+    every Frechet distance of few samples is; this is not.
+    """
+    values = np.empty(len(features))
+    for start in range(0, len(features), BLOCK_ROWS):
+        rows = slice(start, start + BLOCK_ROWS)
+        centred = features[rows] - own.mean
+        values[rows] = np.square(centred).sum(axis=1) - np.square(centred @ through).sum(axis=1)
+        values[rows] += 2 * centred @ (own.mean - other_mean)
+    return values - values.mean()

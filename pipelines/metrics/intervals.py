@@ -7,6 +7,7 @@ value, the others give the interval. The same number of scenes gives the same dr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +64,7 @@ def ratio_estimates(numerators: np.ndarray, denominators: np.ndarray, key: int =
     return [estimate(scores[:, m]) if below[0, m] > 0 else None for m in range(scores.shape[1])]
 
 
-def moved(value: float, influences: tuple[np.ndarray, np.ndarray]) -> Estimate:
-    """A score of two sides that moves, to first order, by the mean of what each side's samples add to it."""
+def moved(value: float, influences: Sequence[np.ndarray]) -> Estimate:
+    """A score that moves, to first order, by the mean of what each side's samples (n,) add to it."""
     shifts = sum(weights(len(part), key) @ part for key, part in enumerate(influences))
     return estimate(value + shifts)
