@@ -12,10 +12,12 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from diffusers import SchedulerMixin
 from jaxtyping import Float, Int
 from torch import Tensor
 
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
+OnStep = Callable[[int, int, Tensor], Tensor]  # number of the step from 0, its timestep, latent -> latent to go on with
 
 
 @dataclass(frozen=True)
@@ -86,24 +88,26 @@ class Walk:
 
 
 # What noise is drawn for: the same scene number must not start generation and outpainting from the same noise.
-GENERATE, OUTPAINT = 1, 2
+GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 
 
 class SceneNoise:
     """Standard normal noise keyed by (seed, scene index, purpose): each scene draws its own sequence.
 
-    The same scene comes out whatever the batch size, the number of workers or the scenes beside it.
+    The same scene comes out whatever the batch size, the number of workers or the scenes beside it. `seed` is one for
+    all, or one per scene.
     """
 
     def __init__(
         self,
-        seed: int,
+        seed: int | Sequence[int],
         indices: Sequence[int],
         shape: tuple[int, ...],
         device: torch.device | str,
         purpose: int = GENERATE,
     ) -> None:
-        self.generators = [keyed_generator(seed, index, purpose) for index in indices]
+        seeds = [seed] * len(indices) if isinstance(seed, int) else seed
+        self.generators = [keyed_generator(*key, purpose) for key in zip(seeds, indices, strict=True)]
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:
@@ -147,28 +151,48 @@ def sample(
     label: Int[Tensor, b],
     transitions: list[tuple[int, int]] | None = None,
     known: Known | None = None,
-    on_step: Callable[[int, int], None] | None = None,
+    on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
     """Clean latents, by DDPM ancestral sampling along `transitions` (plain by default).
 
     Downward, the model denoises; upward, noise is added back (RePaint). With `known`, the known part is noised to
     the state just reached and pasted in after each downward step. Differs from the paper, which prints the level
     just left (Eq. "z_known"): the two parts would not match. At the end the known part is z_0, bit for bit.
-    `on_step(done, total)` is called after every transition.
+    `on_step` is called after every evaluation of the model.
     """
-    transitions = transitions or walk.plain()
-    latent = noise.draw()
-    for done, (state, to) in enumerate(transitions, start=1):
+    latent, evaluations = noise.draw(), 0
+    for state, to in transitions or walk.plain():
         if to > state:
             latent = walk.up(latent, noise.draw(), state, to)
-        else:
-            timestep = torch.full_like(label, int(walk.timesteps[state]))
-            predicted = model(latent, timestep, label)
-            step_noise = noise.draw() if to >= 0 else torch.zeros_like(latent)
-            latent = walk.down(latent, predicted, step_noise, state)
-            if known is not None:
-                kept = walk.to_state(known.latent, noise.draw() if to >= 0 else known.latent, to)
-                latent = torch.where(known.mask.bool(), latent, kept)
+            continue
+        timestep = int(walk.timesteps[state])
+        predicted = model(latent, torch.full_like(label, timestep), label)
+        step_noise = noise.draw() if to >= 0 else torch.zeros_like(latent)
+        latent = walk.down(latent, predicted, step_noise, state)
+        if known is not None:
+            kept = walk.to_state(known.latent, noise.draw() if to >= 0 else known.latent, to)
+            latent = torch.where(known.mask.bool(), latent, kept)
         if on_step:
-            on_step(done, len(transitions))
+            latent = on_step(evaluations, timestep, latent)
+        evaluations += 1
+    return latent
+
+
+@torch.no_grad()
+def solve(
+    model: Denoiser,
+    solver: SchedulerMixin,
+    num_steps: int,
+    noise: SceneNoise,
+    label: Int[Tensor, b],
+    on_step: OnStep | None = None,
+) -> Float[Tensor, "b c h w"]:
+    """Clean latents by one of diffusers' schedulers that draw no noise of their own, as DDIM and DPM-Solver++."""
+    solver.set_timesteps(num_steps, device=label.device)
+    latent = noise.draw() * solver.init_noise_sigma
+    for number, timestep in enumerate(solver.timesteps):
+        predicted = model(solver.scale_model_input(latent, timestep), timestep.expand(len(label)), label)
+        latent = solver.step(predicted, timestep, latent).prev_sample
+        if on_step:
+            latent = on_step(number, int(timestep), latent)
     return latent

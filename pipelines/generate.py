@@ -27,6 +27,7 @@ class SampleRequest:
     seed: int
     num_inference_steps: int
     guidance_scale: float
+    sampler: str = "ddpm"
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:
@@ -59,6 +60,7 @@ class Sampler:
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
+        self.pipeline.use_sampler(request.sampler)
 
     def __call__(self, row: dict) -> dict:
         request, started = self.request, time.perf_counter()
