@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import ray.data
 import torch
 
+from models.layout import LayoutSpec
 from models.pipeline import LABELS, PrITTIPipeline
+from models.scene import Scene
+from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.encode import gpus_per_actor, weights_digest
 from pipelines.scenes.tables import Shard
@@ -54,6 +57,35 @@ def pipeline_digest(pipeline: PrITTIPipeline) -> str:
     return f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"
 
 
+def claim_run(output: str, run: str, options: dict) -> None:
+    """Keep source generated-<run> of a directory for one set of options. Raises ValueError if others made it."""
+    record = storage.join(output, f"generated-{run}.json")
+    if storage.exists(record) and (made := storage.read_json(record)) != options:
+        name = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
+        raise ValueError(
+            f"{output} holds a run {run!r} with {name}={made.get(name)}, asked for {options.get(name)}; "
+            "choose another --run or --output"
+        )
+    storage.write_json(options, record)
+
+
+def on_model_grid(scene: Scene, spec: LayoutSpec) -> Scene:
+    """The scene with the model's ground classes and resolution."""
+    height, occupied = ground_on_grid(scene, spec.ground_classes, spec.grid)
+    return replace(scene, ground_classes=spec.ground_classes, grid=spec.grid, height_m=height, occupied=occupied)
+
+
+def label_of(scene: Scene, kind: str) -> str:
+    """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
+    names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
+    names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
+    if names[kind] not in LABELS[kind]:
+        raise ValueError(
+            f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
+        )
+    return names[kind]
+
+
 class Sampler:
     """Actor. Row in: number of a shard. Row out: its size and time. Generates and writes the shard's scenes."""
 
@@ -95,19 +127,9 @@ def sample_scenes(
         raise ValueError(
             f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}"
         )
-    record = storage.join(request.output, f"generated-{request.run}.json")
     options = {name: value for name, value in asdict(request).items() if name != "output"}
     options |= {"labels": list(request.labels), "weights": pipeline_digest(pipeline)}
-    if storage.exists(record):
-        made = storage.read_json(record)
-        differing = [name for name in options if made.get(name) != options[name]]
-        if differing:
-            name = differing[0]
-            raise ValueError(
-                f"{request.output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options[name]}; "
-                "choose another --run or --output"
-            )
-    storage.write_json(options, record)
+    claim_run(request.output, request.run, options)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):
             storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])

@@ -7,13 +7,11 @@ from dataclasses import asdict, dataclass, replace
 
 import ray.data
 
-from models.layout import LayoutSpec
-from models.pipeline import LABELS, PrITTIPipeline, Resampling
+from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene
-from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.encode import gpus_per_actor
-from pipelines.generate import load_pipeline, pipeline_digest
+from pipelines.generate import claim_run, label_of, load_pipeline, on_model_grid, pipeline_digest
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
@@ -36,23 +34,6 @@ class OutpaintRequest:
     @property
     def source(self) -> str:
         return f"generated-{self.run}"
-
-
-def on_model_grid(scene: Scene, spec: LayoutSpec) -> Scene:
-    """The scene with the model's ground classes and resolution."""
-    height, occupied = ground_on_grid(scene, spec.ground_classes, spec.grid)
-    return replace(scene, ground_classes=spec.ground_classes, grid=spec.grid, height_m=height, occupied=occupied)
-
-
-def label_of(scene: Scene, kind: str) -> str:
-    """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
-    names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
-    names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
-    if names[kind] not in LABELS[kind]:
-        raise ValueError(
-            f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
-        )
-    return names[kind]
 
 
 def outpaint_one(pipeline: PrITTIPipeline, request: OutpaintRequest, scene: Scene, index: int) -> Scene:
@@ -99,14 +80,7 @@ def outpaint_scenes(
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     options = asdict(request) | {"input": asdict(selection), "weights": pipeline_digest(pipeline)}
-    record = storage.join(request.output, f"{request.source}.json")
-    if storage.exists(record) and (made := storage.read_json(record)) != options:
-        name = next(key for key in options if made.get(key) != options[key])
-        raise ValueError(
-            f"{request.output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options[name]}; "
-            "choose another --run or --output"
-        )
-    storage.write_json(options, record)
+    claim_run(request.output, request.run, options)
     graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
         Outpainter,
         fn_constructor_args=(request, chosen),

@@ -252,6 +252,39 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
     assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
 
 
+def test_inpainting_writes_variants_and_goes_on(home, samples, tmp_path):
+    from jobs.inpaint_scenes import Config, inpaint
+
+    config = Config(
+        model=str(home / "models/pritti-smoke"),
+        input=str(samples),
+        source="generated-samples",
+        half_plane=(1.0, 0.0, 32.0),
+        contents="objects",
+        variants=2,
+        limit=2,
+        output=str(tmp_path),
+        steps=8,
+        jump_length=2,
+        resamplings=2,
+    )
+    drift = inpaint(config)
+    assert 0 < drift["ground_iou"] <= 1 and 0 <= drift["objects_found"] <= 1
+    given, made = list(read_scenes(str(samples), limit=2)), list(read_scenes(str(tmp_path)))
+    assert len({scene.scene_id for scene in made}) == 4 == len(list((tmp_path / "glb/inpainted").iterdir()))
+    for k, scene in enumerate(made):
+        assert np.array_equal(scene.occupied, given[k // 2].occupied)
+        behind = [sorted(s.center_m[s.center_m[:, 0] < 32].tolist()) for s in (scene, given[k // 2])]
+        assert behind[0] == behind[1]
+    assert (tmp_path / "inpainted.html").read_text().count("<img") == 6
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
+    assert inpaint(config) == drift and times == {path: path.stat().st_mtime_ns for path in times}
+    with pytest.raises(ValueError, match="holds a run 'inpainted' with seed=0, asked for 1"):
+        inpaint(replace(config, seed=1))
+    with pytest.raises(ValueError, match="the region holds no pixel"):
+        inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
+
+
 def test_real_against_real_is_near_perfect(home, tmp_path):
     """The training scenes scored against themselves: the evaluator's own floor."""
     from pipelines.dataset import Dataset
@@ -350,6 +383,7 @@ MISTAKES = {
     ("encode_latents.py",): "run jobs/preprocess_scenes.py",
     ("sample_scenes.py",): "run jobs/train_dit.py first",
     ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
+    ("inpaint_scenes.py",): "no region: give --polygon-m, --half-plane or --objects",
     ("preprocess_scenes.py", "kitti360", "--input", "nowhere"): "--input nowhere: no such directory",
     ("preprocess_scenes.py", "av2", "--input", "tests"): "tests",
 }

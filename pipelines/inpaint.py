@@ -1,0 +1,218 @@
+"""Scenes made anew inside a region: one Ray Data graph, a pipeline per actor, all results of a scene per task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import ray.data
+
+from models.inpaint import Contents, composited, half_plane_region, object_region, polygon_region, whole_cells
+from models.pipeline import PrITTIPipeline, Resampling
+from models.scene import Scene, merge
+from pipelines import storage
+from pipelines.encode import gpus_per_actor
+from pipelines.generate import claim_run, label_of, load_pipeline, on_model_grid, pipeline_digest
+from pipelines.metrics.reconstruction import pair_sums
+from pipelines.report import Picture, Pictures, Table, report_html
+from pipelines.scenes.mesh import scene_glb
+from pipelines.scenes.render import bev_picture
+from pipelines.scenes.tables import Shard
+from pipelines.selection import Selection
+
+PICTURE_PX = 512
+BORDER_COLOR = (230, 0, 0)
+PER_ROW = 4  # pictures of a scene: as given, and its first results
+
+
+@dataclass(frozen=True)
+class Where:
+    """The region: all that is named, together, or with `outside` all but that."""
+
+    polygon_m: tuple[float, ...] = ()  # x, y, x, y, ...
+    half_plane: tuple[float, ...] = ()  # direction x, y, and the metres along it where it begins
+    objects: tuple[int, ...] = ()  # primitives of a scene by number
+    margin_m: float = 1.0  # around objects
+    outside: bool = False
+
+    def region(self, scene: Scene) -> np.ndarray:
+        """(rows, cols) pixels of a scene, True = make anew. Raises ValueError for a region that is none."""
+        found = np.zeros((scene.grid.rows, scene.grid.cols), bool)
+        if self.polygon_m:
+            if len(self.polygon_m) % 2:
+                raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
+            found |= polygon_region(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
+        if self.half_plane:
+            if len(self.half_plane) != 3:
+                raise ValueError(f"a half plane of {len(self.half_plane)} numbers: expected direction x y, and metres")
+            found |= half_plane_region(scene.grid, self.half_plane[:2], self.half_plane[2])
+        if self.objects:
+            if not -1 < min(self.objects) <= max(self.objects) < len(scene):
+                raise ValueError(f"scene {scene.scene_id} has primitives 0 to {len(scene) - 1}, not {self.objects}")
+            found |= object_region(scene, self.objects, self.margin_m)
+        found = found != self.outside
+        if not found.any():
+            raise ValueError(f"scene {scene.scene_id}: the region holds no pixel of its {scene.grid}")
+        return found
+
+
+@dataclass(frozen=True)
+class InpaintRequest:
+    """What to make anew in scenes, `variants` times each; `label` None means each scene's own."""
+
+    model: str
+    output: str
+    run: str
+    where: Where
+    contents: Contents
+    variants: int
+    label: str | None
+    seed: int
+    resampling: Resampling
+    guidance_scale: float
+
+    def shard(self, number: int) -> Shard:
+        return Shard(self.output, f"generated-{self.run}", "generated", number)
+
+
+def drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
+    """How far a raw decode is off outside the region, as sums: pixels and squared metres, primitives and their IoU3D."""
+    given, made = (merge([s], [~region], s) for s in (scene, raw))
+    both = given.occupied & made.occupied
+    sums = pair_sums(given, made)
+    return {
+        "pixels_both": float(both.sum()),
+        "pixels_either": float((given.occupied | made.occupied).sum()),
+        "squared_m2": float(np.square((given.height_m - made.height_m)[both], dtype=np.float64).sum()),
+        "objects": float(sums.truths.sum()),
+        "found": float(sums.pairs.sum()),
+        "iou3d": float(sums.iou.sum()),
+    }
+
+
+def drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """Of all sums together: ground IoU, height RMSE, share of the objects found again, their mean IoU3D; None for 0 / 0."""
+    total = {name: sum(row[name] for row in sums) for name in sums[0]}
+
+    def share(above: str, below: str) -> float | None:
+        return total[above] / total[below] if total[below] else None
+
+    squared_m2 = share("squared_m2", "pixels_both")
+    return {
+        "ground_iou": share("pixels_both", "pixels_either"),
+        "height_rmse_m": None if squared_m2 is None else squared_m2**0.5,
+        "objects_found": share("found", "objects"),
+        "mean_iou3d": share("iou3d", "found"),
+    }
+
+
+def inpaint_one(
+    pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
+) -> tuple[list[Scene], list[dict[str, float]]]:
+    """All variants of scene `number` of a run, and the drift of each raw decode."""
+    scene = on_model_grid(scene, pipeline.spec)
+    region, count = request.where.region(scene), request.variants
+    raw = pipeline.inpaint(
+        [scene] * count,
+        [region] * count,
+        [request.label or label_of(scene, pipeline.dit.config.label)] * count,
+        request.contents,
+        request.seed,
+        range(number * count, (number + 1) * count),
+        request.resampling,
+        request.guidance_scale,
+        composite=False,
+    )
+    new = whole_cells(region, pipeline.lvae.latent_shape[-1])
+    source, made = f"generated-{request.run}", []
+    for k, one in enumerate(raw):
+        name = f"{source}-{request.seed}-{number:07d}-{k}"
+        one = composited(scene, one, new, request.contents)
+        made.append(replace(one, scene_id=name, source=source, split="generated", frame=number))
+    return made, [drift(scene, one, new) for one in raw]
+
+
+class Inpainter:
+    """Actor. Row in: number of a scene. Row out: its drift. Makes its variants, writes their shard and GLB files."""
+
+    def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
+        self.request, self.chosen = request, chosen
+        self.pipeline = load_pipeline(request.model)
+
+    def __call__(self, row: dict) -> dict:
+        request, shard = self.request, self.request.shard(row["id"])
+        record = storage.join(request.output, "drift", request.run, f"{row['id']:07d}.json")
+        if not (shard.is_written() and storage.exists(record)):
+            source, position = self.chosen[row["id"]]
+            made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
+            for scene in made:
+                path = storage.join(request.output, "glb", request.run, f"{scene.scene_id}.glb")
+                storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
+            storage.write_json(drifts, record)
+            shard.write(made)
+        return {"id": row["id"], "drift": storage.read_json(record)}
+
+
+def inpaint_scenes(
+    request: InpaintRequest,
+    selection: Selection,
+    num_actors: int = 1,
+    pictures: int = 8,
+    on_scene: Callable[[], None] | None = None,
+) -> dict[str, float | None]:
+    """Make the selected scenes anew, write tables, GLB files and a page; returns the drift. Goes on where it stopped.
+
+    Raises ValueError if the output holds a run made with other options, or for a region that a scene does not have.
+    """
+    chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
+    pipeline = load_pipeline(request.model)
+    options = {name: value for name, value in asdict(request).items() if name != "output"}
+    options |= {"where": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(request.where).items()}}
+    claim_run(request.output, request.run, options | {"input": asdict(selection), "weights": pipeline_digest(pipeline)})
+    graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
+        Inpainter,
+        fn_constructor_args=(request, chosen),
+        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
+        num_gpus=gpus_per_actor(),
+    )
+    drifts = []
+    for row in graph.iter_rows():
+        drifts += row["drift"]
+        if on_scene:
+            on_scene()
+    scores = drift_scores(drifts)
+    shown = []
+    for number, (source, position) in enumerate(chosen[:pictures]):
+        given = on_model_grid(source.scenes([position])[0], pipeline.spec)
+        new = whole_cells(request.where.region(given), pipeline.lvae.latent_shape[-1])
+        made = request.shard(number).scenes()[: PER_ROW - 1]
+        shown.append(Picture(given.scene_id, outlined(given, new), "given"))
+        shown += [Picture(scene.scene_id, outlined(scene, new), "made anew") for scene in made]
+    columns = min(PER_ROW, 1 + request.variants)
+    note = f"Inside the red line {described(request.contents)} made anew; the rest is the given scene's."
+    how = (
+        "The latent outside the region is the given scene's, bit for bit, but decoders see all of it: the table says how "
+        "far their raw output is off there. The scenes above and in the tables take that part from the given scene."
+    )
+    table = Table("Drift outside the region", tuple(scores), [tuple(scores.values())], note=how)
+    html = report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
+    page = storage.join(request.output, f"{request.run}.html")
+    storage.write_whole(page, lambda stream: stream.write(html.encode()))
+    return scores
+
+
+def described(contents: Contents) -> str:
+    return {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}[contents]
+
+
+def outlined(scene: Scene, region: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 from above, with the border of a region."""
+    picture = bev_picture(scene, PICTURE_PX, supersample=2).copy()
+    inside = region.repeat(-(-picture.shape[0] // len(region)), 0)[: picture.shape[0]]
+    inside = inside.repeat(-(-picture.shape[1] // region.shape[1]), 1)[:, : picture.shape[1]]
+    border = np.zeros_like(inside)
+    border[1:] |= inside[1:] != inside[:-1]
+    border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
+    picture[border] = BORDER_COLOR
+    return picture
