@@ -2,7 +2,7 @@
 
 python benchmarks/iou3d.py
 
-Cases and oracles are those of tests/test_metrics_iou3d.py: manifold3d's polytopes, and half-space intersection in
+Cases and oracles are those of tests/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
 float64 where manifold3d disagrees. CPU seconds of one thread.
 """
 
@@ -18,10 +18,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import numpy as np
 from common import DENSE_SEEDS, interleaved, ratios, spread, where
 from scipy.spatial.transform import Rotation
-from test_metrics_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs, random_boxes, sphere_lens
+from test_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs, random_boxes, sphere_lens
 
-from models.scene import ELLIPSOID
-from pipelines.metrics.iou3d import (
+from models.iou3d import (
     Boxes,
     boxes,
     boxes_of,
@@ -30,6 +29,7 @@ from pipelines.metrics.iou3d import (
     iou3d_pairs,
     overlapping_bounds,
 )
+from models.scene import ELLIPSOID
 from pipelines.sources.town import town_drive
 
 ROUNDS = 7

@@ -15,11 +15,11 @@ import ray.data
 import torch
 
 from models.encodings import ENCODINGS
+from models.iou3d import boxes, iou3d_pairs
 from models.orientation_study import THINGS, CentredBoxes, Settings, draw_boxes, fit
 from pipelines import storage
 from pipelines.chart import Chart, chart_svg
 from pipelines.dataset_report import Drawing, Drawings, page_html
-from pipelines.metrics.iou3d import boxes, iou3d_pairs
 from pipelines.report import Table, Text
 
 TEST_COUNT = 2000

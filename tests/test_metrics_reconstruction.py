@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
+from models.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, yaw_rotation
 from models.tensors import layout_batch
-from pipelines.metrics.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
 from pipelines.metrics.reconstruction import (
     MEMORY,
     SCORED,

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from models.iou3d import boxes_of, iou3d_matrix
 from models.scene import Scene
 from pipelines.metrics.intervals import Estimate, estimate, weights
-from pipelines.metrics.iou3d import boxes_of, iou3d_matrix
 
 MEASURES = (
     "class_changes",  # pairs of pixels across the line, either of them ground, that differ in class

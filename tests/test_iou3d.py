@@ -7,9 +7,9 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
+from models import iou3d
+from models.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
 from models.scene import yaw_rotation
-from pipelines.metrics import iou3d
-from pipelines.metrics.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
 
 TOLERANCE = 1e-4
 
