@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
+Key = int | tuple[int, ...]  # a scene's number, or several numbers that tell it from others
 OnStep = Callable[[int, int, Tensor], Tensor]  # number of the step from 0, its timestep, latent -> latent to go on with
 
 
@@ -101,13 +102,14 @@ class SceneNoise:
     def __init__(
         self,
         seed: int | Sequence[int],
-        indices: Sequence[int],
+        indices: Sequence[Key],
         shape: tuple[int, ...],
         device: torch.device | str,
         purpose: int = GENERATE,
     ) -> None:
         seeds = [seed] * len(indices) if isinstance(seed, int) else seed
-        self.generators = [keyed_generator(*key, purpose) for key in zip(seeds, indices, strict=True)]
+        keys = [(index,) if isinstance(index, int) else index for index in indices]
+        self.generators = [keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:

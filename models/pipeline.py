@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ from models.dit import DiT
 from models.inpaint import Contents, composited, latent_mask, whole_cells
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.outpaint import CORNERS, SIDES, OutpaintCanvas
+from models.outpaint import Block, Lattice, Place, World, height_near
 from models.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
 from models.scene import DENSITIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
@@ -229,7 +229,7 @@ class PrITTIPipeline(DiffusionPipeline):
         known: Known,
         labels: Sequence[str],
         seed: int | Sequence[int],
-        indices: Sequence[int],
+        indices: Sequence[Key],
         resampling: Resampling,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
@@ -266,10 +266,7 @@ class PrITTIPipeline(DiffusionPipeline):
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
-            if scene.grid != self.spec.grid or scene.ground_classes != self.spec.ground_classes:
-                raise ValueError(
-                    f"scene {scene.scene_id} is not on the model's grid, with its classes: {self.spec.grid}"
-                )
+            self.require_grid(scene)
         if contents != "both" and not self.lvae.config.split_latent:
             raise ValueError(f"this model's latent mixes ground and objects: {contents} cannot be made anew alone")
         shape = self.lvae.latent_shape
@@ -287,44 +284,87 @@ class PrITTIPipeline(DiffusionPipeline):
             for scene, one, region in zip(scenes, made, regions, strict=True)
         ]
 
-    def outpaint(
+    def extend(
         self,
-        scene: Scene,
-        label: str,
+        world: World,
+        places: Sequence[Place],
+        made: Mapping[Place, Block],
+        like: Scene,
+        label: str | Mapping[Place, str],
         seed: int = 0,
         index: int = 0,
-        overlap: float = 0.5,
         mode: str = "reencode",
         resampling: Resampling | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
-    ) -> Scene:
-        """The scene extended to all sides: four sides in one batch, then four corners (paper, supplement B.3).
+    ) -> dict[Place, Block]:
+        """Blocks of a world, all in one batch, that know those made before; ids from `like`, noise from seed, index, place.
 
-        `copy` hands each block the shifted latent, as the paper does; `reencode` hands it what is known so far as a
-        Scene, moved into the block's frame and height datum, encoded anew: object latents hold absolute centres,
-        which a copy leaves wrong. Returns a Scene on a grid (2 - overlap) + (1 - overlap) times as large, stitched by
-        ownership: what stood first stays, an object belongs to the block that owns the pixel under its centre.
+        Raises KeyError for a place without a label, or one whose earlier neighbours are not all made.
         """
         if mode not in ("copy", "reencode"):
             raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
-        canvas = OutpaintCanvas.around(scene, self.spec, self.encode, overlap)
-        for number, offsets in enumerate((SIDES, CORNERS)):
-            blocks = [canvas.block(offset, mode) for offset in offsets]
-            known = Known(torch.stack([b.latent for b in blocks]), torch.stack([b.unknown for b in blocks]))
+        empty = replace(
+            like.select(np.zeros(len(like), bool)),
+            grid=self.spec.grid,
+            ground_classes=self.spec.ground_classes,
+            **{name: np.zeros((len(self.spec.ground_classes), self.spec.grid.rows, self.spec.grid.cols), kind)
+               for name, kind in (("height_m", np.float32), ("occupied", bool))},
+        )  # fmt: skip
+        tasks = [world.task(place, made, empty, mode) for place in places]
+        known = Known(torch.stack([task.latent for task in tasks]), torch.stack([task.unknown for task in tasks]))
+        resampling = resampling or Resampling()
+        if not any(task.knows for task in tasks):  # nothing to harmonise with
+            resampling = replace(resampling, resamplings=1)
+        latents = self.complete(
+            known,
+            [label if isinstance(label, str) else label[place] for place in places],
+            seed,
+            [(index, *place) for place in places],
+            resampling,
+            guidance_scale,
+            callback_on_step_end,
+            OUTPAINT,
+        )
+        scenes = self.decode(latents, [empty] * len(places))
+        parts = zip(places, tasks, latents, scenes, strict=True)
+        return {place: world.block(task, latent, scene) for place, task, latent, scene in parts}
 
-            draws = [8 * index + 4 * number + k for k in range(len(offsets))]
-            latents = self.complete(
-                known,
-                [label] * len(offsets),
-                seed,
-                draws,
-                resampling or Resampling(),
-                guidance_scale,
-                callback_on_step_end,
-                OUTPAINT,
+    def outpaint(
+        self,
+        scene: Scene,
+        label: str | Mapping[Place, str],
+        seed: int = 0,
+        index: int = 0,
+        overlap: float = 0.5,
+        mode: str = "reencode",
+        last: tuple[int, int, int, int] = (1, 1, 1, 1),
+        resampling: Resampling | None = None,
+        guidance_scale: float = 1.0,
+        callback_on_step_end: StepCallback | None = None,
+    ) -> Scene:
+        """The scene extended by blocks ahead, behind, left and right, `last` of each (outpaint.py).
+
+        One to every side is the paper's outpainting: four sides in one batch, then four corners (supplement B.3). `copy`
+        hands each block the shifted latent, as the paper does; `reencode` hands it what is known so far as a Scene, moved
+        into the block's frame and height datum, encoded anew: object latents hold absolute centres, which a copy leaves
+        wrong. `label` is one for all blocks or a mapping from (steps ahead, steps left). Raises ValueError for a scene
+        that is not on the model's grid, or an overlap between two cells.
+        """
+        self.require_grid(scene)
+        lattice = Lattice.of(self.lvae.latent_shape[-1], overlap, last=last)
+        world = World(lattice, self.spec, self.encode, height_near(scene, 0.0, 0.0))
+        made = {(0, 0): Block(scene, self.encode([scene])[0])}
+        for front in lattice.fronts(place for place in lattice.places() if place not in made):
+            made |= self.extend(
+                world, front, made, scene, label, seed, index, mode, resampling, guidance_scale, callback_on_step_end
             )
-            scenes = self.decode(latents, [replace(scene, grid=self.spec.grid)] * len(offsets))
-            for offset, block, latent, generated in zip(offsets, blocks, latents, scenes, strict=True):
-                canvas.paste(offset, latent, generated, block.datum_m)
-        return canvas.scene
+        return world.stitched(made, scene)
+
+    def require_grid(self, scene: Scene) -> None:
+        """Raises ValueError for a scene that is not on the model's grid, with its ground classes."""
+        if scene.grid != self.spec.grid or scene.ground_classes != self.spec.ground_classes:
+            raise ValueError(
+                f"scene {scene.scene_id} has {scene.grid} and ground classes {scene.ground_classes}; "
+                f"the model needs {self.spec.grid} and {self.spec.ground_classes}"
+            )
