@@ -113,7 +113,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A block that is made: its Scene and latent (c, h, w) in its own frame, which lies `datum_m` above the world's.
+    """A block that is made: what it owns as a Scene, and its latent (c, h, w), in its own frame, `datum_m` above the world's.
 
     `known_ground` is the share of what it knew beforehand that had any ground: the paper's outpainting fails where it is
     next to nothing. 1 where nothing was known.
@@ -199,14 +199,11 @@ class World:
         return Task(known, latent, unknown.to(latent).expand_as(latent), datum)
 
     def block(self, task: Task, latent: Tensor, made: Scene) -> Block:
-        """A block from what its task's latent became: known pixels and objects stay, doubles of known objects go."""
-        new = task.new_pixels
-        kept = merge([task.known], [~new], task.known)
-        made = merge([made], [new], replace(task.known, scene_id=made.scene_id))
-        made = made.select(~doubles(made, kept))
-        whole = merge([kept, made], [~new, new], made)
-        seen = kept.occupied.any(axis=0)[~new]
-        return Block(whole, latent, task.datum_m, float(seen.mean()) if task.knows else 1.0)
+        """A block from what its task's latent became: the new part, without objects that are known already."""
+        own = merge([made], [task.new_pixels], made)
+        own = own.select(~doubles(own, task.known))
+        seen = task.known.occupied.any(axis=0)[~task.new_pixels]
+        return Block(own, latent, task.datum_m, float(seen.mean()) if task.knows else 1.0)
 
     def stitched(self, made: Mapping[Place, Block], like: Scene, grid: Grid | None = None) -> Scene:
         """All blocks as one Scene, each with what it owns; ids and labels from `like`. Default grid: all of them.
@@ -229,7 +226,7 @@ class World:
         for place, block in sorted(made.items()):
             x, y = (steps * self.step_m for steps in place)
             mine = pixels(self.lattice.owned(place), small)
-            part = merge([block.scene], [mine], block.scene).moved(x, y, block.datum_m)
+            part = block.scene.moved(x, y, block.datum_m)
             row, col = grid.pixel(part.grid.front_m - small.resolution_m / 2, part.grid.left_m - small.resolution_m / 2)
             rows, cols = (slice(max(0, at), max(0, at + n)) for at, n in ((row, small.rows), (col, small.cols)))
             inside = mine[rows.start - row :, cols.start - col :][: grid.rows - rows.start, : grid.cols - cols.start]

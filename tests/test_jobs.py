@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -250,6 +251,62 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
     assert "fid" not in made and "precision_k3" not in made
     page = (tmp_path / "evaluation.html").read_text()
     assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
+
+
+def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(home, samples, tmp_path):
+    from test_faults import psutil
+
+    from jobs.outpaint_scenes import Config, last_blocks
+    from models.pipeline import Resampling
+    from pipelines.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.selection import Selection
+
+    def request(name: str, **options) -> OutpaintRequest:
+        resampling = Resampling(num_steps=4, jump_length=2, resamplings=2)
+        model = str(home / "models/pritti-smoke")
+        made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", resampling, 1.0)
+        return replace(made, **{"last": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
+
+    chosen = Selection(str(samples), "generated-samples", None, 1, "first")
+    table = outpaint_scenes(request("whole"), chosen)
+    assert len(table) == 8 and set(table.column_names) >= {"ahead", "left", "datum_m", "known_ground"}
+    (whole,) = read_scenes(str(tmp_path / "whole"))
+    assert (whole.grid.rows, whole.grid.cols) == (32 + 3 * 24, 32 + 24)
+    assert not list((tmp_path / "whole/blocks").rglob("*.safetensors"))
+    killed, counts = [], []
+
+    def kill(blocks: int) -> None:
+        counts.append(blocks)
+        for process in psutil.Process().children(recursive=True) if sum(counts) and not killed else ():
+            with suppress(psutil.Error, IndexError):
+                if "Outpainter" in process.cmdline()[0]:
+                    process.kill()
+                    killed.append(process.pid)
+
+    assert outpaint_scenes(request("killed"), chosen, num_actors=2, on_blocks=kill).equals(table)
+    assert killed and counts[0] == 0 and sum(counts) == 7
+
+    class Stop(Exception):
+        pass
+
+    def stop(blocks: int) -> None:
+        if blocks:
+            raise Stop
+
+    with pytest.raises(Stop):
+        outpaint_scenes(request("resumed"), chosen, on_blocks=stop)
+    left = []
+    assert outpaint_scenes(request("resumed"), chosen, on_blocks=left.append).equals(table) and left[0] > 0
+    for name in ("killed", "resumed"):
+        (again,) = read_scenes(str(tmp_path / name))
+        for part in ("category", "center_m", "size_m", "height_m", "occupied"):
+            assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
+    (outward,) = outpaint_scenes(request("outward", order="outward", last=(1, 0, 0, 0)), chosen).to_pylist()[1:]
+    assert outward["ahead"] == 1
+    assert last_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != last_blocks(Config(extent_m=(64.0, 65.0)))
+    for wrong in (Config(extent_m=(32.0, 64.0)), Config(ahead=0, behind=0, left=0, right=0), Config(ahead=-1)):
+        with pytest.raises(ValueError, match="expected"):
+            last_blocks(wrong)
 
 
 def test_inpainting_writes_variants_and_goes_on(home, samples, tmp_path):
