@@ -45,7 +45,7 @@ class Config:
 
 def sample(config: Config) -> str:
     """Generate and return the dataset directory."""
-    from rich.progress import Progress
+    from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
     from models.pipeline import LABELS
     from pipelines import storage
@@ -73,7 +73,8 @@ def sample(config: Config) -> str:
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )
     start_ray()
-    with Progress() as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
+    with Progress(*columns) as bar:
         shown = bar.add_task("sample scenes", total=config.num_scenes)
         sample_scenes(request, config.actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
     for scene in read_scenes(output, f"generated-{config.run}", limit=config.glb) if config.glb else ():

@@ -253,6 +253,29 @@ def test_outpainting_and_evaluation(home, samples, tmp_path):
     assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
 
 
+def test_a_killed_sampler_loses_and_doubles_nothing(home, samples, tmp_path):
+    from test_faults import psutil
+
+    from models.pipeline import LABELS
+    from pipelines.generate import SampleRequest, sample_scenes
+
+    model = str(home / "models/pritti-smoke")
+    request = SampleRequest(model, str(tmp_path), "samples", 9, LABELS["vegetation"], 0, 10, 1.0, shard_scenes=1)
+    killed = []
+
+    def kill(row: dict) -> None:
+        for process in psutil.Process().children(recursive=True) if not killed else ():
+            with suppress(psutil.Error, IndexError):
+                if "Sampler" in process.cmdline()[0]:
+                    process.kill()
+                    killed.append(process.pid)
+
+    assert sample_scenes(request, num_actors=1, batch_size=1, on_shard=kill) == 9 and len(killed) == 1
+    again, before = list(read_scenes(str(tmp_path))), list(read_scenes(str(samples)))
+    assert [scene.scene_id for scene in again] == [scene.scene_id for scene in before]
+    assert all(np.array_equal(a.occupied, b.occupied) for a, b in zip(again, before, strict=True))
+
+
 def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(home, samples, tmp_path):
     from test_faults import psutil
 
