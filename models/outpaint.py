@@ -22,7 +22,7 @@ from torch import Tensor
 
 from models.iou3d import boxes_of, iou3d_matrix
 from models.layout import LayoutSpec
-from models.scene import Grid, Scene, merge
+from models.scene import Grid, Scene, joined, merge
 
 Place = tuple[int, int]  # (i, j) of a block: steps ahead, steps left
 Encode = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid -> latents (b, c, h, w)
@@ -227,21 +227,12 @@ class World:
             x, y = (steps * self.step_m for steps in place)
             mine = pixels(self.lattice.owned(place), small)
             part = block.scene.moved(x, y, block.datum_m)
-            row, col = grid.pixel(part.grid.front_m - small.resolution_m / 2, part.grid.left_m - small.resolution_m / 2)
-            rows, cols = (slice(max(0, at), max(0, at + n)) for at, n in ((row, small.rows), (col, small.cols)))
-            inside = mine[rows.start - row :, cols.start - col :][: grid.rows - rows.start, : grid.cols - cols.start]
-            rows, cols = (
-                slice(rows.start, rows.start + inside.shape[0]),
-                slice(cols.start, cols.start + inside.shape[1]),
-            )
+            here, there = grid.shared(part.grid)
             for whole, piece in ((height, part.height_m), (occupied, part.occupied)):
-                piece = piece[:, rows.start - row : rows.stop - row, cols.start - col : cols.stop - col]
-                np.copyto(whole[:, rows, cols], piece, where=inside)
+                np.copyto(whole[:, *here], piece[:, *there], where=mine[there])
             objects.append(part.select(grid.contains(part.center_m[:, 0], part.center_m[:, 1])))
-        names = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
-        joined = {name: np.concatenate([getattr(part, name) for part in objects]) for name in names}
         classes = self.spec.ground_classes
-        return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **joined)
+        return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **joined(objects))
 
 
 def doubles(made: Scene, known: Scene) -> np.ndarray:

@@ -304,13 +304,7 @@ class PrITTIPipeline(DiffusionPipeline):
         """
         if mode not in ("copy", "reencode"):
             raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
-        empty = replace(
-            like.select(np.zeros(len(like), bool)),
-            grid=self.spec.grid,
-            ground_classes=self.spec.ground_classes,
-            **{name: np.zeros((len(self.spec.ground_classes), self.spec.grid.rows, self.spec.grid.cols), kind)
-               for name, kind in (("height_m", np.float32), ("occupied", bool))},
-        )  # fmt: skip
+        empty = new_scene(like.scene_id, like.source, like.sequence, like.frame, self.spec)
         tasks = [world.task(place, made, empty, mode) for place in places]
         known = Known(torch.stack([task.latent for task in tasks]), torch.stack([task.unknown for task in tasks]))
         resampling = resampling or Resampling()

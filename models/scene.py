@@ -10,6 +10,7 @@ Differs from the paper, whose frame keeps the IMU's pitch and roll: blocks would
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +39,9 @@ GROUND_CLASSES = ("road", "sidewalk", "parking", "terrain", "ground", "crossing"
 KITTI_GROUND_CLASSES = GROUND_CLASSES[:5]
 
 DENSITIES = ("low", "medium", "high")
+
+# Fields of a Scene with a row per primitive.
+PER_PRIMITIVE = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,21 @@ class Grid:
     def contains(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """True where a point lies inside the grid's rectangle (half-open: the far and left border belong)."""
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
+
+    def shared(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """(rows, cols) of this grid and of the other that show the same place. ValueError if not aligned to whole pixels."""
+        row0 = (other.front_m - self.front_m) / self.resolution_m
+        col0 = (other.left_m - self.left_m) / self.resolution_m
+        aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
+        if other.resolution_m != self.resolution_m or not aligned:
+            raise ValueError(f"grid {self} is not aligned with {other} to whole pixels")
+        here, there = [], []
+        for ahead, count, others in ((round(row0), self.rows, other.rows), (round(col0), self.cols, other.cols)):
+            start = max(0, -ahead)  # `ahead`: the other's index of our pixel 0
+            stop = max(start, min(count, others - ahead))
+            here.append(slice(start, stop))
+            there.append(slice(start + ahead, stop + ahead))
+        return tuple(here), tuple(there)
 
     def pixel(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(row, col) of the pixel that holds each point; may lie outside the grid."""
@@ -207,17 +226,7 @@ class Scene:
 
     def select(self, keep: np.ndarray) -> Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
-        per_primitive = (
-            "category",
-            "center_m",
-            "rotation",
-            "size_m",
-            "existence",
-            "heading_rad",
-            "instance_id",
-            "label",
-        )
-        return replace(self, **{name: getattr(self, name)[keep] for name in per_primitive})
+        return replace(self, **{name: getattr(self, name)[keep] for name in PER_PRIMITIVE})
 
     def moved(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
         """The same content in a frame whose origin lies at (-dx, -dy, -dz): everything, the grid too, moves by d."""
@@ -231,21 +240,10 @@ class Scene:
 
         Raises ValueError if the grids are not aligned.
         """
-        row0 = (self.grid.front_m - grid.front_m) / grid.resolution_m
-        col0 = (self.grid.left_m - grid.left_m) / grid.resolution_m
-        aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
-        if grid.resolution_m != self.grid.resolution_m or not aligned:
-            raise ValueError(f"grid {grid} is not aligned with {self.grid} to whole pixels")
-        row0, col0 = round(row0), round(col0)
+        here, there = grid.shared(self.grid)
         shape = (len(self.ground_classes), grid.rows, grid.cols)
         height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
-        here_r = slice(max(0, -row0), max(0, min(grid.rows, self.grid.rows - row0)))
-        here_c = slice(max(0, -col0), max(0, min(grid.cols, self.grid.cols - col0)))
-        there_r = slice(here_r.start + row0, here_r.stop + row0)
-        there_c = slice(here_c.start + col0, here_c.stop + col0)
-        if here_r.start < here_r.stop and here_c.start < here_c.stop:
-            height[:, here_r, here_c] = self.height_m[:, there_r, there_c]
-            occupied[:, here_r, here_c] = self.occupied[:, there_r, there_c]
+        height[:, *here], occupied[:, *here] = self.height_m[:, *there], self.occupied[:, *there]
         inside = grid.contains(self.center_m[:, 0], self.center_m[:, 1])
         return replace(self.select(inside), height_m=height, occupied=occupied, grid=grid)
 
@@ -262,6 +260,9 @@ def merge(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
         row, col = like.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
         row, col = row.clip(0, like.grid.rows - 1), col.clip(0, like.grid.cols - 1)
         parts.append(scene.select(mask[row, col]))
-    names = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return replace(like, height_m=height, occupied=occupied, **joined)
+    return replace(like, height_m=height, occupied=occupied, **joined(parts))
+
+
+def joined(scenes: Sequence[Scene]) -> dict[str, np.ndarray]:
+    """The primitives of all scenes, one after the other, as fields of a Scene."""
+    return {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in PER_PRIMITIVE}
