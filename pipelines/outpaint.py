@@ -227,7 +227,19 @@ def work_off(
         num_cpus=1, num_gpus=gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
     count = min(num_actors, max(len(waiting), len(done)))
-    idle = [actor.remote(request, chosen) for _ in range(count)]
+    workers = [actor.remote(request, chosen) for _ in range(count)]
+    try:
+        hand_out(workers, waiting, done, on_blocks)
+    finally:  # an error's traceback would keep them, and their CPUs, alive
+        for worker in workers:
+            ray.kill(worker)
+
+
+def hand_out(
+    workers: list, waiting: list[Batch], done: dict[int, set[Place]], on_blocks: Callable[[int], None] | None
+) -> None:
+    """Until nothing is left to do."""
+    idle = list(workers)
     left = {number: sum(batch.number == number for batch in waiting) for number in done}
     whole = [number for number, batches_left in left.items() if not batches_left]
     running: dict[ray.ObjectRef, tuple] = {}
