@@ -55,7 +55,9 @@ def lattices():
         yield Lattice.of(8, overlap, rank=colour, last=None)
 
 
-@pytest.mark.parametrize("lattice", lattices(), ids=str)
+@pytest.mark.parametrize(
+    "lattice", lattices(), ids=lambda lattice: f"{lattice.rank.__name__}-{lattice.step}-{lattice.last}"
+)
 def test_every_cell_is_owned_once_and_known_by_all_later_blocks(lattice):
     places = lattice.places() if lattice.last else list(product(range(-3, 4), repeat=2))
     owners: dict[tuple[int, int], list] = {}
