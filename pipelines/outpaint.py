@@ -8,8 +8,9 @@ from functools import cached_property
 
 import pyarrow as pa
 import ray
-import safetensors.torch
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 
 from models.outpaint import Block, Lattice, Place, World, colour, height_near, outward
 from models.pipeline import Resampling
@@ -95,15 +96,15 @@ def write_block(block: Block, path: str) -> None:
     arrays = {name: torch.from_numpy(getattr(block.scene, name).copy()) for name in ARRAYS}
     arrays |= {"latent": block.latent.cpu().contiguous()}
     arrays |= {"of_block": torch.tensor([block.datum_m, block.known_ground], dtype=torch.float64)}
-    data = safetensors.torch.save(arrays)
+    data = save(arrays)
     storage.write_whole(path, lambda stream: stream.write(data))
 
 
 def read_block(path: str, empty: Scene) -> Block:
     """Raises ValueError naming a file that is missing or damaged."""
     try:
-        arrays = safetensors.torch.load(storage.read_bytes(path))
-    except safetensors.SafetensorError as error:
+        arrays = load(storage.read_bytes(path))
+    except SafetensorError as error:
         raise ValueError(f"{path}: not a whole block ({error}); delete it and run the job again") from error
     latent, (datum_m, known_ground) = arrays.pop("latent"), arrays.pop("of_block").tolist()
     scene = replace(
