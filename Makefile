@@ -18,7 +18,7 @@ test: export RAY_DATA_USE_DATASOURCE_V2 = 0
 test: export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2
 test: .venv/ready
 	$(BIN)/ruff check .
-	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: .venv/ready
 	$(BIN)/ruff check .

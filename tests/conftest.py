@@ -6,12 +6,20 @@ from pathlib import Path
 import pytest
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Under `-n 2 --dist loadgroup` a module stays in one process, and so do all modules that use `home`."""
-    at_home = {item.path for item in items if "home" in item.fixturenames}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("home" if item.path in at_home else item.path.stem))
+AT_HOME = {f"tests/test_{name}.py" for name in ("evaluate_job", "jobs", "voxel_import")}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log):
+    """Under `-n 2` a module stays in one process, and so do all modules that use `home`."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            module = super()._split_scope(nodeid)
+            return "home" if module in AT_HOME else module
+
+    return Scheduling(config, log)
 
 
 @pytest.fixture(scope="session")
