@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-
 AT_HOME = {f"tests/test_{name}.py" for name in ("evaluate_job", "jobs", "voxel_import")}
 
 
