@@ -3,9 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +12,10 @@ import numpy as np
 import pytest
 import trimesh
 from safetensors.torch import load_file
+from test_commands import command
 
 from models.scene import DENSITIES
 from pipelines.scenes.tables import find_shards, read_scenes
-
-JOBS = sorted(p.name for p in (Path(__file__).parents[1] / "jobs").glob("*.py") if os.access(p, os.X_OK))
 
 
 def weights(directory: Path) -> dict:
@@ -423,13 +419,6 @@ def test_a_truncated_shard_is_named(home, tmp_path):
         train(Config(preset="smoke", dataset=str(tmp_path / "data"), name="lvae-truncated"))
 
 
-def command(*words: str, **environment: str) -> subprocess.CompletedProcess:
-    root = Path(__file__).parents[1]
-    return subprocess.run(
-        [sys.executable, *words], cwd=root, capture_output=True, text=True, env=os.environ | environment, timeout=120
-    )
-
-
 def test_a_fault_in_a_worker_reaches_the_user_as_one_line(home, tmp_path):
     """A truncated shard found by an actor of another process: no traceback, exit code 2."""
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
@@ -448,40 +437,3 @@ def test_a_fault_in_a_worker_reaches_the_user_as_one_line(home, tmp_path):
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-2000:]
     assert path.name in lines[0] and "delete it and run the job that wrote it again" in lines[0]
-
-
-@pytest.mark.parametrize("job", JOBS)
-def test_help_explains(job):
-    done = command(f"jobs/{job}", "--help")
-    assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
-
-
-MISTAKES = {
-    ("train_lvae.py", "tiny"): "unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2",
-    ("train_lvae.py",): "run jobs/preprocess_scenes.py",
-    ("train_dit.py", "kitti360"): "run jobs/preprocess_scenes.py",
-    ("encode_latents.py",): "run jobs/preprocess_scenes.py",
-    ("sample_scenes.py",): "run jobs/train_dit.py first",
-    ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
-    ("inpaint_scenes.py",): "no region: give --polygon-m, --half-plane or --objects",
-    ("preprocess_scenes.py", "kitti360", "--input", "nowhere"): "--input nowhere: no such directory",
-    ("preprocess_scenes.py", "av2", "--input", "tests"): "tests",
-}
-
-
-@pytest.fixture(scope="module")
-def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
-    """What the commands print; two at a time, as each takes seconds to start."""
-    empty = str(tmp_path_factory.mktemp("empty"))
-    with ThreadPoolExecutor(2) as pool:
-        done = pool.map(lambda words: command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
-        return dict(zip(MISTAKES, done, strict=True))
-
-
-@pytest.mark.parametrize("words", MISTAKES, ids=" ".join)
-def test_a_mistake_is_one_clear_line(mistakes, words):
-    done = mistakes[words]
-    assert done.returncode == 2
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1 and MISTAKES[words] in lines[0], done.stderr
-    assert "Traceback" not in done.stderr
