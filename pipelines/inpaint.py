@@ -167,6 +167,8 @@ def inpaint_scenes(
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
+    first, row = chosen[0]
+    request.where.region(on_model_grid(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
     options = {name: value for name, value in asdict(request).items() if name != "output"}
     options |= {"where": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(request.where).items()}}
     claim_run(request.output, request.run, options | {"input": asdict(selection), "weights": pipeline_digest(pipeline)})
