@@ -16,19 +16,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
+from jobs.given_scenes import GivenScenes, pipeline_directory
 
 
 @dataclass(frozen=True)
-class Config:
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
-    input: str = ""
-    """Dataset directory with the scenes (default: $PRITTI_HOME/generated)."""
-    source: str = ""
-    """Source of the scenes (default: whatever is there)."""
-    split: str = ""
-    limit: int = 1
-    """How many scenes, from the first on."""
+class Config(GivenScenes):
     polygon_m: tuple[float, ...] = ()
     """Corners of a polygon, x y x y ..., in metres of the scene: x ahead, y left."""
     half_plane: tuple[float, ...] = ()
@@ -43,52 +35,40 @@ class Config:
     """What to make anew there."""
     variants: int = 1
     """Different results per scene."""
-    label: str = ""
-    """Label to aim at (default: the scene's own)."""
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/inpainted)."""
     run: str = "inpainted"
-    seed: int = 0
-    steps: int = 250
-    jump_length: int = 10
-    resamplings: int = 10
-    guidance: float = 1.0
-    actors: int = 1
-    """Pipelines at work at once; one per GPU."""
     pictures: int = 8
     """So many scenes on the page."""
+
+    def output_directory(self) -> str:
+        return absolute(self.output) if self.output else home("inpainted")
 
 
 def inpaint(config: Config) -> dict[str, float | None]:
     """Make anew, write, and return how far raw decodes drift outside the region."""
     from rich.progress import Progress
 
-    from models.pipeline import Resampling
-    from pipelines import storage
     from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes
-    from pipelines.selection import Selection
 
     if not (config.polygon_m or config.half_plane or config.objects):
         raise ValueError("no region: give --polygon-m, --half-plane or --objects")
     if config.variants < 1 or config.pictures < 0:
         raise ValueError(f"--variants is {config.variants}, --pictures {config.pictures}: expected 1 and 0 or more")
+    selection = config.selection()
+    total = sum(len(rows) for _, rows in selection.shards())
     request = InpaintRequest(
-        model=absolute(config.model) if config.model else home("models", "pritti-town"),
-        output=absolute(config.output) if config.output else home("inpainted"),
+        model=pipeline_directory(config.model),
+        output=config.output_directory(),
         run=config.run,
         where=Where(config.polygon_m, config.half_plane, config.objects, config.margin_m, config.outside),
         contents=config.contents,
         variants=config.variants,
         label=config.label or None,
         seed=config.seed,
-        resampling=Resampling(config.steps, config.jump_length, config.resamplings),
+        resampling=config.resampling(),
         guidance_scale=config.guidance,
     )
-    source = absolute(config.input) if config.input else home("generated")
-    selection = Selection(source, config.source or None, config.split or None, config.limit, "first")
-    total = sum(len(rows) for _, rows in selection.shards())
-    if not storage.exists(storage.join(request.model, "model_index.json")):
-        raise ValueError(f"{request.model}: no PrITTI pipeline here; run jobs/train_dit.py first")
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("inpaint", total=total)
@@ -97,8 +77,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
 
 def main(config: Config) -> None:
     scores = inpaint(config)
-    output = absolute(config.output) if config.output else home("inpainted")
-    print(f"scenes, source generated-{config.run}, GLB files and {config.run}.html in {output}")
+    print(f"scenes, source generated-{config.run}, GLB files and {config.run}.html in {config.output_directory()}")
     said = {name: "–" if value is None else f"{value:.4g}" for name, value in scores.items()}
     print("drift outside the region:", ", ".join(f"{name} {value}" for name, value in said.items()))
 

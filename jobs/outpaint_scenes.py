@@ -18,6 +18,7 @@ from math import ceil
 from typing import TYPE_CHECKING, Literal
 
 from jobs.command import absolute, home, run, start_ray
+from jobs.given_scenes import GivenScenes, pipeline_directory
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,22 +27,10 @@ BLOCK_M = 64.0  # of every dataset's scenes (paper, Sec. 3.1)
 
 
 @dataclass(frozen=True)
-class Config:
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
-    input: str = ""
-    """Dataset directory with the scenes to extend (default: $PRITTI_HOME/generated)."""
-    source: str = ""
-    """Source of the scenes (default: whatever is there)."""
-    split: str = ""
-    limit: int = 1
-    """How many scenes to extend, from the first on."""
-    label: str = ""
-    """Label of the new blocks (default: the scene's own)."""
+class Config(GivenScenes):
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/outpainted)."""
     run: str = "outpainted"
-    seed: int = 0
     extent_m: tuple[float, float] | None = None
     """Length (ahead) and width of the whole in metres, the scene in its middle; instead of the four numbers below."""
     ahead: int = 1
@@ -56,14 +45,11 @@ class Config:
     overlap below 0.5."""
     mode: Literal["reencode", "copy"] = "reencode"
     """How a block knows its neighbours: encoded anew in its own frame, or the shifted latent (the paper)."""
-    steps: int = 250
-    jump_length: int = 10
-    resamplings: int = 10
-    guidance: float = 1.0
     batch_size: int = 4
     """Blocks of a scene to make at once; part of what decides their last digits."""
-    actors: int = 1
-    """Pipelines at work at once; one per GPU."""
+
+    def output_directory(self) -> str:
+        return absolute(self.output) if self.output else home("outpainted")
 
 
 def last_blocks(config: Config) -> tuple[int, int, int, int]:
@@ -87,35 +73,29 @@ def outpaint(config: Config) -> pa.Table:
     """Extend, write, and return what is known of each block."""
     from rich.progress import MofNCompleteColumn, Progress
 
-    from models.pipeline import Resampling
-    from pipelines import storage
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes
-    from pipelines.selection import Selection
 
-    output = absolute(config.output) if config.output else home("outpainted")
+    if config.batch_size < 1:
+        raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
+    last = last_blocks(config)
+    selection = config.selection()
+    count = sum(len(rows) for _, rows in selection.shards())
     request = OutpaintRequest(
-        model=absolute(config.model) if config.model else home("models", "pritti-town"),
-        output=output,
+        model=pipeline_directory(config.model),
+        output=config.output_directory(),
         run=config.run,
         label=config.label or None,
         seed=config.seed,
         overlap=config.overlap,
         mode=config.mode,
-        resampling=Resampling(config.steps, config.jump_length, config.resamplings),
+        resampling=config.resampling(),
         guidance_scale=config.guidance,
-        last=last_blocks(config),
+        last=last,
         order=config.order,
         batch_size=config.batch_size,
     )
-    source = absolute(config.input) if config.input else home("generated")
-    selection = Selection(source, config.source or None, config.split or None, config.limit, "first")
-    count = sum(len(rows) for _, rows in selection.shards())
-    if config.batch_size < 1:
-        raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
-    if not storage.exists(storage.join(request.model, "model_index.json")):
-        raise ValueError(f"{request.model}: no PrITTI pipeline here; run jobs/train_dit.py first")
     start_ray()
-    ahead, behind, left, right = request.last
+    ahead, behind, left, right = last
     with Progress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
         shown = bar.add_task("outpaint, blocks", total=count * ((ahead + behind + 1) * (left + right + 1) - 1))
         return outpaint_scenes(request, selection, config.actors, lambda blocks: bar.advance(shown, blocks))
@@ -126,8 +106,7 @@ def main(config: Config) -> None:
 
     from pipelines.outpaint import HARDLY_KNOWN
 
-    blocks = outpaint(config)
-    output = absolute(config.output) if config.output else home("outpainted")
+    blocks, output = outpaint(config), config.output_directory()
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
     if bare := pc.sum(pc.less(blocks["known_ground"], HARDLY_KNOWN)).as_py():
         print(

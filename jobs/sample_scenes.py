@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
+from jobs.given_scenes import pipeline_directory
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,10 @@ def sample(config: Config) -> str:
     from pipelines.scenes.mesh import scene_glb
     from pipelines.scenes.tables import read_scenes
 
-    model = absolute(config.model) if config.model else home("models", "pritti-town")
     output = absolute(config.output) if config.output else home("generated")
     if config.num_scenes < 1:
         raise ValueError(f"--num-scenes is {config.num_scenes}, expected at least 1")
-    if not storage.exists(storage.join(model, "model_index.json")):
-        raise ValueError(f"{model}: no PrITTI pipeline here; run jobs/train_dit.py first")
+    model = pipeline_directory(config.model)
     kind = storage.read_json(storage.join(model, "dit/config.json"))["label"]
     request = SampleRequest(
         model=model,

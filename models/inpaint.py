@@ -67,10 +67,9 @@ def cells_of(region: np.ndarray, size: int) -> np.ndarray:
     return region.reshape(size, rows // size, size, cols // size).any(axis=(1, 3))
 
 
-def whole_cells(region: np.ndarray, size: int) -> np.ndarray:
+def whole_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
     """The region grown to whole latent cells: what is really made anew."""
-    rows, cols = region.shape
-    return cells_of(region, size).repeat(rows // size, axis=0).repeat(cols // size, axis=1)
+    return grid.enlarged(cells_of(region, size))
 
 
 def latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents) -> Tensor:

@@ -141,11 +141,7 @@ class Task:
     @cached_property
     def new_pixels(self) -> np.ndarray:
         """(rows, cols) True where the block is made."""
-        return pixels(self.unknown[0].cpu().numpy() > 0, self.known.grid)
-
-
-def pixels(cells: np.ndarray, grid: Grid) -> np.ndarray:
-    return cells.repeat(grid.rows // cells.shape[0], axis=0).repeat(grid.cols // cells.shape[1], axis=1)
+        return self.known.grid.enlarged(self.unknown[0].cpu().numpy() > 0)
 
 
 def height_near(scene: Scene, x_m: float, y_m: float) -> float:
@@ -167,9 +163,12 @@ class World:
         self.lattice, self.spec, self.encode, self.level_m = lattice, spec, encode, level_m
 
     @property
+    def step_px(self) -> int:
+        return self.lattice.step * (self.spec.grid.rows // self.lattice.size)
+
+    @property
     def step_m(self) -> float:
-        grid = self.spec.grid
-        return self.lattice.step * (grid.rows // self.lattice.size) * grid.resolution_m
+        return self.step_px * self.spec.grid.resolution_m
 
     def seen_from(self, place: Place, other: Place, block: Block) -> Scene:
         """The part of a block's Scene inside another block's grid, in that one's frame and the world's heights."""
@@ -185,7 +184,7 @@ class World:
         parts = [(other, made[other], cells) for other, cells in self.lattice.known(place)]
         grid = self.spec.grid
         scenes = [self.seen_from(place, other, block) for other, block, _ in parts]
-        known = merge(scenes, [pixels(cells, grid) for *_, cells in parts], empty) if parts else empty
+        known = merge(scenes, [grid.enlarged(cells) for *_, cells in parts], empty) if parts else empty
         unknown = torch.from_numpy(self.lattice.owned(place))
         datum = height_near(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
         known = known.moved(0, 0, -datum)
@@ -210,7 +209,7 @@ class World:
 
         Grids count from block (0, 0), in whole pixels.
         """
-        small, pixels_per_step = self.spec.grid, self.lattice.step * self.spec.grid.rows // self.lattice.size
+        small = self.spec.grid
         if grid is None:
             ahead, left = (max(place[k] for place in made) for k in (0, 1))
             behind, right = (-min(place[k] for place in made) for k in (0, 1))
@@ -218,14 +217,14 @@ class World:
                 small,
                 front_m=small.front_m + ahead * self.step_m,
                 left_m=small.left_m + left * self.step_m,
-                rows=small.rows + (ahead + behind) * pixels_per_step,
-                cols=small.cols + (left + right) * pixels_per_step,
+                rows=small.rows + (ahead + behind) * self.step_px,
+                cols=small.cols + (left + right) * self.step_px,
             )
         shape = (len(self.spec.ground_classes), grid.rows, grid.cols)
         height, occupied, objects = np.zeros(shape, np.float32), np.zeros(shape, bool), []
         for place, block in sorted(made.items()):
             x, y = (steps * self.step_m for steps in place)
-            mine = pixels(self.lattice.owned(place), small)
+            mine = small.enlarged(self.lattice.owned(place))
             part = block.scene.moved(x, y, block.datum_m)
             here, there = grid.shared(part.grid)
             for whole, piece in ((height, part.height_m), (occupied, part.occupied)):

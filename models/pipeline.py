@@ -280,7 +280,7 @@ class PrITTIPipeline(DiffusionPipeline):
         if not composite:
             return made
         return [
-            composited(scene, one, whole_cells(region, shape[-1]), contents)
+            composited(scene, one, whole_cells(region, scene.grid, shape[-1]), contents)
             for scene, one, region in zip(scenes, made, regions, strict=True)
         ]
 

@@ -92,6 +92,11 @@ class Grid:
             there.append(slice(start + ahead, stop + ahead))
         return tuple(here), tuple(there)
 
+    def enlarged(self, cells: np.ndarray) -> np.ndarray:
+        """(rows, cols): each of the coarser (h, w) cells as its block of pixels. h divides rows and w cols."""
+        h, w = cells.shape
+        return cells.repeat(self.rows // h, axis=0).repeat(self.cols // w, axis=1)
+
     def pixel(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(row, col) of the pixel that holds each point; may lie outside the grid."""
         row = np.floor((self.front_m - np.asarray(x_m)) / self.resolution_m).astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -19,12 +20,25 @@ from pipelines.scenes.tables import Shard
 
 
 @dataclass(frozen=True)
-class SampleRequest:
-    """What to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+class Request:
+    """A run of a pipeline: where its scenes go, as source generated-<run>."""
 
     model: str  # directory of a PrITTIPipeline
     output: str
     run: str
+
+    @property
+    def source(self) -> str:
+        return f"generated-{self.run}"
+
+    def shard(self, number: int) -> Shard:
+        return Shard(self.output, self.source, "generated", number)
+
+
+@dataclass(frozen=True)
+class SampleRequest(Request):
+    """What to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+
     num_scenes: int
     labels: tuple[str, ...]
     seed: int
@@ -34,8 +48,7 @@ class SampleRequest:
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:
-        count = -(-self.num_scenes // self.shard_scenes)
-        return [Shard(self.output, f"generated-{self.run}", "generated", k) for k in range(count)]
+        return [self.shard(k) for k in range(-(-self.num_scenes // self.shard_scenes))]
 
     def indices(self, shard: Shard) -> range:
         start = shard.number * self.shard_scenes
@@ -52,18 +65,19 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
     return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def pipeline_digest(pipeline: PrITTIPipeline) -> str:
-    """Digest of all weights: a run goes on only with the model that began it."""
-    return f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"
+def claim_run(request: Request, pipeline: PrITTIPipeline, **also: object) -> None:
+    """Keep source generated-<run> of a directory for one request, and only with the model that began it.
 
-
-def claim_run(output: str, run: str, options: dict) -> None:
-    """Keep source generated-<run> of a directory for one set of options. Raises ValueError if others made it."""
-    record = storage.join(output, f"generated-{run}.json")
+    Raises ValueError if the directory holds a run of that name that was asked for otherwise.
+    """
+    digest = f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"
+    options = json.loads(json.dumps(asdict(request) | also | {"weights": digest}))
+    output = options.pop("output")
+    record = storage.join(output, f"{request.source}.json")
     if storage.exists(record) and (made := storage.read_json(record)) != options:
         name = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
         raise ValueError(
-            f"{output} holds a run {run!r} with {name}={made.get(name)}, asked for {options.get(name)}; "
+            f"{output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options.get(name)}; "
             "choose another --run or --output"
         )
     storage.write_json(options, record)
@@ -127,9 +141,7 @@ def sample_scenes(
         raise ValueError(
             f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}"
         )
-    options = {name: value for name, value in asdict(request).items() if name != "output"}
-    options |= {"labels": list(request.labels), "weights": pipeline_digest(pipeline)}
-    claim_run(request.output, request.run, options)
+    claim_run(request, pipeline)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):
             storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])

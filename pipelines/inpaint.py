@@ -13,16 +13,15 @@ from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene, merge
 from pipelines import storage
 from pipelines.encode import gpus_per_actor
-from pipelines.generate import claim_run, label_of, load_pipeline, on_model_grid, pipeline_digest
+from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
 from pipelines.metrics.reconstruction import pair_sums
 from pipelines.report import Picture, Pictures, Table, report_html
 from pipelines.scenes.mesh import scene_glb
-from pipelines.scenes.render import bev_picture
+from pipelines.scenes.render import MARK_COLOR, bev_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
 
 PICTURE_PX = 512
-BORDER_COLOR = (230, 0, 0)
 PER_ROW = 4  # pictures of a scene: as given, and its first results
 
 
@@ -58,12 +57,9 @@ class Where:
 
 
 @dataclass(frozen=True)
-class InpaintRequest:
+class InpaintRequest(Request):
     """What to make anew in scenes, `variants` times each; `label` None means each scene's own."""
 
-    model: str
-    output: str
-    run: str
     where: Where
     contents: Contents
     variants: int
@@ -71,9 +67,6 @@ class InpaintRequest:
     seed: int
     resampling: Resampling
     guidance_scale: float
-
-    def shard(self, number: int) -> Shard:
-        return Shard(self.output, f"generated-{self.run}", "generated", number)
 
 
 def drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
@@ -124,12 +117,12 @@ def inpaint_one(
         request.guidance_scale,
         composite=False,
     )
-    new = whole_cells(region, pipeline.lvae.latent_shape[-1])
-    source, made = f"generated-{request.run}", []
+    new = whole_cells(region, scene.grid, pipeline.lvae.latent_shape[-1])
+    made = []
     for k, one in enumerate(raw):
-        name = f"{source}-{request.seed}-{number:07d}-{k}"
+        name = f"{request.source}-{request.seed}-{number:07d}-{k}"
         one = composited(scene, one, new, request.contents)
-        made.append(replace(one, scene_id=name, source=source, split="generated", frame=number))
+        made.append(replace(one, scene_id=name, source=request.source, split="generated", frame=number))
     return made, [drift(scene, one, new) for one in raw]
 
 
@@ -169,9 +162,7 @@ def inpaint_scenes(
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
     request.where.region(on_model_grid(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
-    options = {name: value for name, value in asdict(request).items() if name != "output"}
-    options |= {"where": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(request.where).items()}}
-    claim_run(request.output, request.run, options | {"input": asdict(selection), "weights": pipeline_digest(pipeline)})
+    claim_run(request, pipeline, input=asdict(selection))
     graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
         Inpainter,
         fn_constructor_args=(request, chosen),
@@ -187,7 +178,7 @@ def inpaint_scenes(
     shown = []
     for number, (source, position) in enumerate(chosen[:pictures]):
         given = on_model_grid(source.scenes([position])[0], pipeline.spec)
-        new = whole_cells(request.where.region(given), pipeline.lvae.latent_shape[-1])
+        new = whole_cells(request.where.region(given), given.grid, pipeline.lvae.latent_shape[-1])
         made = request.shard(number).scenes()[: PER_ROW - 1]
         shown.append(Picture(given.scene_id, outlined(given, new), "given"))
         shown += [Picture(scene.scene_id, outlined(scene, new), "made anew") for scene in made]
@@ -216,5 +207,5 @@ def outlined(scene: Scene, region: np.ndarray) -> np.ndarray:
     border = np.zeros_like(inside)
     border[1:] |= inside[1:] != inside[:-1]
     border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
-    picture[border] = BORDER_COLOR
+    picture[border] = MARK_COLOR
     return picture

@@ -18,7 +18,7 @@ from models.scene import Scene
 from models.tensors import new_scene
 from pipelines import storage
 from pipelines.encode import gpus_per_actor
-from pipelines.generate import claim_run, label_of, load_pipeline, on_model_grid, pipeline_digest
+from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
@@ -30,12 +30,9 @@ MAX_RETRIES = 3  # of a block whose process died
 
 
 @dataclass(frozen=True)
-class OutpaintRequest:
+class OutpaintRequest(Request):
     """How to extend scenes; `label` None means each scene's own. `last`: blocks ahead, behind, left, right."""
 
-    model: str
-    output: str
-    run: str
     label: str | None
     seed: int
     overlap: float
@@ -46,15 +43,8 @@ class OutpaintRequest:
     order: str = "outward"
     batch_size: int = 4
 
-    @property
-    def source(self) -> str:
-        return f"generated-{self.run}"
-
     def scene_id(self, number: int) -> str:
         return f"{self.source}-{self.seed}-{number:07d}"
-
-    def shard(self, number: int) -> Shard:
-        return Shard(self.output, self.source, "generated", number)
 
     def blocks(self, number: int) -> str:
         """Directory of a scene's blocks, until they are put together."""
@@ -195,10 +185,8 @@ def outpaint_scenes(
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
-    options = {name: value for name, value in asdict(request).items() if name != "output"}
-    options |= {"last": list(request.last), "input": asdict(selection), "weights": pipeline_digest(pipeline)}
     lattice = request.lattice(pipeline.lvae.latent_shape[-1])
-    claim_run(request.output, request.run, options)
+    claim_run(request, pipeline, input=asdict(selection))
 
     waiting, done = [], {}
     for number in range(len(chosen)):

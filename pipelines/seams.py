@@ -14,12 +14,11 @@ from pipelines.describe import READER_CPUS, chosen_scenes
 from pipelines.evaluation_report import written
 from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, seam_ratios, seam_record
 from pipelines.report import Picture, Pictures, Table, Text, report_html
-from pipelines.scenes.render import bev_picture
+from pipelines.scenes.render import MARK_COLOR, bev_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection, evenly
 
 BLOCK_M = 64.0  # the middle of an outpainted scene
-LINE_COLOR = (230, 0, 0)
 MEANINGS = {
     "class_changes": "pixels that change their ground class across the line",
     "height_step": "step of the ground's height across the line",
@@ -136,7 +135,7 @@ def with_lines(scene: Scene, lines: Lines, size_px: int = 512) -> np.ndarray:
         turned = picture.swapaxes(0, axis)
         for seam in seams:
             at = round(seam * scale)
-            turned[at - 1 : at + 1, :tick] = turned[at - 1 : at + 1, -tick:] = LINE_COLOR
+            turned[at - 1 : at + 1, :tick] = turned[at - 1 : at + 1, -tick:] = MARK_COLOR
     return picture
 
 

@@ -99,3 +99,10 @@ def test_merge_gives_every_pixel_and_primitive_one_owner():
     assert np.array_equal(joined.occupied[:, :, :128], a.occupied[:, :, :128])
     assert np.array_equal(joined.height_m[:, :, 128:], b.height_m[:, :, 128:])
     assert len(joined) == (a.center_m[:, 1] > 0).sum() + (b.center_m[:, 1] <= 0).sum()
+
+
+def test_enlarged_cells_cover_the_grid_in_blocks():
+    grid = Grid(8.0, 3.0, 1.0, 8, 6)
+    large = grid.enlarged(np.array([[1, 2, 3], [4, 5, 6]]))
+    assert large.shape == (8, 6) and (large[:4, 2:4] == 2).all() and (large[4:, :2] == 4).all()
+    assert np.array_equal(np.unique(large, return_counts=True)[1], [8] * 6)

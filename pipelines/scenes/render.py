@@ -15,6 +15,8 @@ from pipelines.scenes.mesh import cuboid_triangles
 from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
 from pipelines.scenes.rasters import draw, hits
 
+MARK_COLOR = (230, 0, 0)  # sRGB, of lines drawn over a picture
+
 
 def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
     """The scene from above, unlit, white where there is nothing: (H, W, 3) uint8 sRGB.

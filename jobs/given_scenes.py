@@ -1,0 +1,60 @@
+"""Options shared by the jobs that make given scenes anew or larger: which scenes, with which model, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jobs.command import absolute, home
+
+if TYPE_CHECKING:
+    from models.pipeline import Resampling
+    from pipelines.selection import Selection
+
+
+@dataclass(frozen=True)
+class GivenScenes:
+    """The first scenes of a dataset directory, and RePaint's numbers (paper, Sec. 3.3 and supplement B.3)."""
+
+    model: str = ""
+    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    input: str = ""
+    """Dataset directory with the scenes (default: $PRITTI_HOME/generated)."""
+    source: str = ""
+    """Source of the scenes (default: whatever is there)."""
+    split: str = ""
+    limit: int = 1
+    """How many scenes, from the first on."""
+    label: str = ""
+    """Label to aim at (default: the scene's own)."""
+    seed: int = 0
+    steps: int = 250
+    """Denoising steps without detours."""
+    jump_length: int = 10
+    """Steps that RePaint goes back at a time."""
+    resamplings: int = 10
+    """How often it passes the same steps."""
+    guidance: float = 1.0
+    actors: int = 1
+    """Pipelines at work at once; one per GPU."""
+
+    def selection(self) -> Selection:
+        from pipelines.selection import Selection
+
+        directory = absolute(self.input) if self.input else home("generated")
+        return Selection(directory, self.source or None, self.split or None, self.limit, "first")
+
+    def resampling(self) -> Resampling:
+        from models.pipeline import Resampling
+
+        return Resampling(self.steps, self.jump_length, self.resamplings)
+
+
+def pipeline_directory(model: str) -> str:
+    """Where an option --model points. Raises ValueError if no trained pipeline is there."""
+    from pipelines import storage
+
+    directory = absolute(model) if model else home("models", "pritti-town")
+    if not storage.exists(storage.join(directory, "model_index.json")):
+        raise ValueError(f"{directory}: no PrITTI pipeline here; run jobs/train_dit.py first")
+    return directory
