@@ -47,18 +47,19 @@ class Config(GivenScenes):
 
 def inpaint(config: Config) -> dict[str, float | None]:
     """Make anew, write, and return how far raw decodes drift outside the region."""
-    from rich.progress import Progress
-
-    from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes
-
     if not (config.polygon_m or config.half_plane or config.objects):
         raise ValueError("no region: give --polygon-m, --half-plane or --objects")
     if config.variants < 1 or config.pictures < 0:
         raise ValueError(f"--variants is {config.variants}, --pictures {config.pictures}: expected 1 and 0 or more")
+    model = pipeline_directory(config.model)
+    from rich.progress import Progress
+
+    from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes
+
     selection = config.selection()
     total = sum(len(rows) for _, rows in selection.shards())
     request = InpaintRequest(
-        model=pipeline_directory(config.model),
+        model=model,
         output=config.output_directory(),
         run=config.run,
         where=Where(config.polygon_m, config.half_plane, config.objects, config.margin_m, config.outside),

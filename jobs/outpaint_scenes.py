@@ -71,17 +71,18 @@ def last_blocks(config: Config) -> tuple[int, int, int, int]:
 
 def outpaint(config: Config) -> pa.Table:
     """Extend, write, and return what is known of each block."""
+    if config.batch_size < 1:
+        raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
+    last = last_blocks(config)
+    model = pipeline_directory(config.model)
     from rich.progress import MofNCompleteColumn, Progress
 
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes
 
-    if config.batch_size < 1:
-        raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
-    last = last_blocks(config)
     selection = config.selection()
     count = sum(len(rows) for _, rows in selection.shards())
     request = OutpaintRequest(
-        model=pipeline_directory(config.model),
+        model=model,
         output=config.output_directory(),
         run=config.run,
         label=config.label or None,

@@ -46,6 +46,9 @@ class Config:
 
 def sample(config: Config) -> str:
     """Generate and return the dataset directory."""
+    if config.num_scenes < 1:
+        raise ValueError(f"--num-scenes is {config.num_scenes}, expected at least 1")
+    model = pipeline_directory(config.model)
     from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
     from models.pipeline import LABELS
@@ -55,9 +58,6 @@ def sample(config: Config) -> str:
     from pipelines.scenes.tables import read_scenes
 
     output = absolute(config.output) if config.output else home("generated")
-    if config.num_scenes < 1:
-        raise ValueError(f"--num-scenes is {config.num_scenes}, expected at least 1")
-    model = pipeline_directory(config.model)
     kind = storage.read_json(storage.join(model, "dit/config.json"))["label"]
     request = SampleRequest(
         model=model,
