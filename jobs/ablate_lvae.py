@@ -13,6 +13,7 @@ Run it again with the same options to go on: finished trials are kept. Scores al
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -242,7 +243,8 @@ def at_equal_time(config: Branches) -> bool:
 
 
 def slug(variant: str) -> str:
-    return variant.replace(",", "").replace(" ", "-")
+    """A variant's name as part of a file's or an MLflow metric's."""
+    return re.sub(r"\W+", "-", variant.replace("'", ""))
 
 
 def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps: int) -> TrainingRun:

@@ -184,13 +184,14 @@ def sample(
 def solve(
     model: Denoiser,
     solver: SchedulerMixin,
-    num_steps: int,
     noise: SceneNoise,
     label: Int[Tensor, b],
     on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
-    """Clean latents by one of diffusers' schedulers that draw no noise of their own, as DDIM and DPM-Solver++."""
-    solver.set_timesteps(num_steps, device=label.device)
+    """Clean latents by one of diffusers' schedulers that draw no noise of their own, as DDIM and DPM-Solver++.
+
+    Takes the steps that `solver.set_timesteps` has set.
+    """
     latent = noise.draw() * solver.init_noise_sigma
     for number, timestep in enumerate(solver.timesteps):
         predicted = model(solver.scale_model_input(latent, timestep), timestep.expand(len(label)), label)

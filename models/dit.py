@@ -9,6 +9,7 @@ and one mask per sample serve the whole network.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +17,8 @@ from diffusers import ConfigMixin, ModelMixin
 from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+
+from models.diffusion import Denoiser
 
 FREQUENCIES = 256
 
@@ -54,9 +57,11 @@ class Block(nn.Module):
         self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
         self.modulation = nn.Linear(width, 6 * width)
 
-    def forward(self, x: Float[Tensor, "batch n d"], condition: Float[Tensor, "batch d"]) -> Float[Tensor, "batch n d"]:
-        """`condition` has passed its SiLU."""
-        shift1, scale1, gate1, shift2, scale2, gate2 = self.modulation(condition).chunk(6, dim=1)
+    def forward(
+        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6d"]
+    ) -> Float[Tensor, "batch n d"]:
+        """`modulation` is what the layer of that name makes of the condition."""
+        shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
         width = x.shape[-1:]
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
         q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # (b, heads, n, dh) each
@@ -110,9 +115,13 @@ class DiT(ModelMixin, ConfigMixin):
         nn.init.zeros_(self.patch_in.bias)
         for layer in (self.label_embedding, self.timestep_mlp[0], self.timestep_mlp[2]):
             nn.init.normal_(layer.weight, std=0.02)
-        for layer in (*(block.modulation for block in self.blocks), self.modulation, self.patch_out):
+        for layer in (*self.modulating(), self.patch_out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
+
+    def modulating(self) -> list[nn.Linear]:
+        """The layers that the condition goes through: one per block, and the output's."""
+        return [*(block.modulation for block in self.blocks), self.modulation]
 
     @property
     def null_label(self) -> int:
@@ -123,16 +132,46 @@ class DiT(ModelMixin, ConfigMixin):
         frequencies = timestep_frequencies(timestep).to(self.patch_out.weight.dtype)
         return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
 
+    def modulations(self, timestep: Int[Tensor, batch], label: Int[Tensor, batch]) -> list[Tensor]:
+        """Shifts, scales and gates of every block (b, 6 d), and shift and scale of the output (b, 2 d)."""
+        condition = self.condition(timestep, label)
+        return [layer(condition) for layer in self.modulating()]
+
     def forward(
         self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, batch], label: Int[Tensor, batch]
     ) -> Float[Tensor, "batch c h w"]:
         """The noise in `latent`."""
+        return self.modulated(latent, self.modulations(timestep, label))
+
+    @torch.no_grad()
+    def prepared(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
+        """`forward` for these timesteps and labels alone: what depends on nothing else is computed once, not in every step.
+
+        The modulations are a third of the weights, which each step would read for a row or two. IndexError for others.
+        """
+        timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
+        labels = sorted(set(labels))
+        # Label by label: what one's rows round to must not depend on which others there are.
+        rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
+        table, sizes = torch.cat(rows), [layer.out_features for layer in self.modulating()]
+        row_of = torch.full((int(timestep[-1]) + 1, labels[-1] + 1), len(table), device=timestep.device)
+        for k, label in enumerate(labels):
+            row_of[timestep, label] = torch.arange(len(timestep), device=timestep.device) + k * len(timestep)
+
+        def denoise(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
+            return self.modulated(latent, table[row_of[timestep, label]].split(sizes, dim=1))
+
+        return denoise
+
+    def modulated(
+        self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor]
+    ) -> Float[Tensor, "batch c h w"]:
+        """`forward` from modulations that are computed already."""
         patch, tokens = self.config.patch, self.config.size // self.config.patch
-        condition = self.condition(timestep, label)
         x = self.patch_in(latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
-        for block in self.blocks:
-            x = block(x, condition)
-        shift, scale = self.modulation(condition).chunk(2, dim=1)
+        for block, modulation in zip(self.blocks, modulations, strict=False):
+            x = block(x, modulation)
+        shift, scale = modulations[-1].chunk(2, dim=1)
         x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c)
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c)
         return x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)

@@ -16,6 +16,7 @@ from models.diffusion import (
     GENERATE,
     INPAINT,
     OUTPAINT,
+    Denoiser,
     Diffusion,
     Known,
     OnStep,
@@ -165,6 +166,12 @@ class PrITTIPipeline(DiffusionPipeline):
     def label_tensor(self, labels: Sequence[str]) -> Tensor:
         return torch.tensor([label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
+    def _denoiser(self, timesteps: np.ndarray | Tensor, label: Tensor, guidance_scale: float) -> Denoiser:
+        """The DiT, guided, with all that does not depend on the latent computed."""
+        null = self.dit.null_label
+        labels = label.tolist() if guidance_scale == 1.0 else [*label.tolist(), null]
+        return guided(self.dit.prepared(timesteps.tolist(), labels), null, guidance_scale)
+
     def use_sampler(self, name: str) -> None:
         """Sample with "ddpm" (the paper's), "ddim" or "dpm++" from now on; any other of diffusers' may be set as `scheduler`."""
         if name not in SAMPLERS:
@@ -194,11 +201,16 @@ class PrITTIPipeline(DiffusionPipeline):
     ) -> Float[Tensor, "b c h w"]:
         """Latents of scenes `indices`; each depends on (seed, its index, its label) only."""
         noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device)
-        model, label = guided(self.dit, self.dit.null_label, guidance_scale), self.label_tensor(labels)
+        label = self.label_tensor(labels)
         with self._watched(num_inference_steps, callback_on_step_end) as on_step:
             if isinstance(self.scheduler, DDPMScheduler):
-                return sample(model, Walk(self.diffusion, num_inference_steps), noise, label, on_step=on_step)
-            return solve(model, self.scheduler, num_inference_steps, noise, label, on_step)
+                walk = Walk(self.diffusion, num_inference_steps)
+                return sample(
+                    self._denoiser(walk.timesteps, label, guidance_scale), walk, noise, label, on_step=on_step
+                )
+            self.scheduler.set_timesteps(num_inference_steps, device=self.device)
+            model = self._denoiser(self.scheduler.timesteps, label, guidance_scale)
+            return solve(model, self.scheduler, noise, label, on_step)
 
     def generate(
         self,
@@ -239,10 +251,11 @@ class PrITTIPipeline(DiffusionPipeline):
         walk = Walk(self.diffusion, resampling.num_steps)
         transitions = repaint_transitions(resampling.num_steps, resampling.jump_length, resampling.resamplings)
         noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device, purpose)
-        model = guided(self.dit, self.dit.null_label, guidance_scale)
+        label = self.label_tensor(labels)
+        model = self._denoiser(walk.timesteps, label, guidance_scale)
         evaluations = sum(to < state for state, to in transitions)
         with self._watched(evaluations, callback_on_step_end) as on_step:
-            return sample(model, walk, noise, self.label_tensor(labels), transitions, known, on_step)
+            return sample(model, walk, noise, label, transitions, known, on_step)
 
     def inpaint(
         self,

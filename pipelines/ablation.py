@@ -336,8 +336,10 @@ def variant_table(rows: Sequence[dict]) -> Table:
         cell: list = [row["variant"], f"{row['parameters']:,}", round(row["gflops"], 2), row["seeds"], row["steps"]]
         cell.append(round(row["training_seconds"] / 60, 1))
         for name in names:
-            mean, low, high = (row[f"{name}_{way}"] for way in ("mean", "min", "max"))
-            cell.append(None if mean is None else f"{100 * mean:.2f} ({100 * low:.2f} to {100 * high:.2f})")
+            values = [row[f"{name}_{way}"] for way in ("mean", "min", "max")]
+            digits = ".2g" if name == "height_mse_normalised" else ".2f"
+            known = None not in values
+            cell.append("{} ({} to {})".format(*(format(100 * v, digits) for v in values)) if known else None)
         cells.append(cell)
     note = (
         "Mean (lowest to highest) over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."

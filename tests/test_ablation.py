@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -325,6 +326,13 @@ def test_the_ground_study_goes_from_the_papers_networks_down_with_equal_latents(
     assert GROUND["the paper's networks"].architecture["channels"] == paper.channels
     assert min(sizes, key=sizes.get) in ("half as wide", "an eighth of the paper's widths")
     assert max(sizes, key=sizes.get) == "the paper's networks"
+
+
+def test_variants_have_names_that_files_and_mlflow_take():
+    from jobs.ablate_lvae import slug
+
+    names = [slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
+    assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 12
 
 
 def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatch, capsys):

@@ -352,6 +352,11 @@ def test_dit_is_conditioned_and_starts_at_zero():
     assert not torch.allclose(base, dit(latent, time.flip(0), label))
     with pytest.raises(ValueError, match="must be whole"):
         DiT(size=9)
+    prepared = dit.prepared([999, 500, 0, 4], [3, 1, 0, 1])
+    assert torch.allclose(prepared(latent, time, label), base, atol=1e-4)
+    for other in ((torch.tensor([0, 5, 999]), label), (time, torch.tensor([0, 2, 3])), (time + 1, label)):
+        with pytest.raises(IndexError):
+            prepared(latent, *other)
 
 
 def test_dit_patches_are_put_back_where_they_came_from():

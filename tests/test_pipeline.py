@@ -65,7 +65,9 @@ def test_samplers_draw_from_a_gaussian_whose_noise_is_known(name, steps, off):
     if name == "ddpm":
         drawn = sample(model, Walk(Diffusion(), steps), noise, label)
     else:
-        drawn = solve(model, sampler_of(name), steps, noise, label)
+        solver = sampler_of(name)
+        solver.set_timesteps(steps)
+        drawn = solve(model, solver, noise, label)
     assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < off
 
 
