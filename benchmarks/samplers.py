@@ -1,0 +1,57 @@
+"""How far samplers of few steps are off, on data whose best prediction of the noise is known: Gaussian ones.
+
+python benchmarks/samplers.py
+
+Without noise on the way a sampler is linear there: what it makes of the starting noise, over the deviation of the data,
+is 1 if it is right. Float64; the same on every machine.
+"""
+
+from __future__ import annotations
+
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
+
+from models.diffusion import Diffusion, solve
+from models.pipeline import SAMPLERS, scheduler
+
+DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of these
+STEPS = (10, 20, 25, 50)
+
+
+def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
+    """Deviation of what is drawn over that of the data."""
+    alpha_bar = Diffusion().alpha_bar
+
+    def model(latent: torch.Tensor, timestep: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+        a = np.interp(float(timestep[0]), np.arange(len(alpha_bar)), alpha_bar)
+        return (1 - a) ** 0.5 * latent / (a * deviation**2 + 1 - a)
+
+    solver.set_timesteps(steps)
+    one = SimpleNamespace(draw=lambda: torch.ones((1, 1, 1, 1), dtype=torch.float64))
+    drawn = solve(model, solver, one, torch.zeros(1, dtype=torch.long))
+    return drawn.item() / deviation
+
+
+def main() -> None:
+    warnings.filterwarnings("ignore", module="diffusers")
+    base = scheduler().config
+    ways = {name: kind.from_config(base, **options) for name, (kind, options) in SAMPLERS.items() if name != "ddpm"}
+    ways |= {f"DDIM, {way}": DDIMScheduler.from_config(base, timestep_spacing=way) for way in ("trailing", "linspace")}
+    dpm = DPMSolverMultistepScheduler
+    ways |= {
+        "DPM-Solver++, even in time (trailing)": dpm.from_config(base, timestep_spacing="trailing"),
+        "DPM-Solver++, Karras": dpm.from_config(base, use_karras_sigmas=True),
+        "DPM-Solver++ of third order, as dpm++": dpm.from_config(base, use_lu_lambdas=True, solver_order=3),
+    }
+    print(f"{'steps':>5}  {'deviation of the data':40}", *(f"{deviation:6}" for deviation in DEVIATIONS))
+    for steps in STEPS:
+        for name, solver in ways.items():
+            print(f"{steps:5}  {name:40}", *(f"{kept(solver, steps, deviation):6.2f}" for deviation in DEVIATIONS))
+
+
+if __name__ == "__main__":
+    main()
