@@ -101,7 +101,7 @@ def label_of(scene: Scene, kind: str) -> str:
 
 
 class Sampler:
-    """Actor. Row in: number of a shard. Row out: its size and time. Generates and writes the shard's scenes."""
+    """Actor. Row in: number of a shard. Row out: that, its size and time. Generates and writes the shard's scenes."""
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
         self.request, self.batch_size = request, batch_size
@@ -125,7 +125,7 @@ class Sampler:
                     run=request.run,
                 )
             shard.write(scenes)
-        return {"scenes": len(indices), "seconds": time.perf_counter() - started}
+        return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
 
 
 def sample_scenes(

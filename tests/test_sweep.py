@@ -1,8 +1,17 @@
-"""References of growing size: which there are, and that more of them are what the paper's figure needs."""
+"""Sweeps: references of growing size, and samplers of few and many steps."""
 
 import numpy as np
 import pytest
 
+from pipelines.metrics.intervals import Estimate
+from pipelines.sampler_sweep import (
+    as_good_as,
+    reference_row,
+    sampler_charts,
+    sampler_html,
+    sampler_row,
+    sampler_table,
+)
 from pipelines.selection import apart, farthest
 from pipelines.sweep import references, sweep, sweep_charts, sweep_html
 
@@ -34,3 +43,30 @@ def test_a_row_per_reference_and_k(cluster):
 def test_no_reference_that_fits_is_an_error():
     with pytest.raises(ValueError, match="no reference fits 5 real and 4 generated"):
         sweep(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(4), [], (3,))
+
+
+# -------------------------------------------------------------------------------------------------------- samplers
+
+
+def row_of(sampler: str, steps: int, frechet: Estimate) -> dict:
+    validity = {name: {"generated": Estimate(0.5, 0.4, 0.6)} for name in ("road_connectivity", "overlapping")}
+    scores = {
+        "layout_frechet": frechet,
+        "random_frechet": frechet,
+        "validity": validity | {"sunken": {"generated": None}},
+    }
+    scores |= {f"random_{name}_k3": Estimate(0.3, 0.2, 0.4) for name in ("precision", "recall")}
+    return sampler_row(sampler, steps, 12.0, 6, scores)
+
+
+def test_few_steps_are_held_against_the_papers_sampler_with_most():
+    paper = row_of("ddpm", 250, Estimate(2.0, 1.5, 2.5))
+    near, far = row_of("dpm++", 20, Estimate(2.8, 2.4, 3.2)), row_of("ddpm", 10, Estimate(9.0, 8.0, 10.0))
+    rows = [far, paper, near]
+    assert near["seconds_per_scene"] == 2 and near["layout_frechet_high"] == 3.2 and near["sunken"] is None
+    assert reference_row(rows) is paper and reference_row([near, row_of("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
+    assert as_good_as(near, paper) and not as_good_as(far, paper)
+    assert [row[-1] for row in sampler_table(rows).rows] == ["no", "–", "yes"]
+    (layout, *_), page = sampler_charts(rows), sampler_html(rows, [], 1, ["how"])
+    assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
+    assert page.count("<svg") == 4 and "as ddpm of 250" in page

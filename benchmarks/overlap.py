@@ -1,0 +1,94 @@
+"""What a block knows of a neighbour 32 m back: the shifted latent (`copy`, the paper) against encoding anew (`reencode`).
+
+python benchmarks/overlap.py --lvae DIRECTORY
+
+Real pairs: both blocks are cut from the same town, 32 m apart along the street. The second one's known half comes from the
+first, its new half is the truth's; then it is decoded, and its known half compared with the truth. "own latent" is the
+ceiling: the second block encoded as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import tyro
+from common import where
+
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.outpaint import Block, Lattice, World, height_near
+from models.scene import Grid, Scene
+from models.tensors import layout_batch, new_scene, scene_from_layout
+from pipelines.encode import load_lvae
+from pipelines.generate import on_model_grid
+from pipelines.inpaint import drift, drift_scores
+from pipelines.sources.town import town_drive
+
+STEP_M = 32.0
+
+
+@dataclass(frozen=True)
+class Config:
+    lvae: str
+    """Directory of a trained layout VAE of the town."""
+    seeds: tuple[int, ...] = tuple(range(10_000, 10_016))
+    """Towns; none that training has seen."""
+    pairs: int = 4
+    """Of each town."""
+
+
+def pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
+    """Scenes of a town and those 32 m ahead of each, in a frame of their own with the same heading and height."""
+    drive, grid = town_drive(seed), Grid()
+    large = replace(grid, front_m=grid.front_m + STEP_M, rows=grid.rows + round(STEP_M / grid.resolution_m))
+    found = []
+    for pose in np.linspace(0, len(drive) - 1, count).astype(int):
+        scene = drive.scene(pose, "test", large)
+        ahead = scene.cropped(replace(grid, front_m=large.front_m)).moved(-STEP_M, 0)
+        found.append(tuple(on_model_grid(part, spec) for part in (scene.cropped(grid), ahead)))
+    return found
+
+
+@torch.inference_mode()
+def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str, float]]:
+    """Drift of the second block's known half, by way."""
+    spec = lvae.spec
+
+    def encode(scenes: Sequence[Scene]) -> torch.Tensor:
+        return lvae.encode(layout_batch(list(scenes), spec)).mean
+
+    def decoded(latent: torch.Tensor) -> Scene:
+        return scene_from_layout(lvae.decode(latent[None]).layouts()[0], spec, empty)
+
+    empty = new_scene(second.scene_id, second.source, second.sequence, second.frame, spec)
+    lattice = Lattice.of(lvae.latent_shape[-1], STEP_M / 64.0)
+    world = World(lattice, spec, encode, height_near(first, 0.0, 0.0))
+    made, found = {(0, 0): Block(first, encode([first])[0])}, {}
+    for mode in ("copy", "reencode"):
+        task = world.task((1, 0), made, empty, mode)
+        truth = second.moved(0, 0, -task.datum_m)
+        latent = torch.where(task.unknown.bool(), encode([truth])[0], task.latent)
+        found[mode] = drift(truth, decoded(latent), task.new_pixels)
+        if mode == "reencode":
+            found["own latent"] = drift(truth, decoded(encode([truth])[0]), task.new_pixels)
+    return found
+
+
+def main(config: Config) -> None:
+    lvae = load_lvae(config.lvae)
+    print(where())
+    sums: dict[str, list] = {}
+    for seed in config.seeds:
+        for first, second in pairs(seed, config.pairs, lvae.spec):
+            for way, found in compare(lvae, first, second).items():
+                sums.setdefault(way, []).append(found)
+    print(f"{len(sums['copy'])} pairs of {len(config.seeds)} towns, known half of the second block")
+    for way, found in sums.items():
+        print(f"{way}:", ", ".join(f"{name} {value:.4g}" for name, value in drift_scores(found).items()))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))

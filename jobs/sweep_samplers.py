@@ -1,0 +1,138 @@
+#!/usr/bin/env python3
+"""How many steps are enough? Scenes by every sampler with few and many steps, all scored against the same real ones.
+
+    jobs/sweep_samplers.py                                             256 town scenes each, 10 to 250 steps
+    jobs/sweep_samplers.py --samplers ddpm dpm++ --steps 10 250 --num-scenes 64
+
+Writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and samplers.html.
+Run it again with the same options to go on after an interruption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jobs.command import absolute, home, run, start_ray
+from jobs.given_scenes import pipeline_directory
+
+
+@dataclass(frozen=True)
+class Config:
+    model: str = ""
+    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    real: str = ""
+    """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
+    real_split: str = "test"
+    samplers: tuple[str, ...] = ("ddpm", "ddim", "dpm++")
+    steps: tuple[int, ...] = (10, 20, 50, 100, 250)
+    num_scenes: int = 256
+    """Of each sampler and number of steps; as many real ones."""
+    seed: int = 0
+    guidance: float = 1.0
+    batch_size: int = 8
+    pictures: int = 4
+    """So many scenes of each on the page."""
+    output: str = ""
+    """Where everything goes (default: $PRITTI_HOME/evaluations/samplers)."""
+    actors: int = 1
+    """Pipelines at work at once; one per GPU."""
+
+
+def sweep_samplers(config: Config) -> list[dict]:
+    """Generate, score, write and return a row per sampler and number of steps."""
+    model = pipeline_directory(config.model)
+    if config.num_scenes < 5 or config.pictures < 0:
+        raise ValueError(f"--num-scenes is {config.num_scenes}, --pictures {config.pictures}: expected 5 and 0 or more")
+    import pyarrow as pa
+    from rich.progress import Progress
+
+    from models.pipeline import LABELS, SAMPLERS
+    from pipelines import storage
+    from pipelines.chart import standalone_svg
+    from pipelines.dataset import Dataset
+    from pipelines.describe import Looks, describe
+    from pipelines.evaluate import compare
+    from pipelines.generate import SampleRequest, sample_scenes
+    from pipelines.report import Picture
+    from pipelines.sampler_sweep import sampler_charts, sampler_html, sampler_row
+    from pipelines.scenes.render import bev_picture
+    from pipelines.scenes.tables import read_scenes
+    from pipelines.selection import Selection
+
+    if unknown := set(config.samplers) - set(SAMPLERS):
+        raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
+    if not config.samplers or not config.steps or min(config.steps) < 1:
+        raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
+    dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
+    output = absolute(config.output) if config.output else home("evaluations", "samplers")
+    real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
+    count = sum(len(rows) for _, rows in real.shards())
+    labels = LABELS[storage.read_json(storage.join(model, "dit/config.json"))["label"]]
+    settings = [(sampler, steps) for sampler in config.samplers for steps in config.steps]
+    rows, pictures = [], []
+    start_ray()
+    with Progress() as bar:
+        done = bar.add_task("describe real", total=count)
+        described = storage.join(output, "described")
+        truth = describe(
+            real, dataset, Looks(), f"{described}/real", config.actors, lambda n, task=done: bar.advance(task, n)
+        )
+        for sampler, steps in settings:
+            name = f"{sampler}-{steps}"
+            request = SampleRequest(
+                model=model,
+                output=output,
+                run=name,
+                num_scenes=config.num_scenes,
+                labels=labels,
+                seed=config.seed,
+                num_inference_steps=steps,
+                guidance_scale=config.guidance,
+                sampler=sampler,
+                shard_scenes=max(1, config.num_scenes // (4 * config.actors)),
+            )
+            done = bar.add_task(name, total=config.num_scenes)
+            record = storage.join(output, "times", f"{name}.json")
+            times = storage.read_json(record) if storage.exists(record) else {}
+
+            def advance(row: dict, task=done, times=times, record=record) -> None:
+                bar.advance(task, row["scenes"])
+                times.setdefault(str(row["id"]), row["seconds"])  # of when the shard was made
+                storage.write_json(times, record)
+
+            sample_scenes(request, config.actors, config.batch_size, advance)
+            chosen = Selection(output, request.source, None, count, "spread")
+            made = describe(chosen, dataset, Looks(), f"{described}/{name}", config.actors)
+            scores = compare(truth, made, dataset.spec.ground_classes)
+            rows.append(sampler_row(sampler, steps, sum(times.values()), config.num_scenes, scores))
+            scenes = read_scenes(output, request.source, limit=config.pictures) if config.pictures else ()
+            pictures += [Picture(f"{name}, {scene.frame}", bev_picture(scene, supersample=2)) for scene in scenes]
+    storage.write_json(rows, storage.join(output, "samplers.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
+    how = [
+        f"Real: {count} scenes of {dataset.root}, split {config.real_split}, evenly spread. Model: {model}.",
+        f"Seed {config.seed}, guidance scale {config.guidance:g}, labels in turn: {', '.join(labels)}.",
+    ]
+    texts = {"samplers.html": sampler_html(rows, pictures, max(1, config.pictures), how)}
+    for chart in sampler_charts(rows):
+        texts[f"samplers-{chart.title.split()[0].lower()}.svg"] = standalone_svg(chart)
+    for name, text in texts.items():
+        storage.write_whole(storage.join(output, name), lambda stream, text=text: stream.write(text.encode()))
+    return rows
+
+
+def main(config: Config) -> None:
+    from rich.console import Console
+    from rich.table import Table as Lines
+
+    from pipelines.sampler_sweep import sampler_table
+
+    table = sampler_table(sweep_samplers(config))
+    lines = Lines(*table.columns)
+    for row in table.rows:
+        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
+    Console().print(lines)
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)
