@@ -187,6 +187,29 @@ def test_sampling_goes_on_where_it_stopped(home, samples):
         sample(replace(config, run="x", labels=("dense",)))
 
 
+def test_samplers_are_scored_side_by_side_and_go_on(home, tmp_path):
+    from jobs.sweep_samplers import Config, sweep_samplers
+
+    config = Config(
+        model=str(home / "models/pritti-smoke"),
+        real=str(home / "datasets/smoke"),
+        samplers=("dpm++",),
+        steps=(2, 4),
+        num_scenes=6,
+        pictures=2,
+        output=str(tmp_path),
+    )
+    rows = sweep_samplers(config)
+    assert [(row["sampler"], row["steps"], row["scenes"]) for row in rows] == [("dpm++", 2, 6), ("dpm++", 4, 6)]
+    assert all(row["layout_frechet_low"] <= row["layout_frechet"] and row["seconds_per_scene"] > 0 for row in rows)
+    assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
+    assert (tmp_path / "samplers.html").read_text().count("<img") == 4
+    found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
+    assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
+    with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
+        sweep_samplers(replace(config, samplers=("euler",)))
+
+
 def test_the_glb_has_a_named_node_per_primitive(samples):
     scene = next(read_scenes(str(samples)))
     path = samples / "glb/samples" / f"{scene.scene_id}.glb"
