@@ -16,6 +16,8 @@ demo: .venv/ready
 
 test: export RAY_DATA_USE_DATASOURCE_V2 = 0
 test: export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2
+test: export RAY_worker_niceness = 0
+test: export OMP_NUM_THREADS = 1
 test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile

@@ -24,25 +24,33 @@ def absolute(path: str) -> str:
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
+# What Ray reads when it starts, unless the user has set it.
+RAY_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
+    "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
+    "RAY_TRAIN_ENABLE_PREEMPTION_WATCHER": "0",
+    # Few CPUs mean few idle processes: a reader would be killed after every read and start again, 10 s of imports each.
+    "RAY_idle_worker_killing_time_threshold_ms": "300000",
+    "OMP_WAIT_POLICY": "PASSIVE",  # spinning threads slow torch fivefold beside a busy process
+    # glibc hands every large tensor back to the kernel and faults it in again: a tenth to a fifth of a step on the CPU.
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": "-1",
+}
+
+
 def start_ray() -> None:
     """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    os.environ.setdefault("RAY_TRAIN_ENABLE_PRINT_PATCH", "0")
-    os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
-    os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
-    # Few CPUs mean few idle processes: a reader would be killed after every read and start again, 10 s of imports each.
-    os.environ.setdefault("RAY_idle_worker_killing_time_threshold_ms", "300000")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads slow torch fivefold beside a busy process
-    # glibc hands every large tensor back to the kernel and faults it in again: a tenth to a fifth of a step on the CPU.
-    os.environ.setdefault("MALLOC_MMAP_MAX_", "0")
-    os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", "-1")
+    for name, value in RAY_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     import ray
     import ray.data
 
     if ray.is_initialized():
         return
-    ray.init(logging_level=logging.WARNING, log_to_driver=True)
+    # A Ray of this command's own ends with it: nobody would open its dashboard. A cluster keeps its own.
+    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=False)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False

@@ -127,12 +127,21 @@ def _chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
     center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n): B's centre along A's axes
 
+    # A face of either box that has the other box behind it: most pairs whose bounds overlap are done here.
+    reach = np.abs(axes)
+    near_a = np.abs(center_b) < half_a + np.einsum("ijn,jn->in", reach, half_b)
+    near_b = np.abs(offset) < half_b + np.einsum("ijn,in->jn", reach, half_a)
+    near = np.flatnonzero((near_a & near_b).all(axis=0))
+    volume = np.zeros(len(a.center_m))
+    axes, offset, center_b, half_a, half_b = (part[..., near] for part in (axes, offset, center_b, half_a, half_b))
+
     # (3, 2, n) distances of the planes of both boxes from A's centre; index 0 is the face on the negative side.
     distance_a = np.stack([half_a, half_a], axis=1)
     distance_b = np.stack([half_b - offset, half_b + offset], axis=1)
     edges = _own_edges(half_a, half_b, axes, offset, distance_a)
     edges += _own_edges(half_b, half_a, np.swapaxes(axes, 0, 1), -center_b, distance_b)
-    return np.maximum(edges / 3 + _crossing_edges(half_a, half_b, axes, offset, distance_b) / 6, 0)
+    volume[near] = np.maximum(edges / 3 + _crossing_edges(half_a, half_b, axes, offset, distance_b) / 6, 0)
+    return volume
 
 
 def _own_edges(

@@ -5,18 +5,18 @@ from pathlib import Path
 
 import pytest
 
-AT_HOME = {f"tests/test_{name}.py" for name in ("evaluate_job", "jobs", "voxel_import")}
+WITH_SMOKE = {f"tests/test_{name}.py" for name in ("evaluate_job", "generation_jobs", "voxel_import")}
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """Under `-n 2` a module stays in one process, and so do all modules that use `home`."""
+    """Under `-n 2` a module stays in one process, and so do all modules that use `smoke`."""
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             module = super()._split_scope(nodeid)
-            return "home" if module in AT_HOME else module
+            return "smoke" if module in WITH_SMOKE else module
 
     return Scheduling(config, log)
 
@@ -34,17 +34,17 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
     """One small local Ray for all tests that need it, and a $PRITTI_HOME that is nobody's."""
+    from jobs.command import RAY_ENVIRONMENT
+
     settings = {
         "PRITTI_HOME": str(tmp_path_factory.mktemp("nobody")),
         "RAY_AUTH_MODE": "disabled",
-        "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
-        "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
+        "RAY_worker_niceness": "0",  # workers must not starve beside the tests of another process
         "DO_NOT_TRACK": "true",
-        "OMP_WAIT_POLICY": "PASSIVE",
     }
-    os.environ.update(settings)
+    os.environ.update(RAY_ENVIRONMENT | settings)
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     import logging
 
@@ -53,7 +53,14 @@ def cluster(tmp_path_factory):
 
     logging.getLogger("ray").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    ray.init(address="local", num_cpus=2, object_store_memory=300 * 2**20, logging_level="WARNING", log_to_driver=False)
+    ray.init(
+        address="local",
+        num_cpus=2,
+        object_store_memory=300 * 2**20,
+        logging_level="WARNING",
+        log_to_driver=False,
+        include_dashboard=False,
+    )
     yield
     ray.shutdown()
 
@@ -66,4 +73,28 @@ def home(tmp_path_factory, cluster) -> Path:
     from jobs.train_dit import Config, train
 
     train(Config(preset="smoke"))
+    return path
+
+
+@pytest.fixture(scope="session")
+def smoke(tmp_path_factory, cluster) -> Path:
+    """A $PRITTI_HOME for what comes after training: as `home`, but trained in this process, without Ray Train."""
+    path = tmp_path_factory.mktemp("smoke")
+    os.environ["PRITTI_HOME"] = str(path)
+    import jobs.ray_training
+    from jobs.ray_training import as_tensors
+    from jobs.train_dit import Config, train
+    from pipelines.feed import batches
+
+    def fit_here(run, num_workers: int, output: str) -> str:
+        trainer = run.build("cpu", lambda model: model)
+        for batch in batches(run.stream, run.reader, 0, run.settings.steps):
+            trainer.step(as_tensors(batch), range(run.stream.batch_size))
+        trainer.averaged().save_pretrained(output)
+        run.tracker.finish("FINISHED")
+        return output
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(jobs.ray_training, "fit", fit_here)
+        train(Config(preset="smoke"))
     return path

@@ -29,9 +29,9 @@ def weights(tmp_path_factory) -> str:
     return str(path)
 
 
-def test_tables_and_their_pictures_score_the_same(home, weights, tmp_path):
+def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
     """Real training scenes against real test scenes: once as tables, once as ADM's .npz of their pictures."""
-    data = str(home / "datasets/smoke")
+    data = str(smoke / "datasets/smoke")
     test = chosen_scenes(Selection(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([bev_picture(scene)]) for scene in test), SAMPLES)
     options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3)}
@@ -54,17 +54,19 @@ def test_tables_and_their_pictures_score_the_same(home, weights, tmp_path):
         assert "no score of theirs compares with published ones" in page and page.count("<img") > 10
 
 
-def test_pictures_of_another_size_are_refused(home, tmp_path):
+def test_pictures_of_another_size_are_refused(smoke, tmp_path):
     write_npz(str(tmp_path / "small.npz"), [np.zeros((4, 64, 64, 3), np.uint8)], 4)
     with pytest.raises(ValueError, match=r"real pictures are \[256, 256\] pixels, generated ones \[64, 64\]"):
-        evaluate(Config(real=str(home / "datasets/smoke"), generated=str(tmp_path / "small.npz"), output=str(tmp_path)))
+        evaluate(
+            Config(real=str(smoke / "datasets/smoke"), generated=str(tmp_path / "small.npz"), output=str(tmp_path))
+        )
 
 
-def test_a_killed_worker_changes_nothing(home, tmp_path):
+def test_a_killed_worker_changes_nothing(smoke, tmp_path):
     """Its process is killed as soon as the first part is written."""
     from test_faults import psutil
 
-    dataset = Dataset.open(str(home / "datasets/smoke"))
+    dataset = Dataset.open(str(smoke / "datasets/smoke"))
     chosen = Selection(dataset.root, "town", "train")
     whole = describe(chosen, dataset, Looks(), str(tmp_path / "whole"))
     killed = []
@@ -116,7 +118,7 @@ def test_degenerate_features_get_the_right_number_or_a_clear_error(cluster):
         ({"generated": "nowhere.npz"}, "nowhere.npz: no such file"),
     ],
 )
-def test_wrong_options_are_named(home, tmp_path, options, message):
-    data = str(home / "datasets/smoke")
+def test_wrong_options_are_named(smoke, tmp_path, options, message):
+    data = str(smoke / "datasets/smoke")
     with pytest.raises(ValueError, match=message):
         evaluate(Config(**({"real": data, "generated": data, "output": str(tmp_path)} | options)))

@@ -172,16 +172,16 @@ def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_s
         import_scenes(config)
 
 
-def test_imported_scenes_are_scored_like_any_other(home, tmp_path):
+def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
     from jobs.evaluate_scenes import evaluate
     from jobs.import_scenes import Config, import_scenes
 
-    scenes = list(read_scenes(str(home / "datasets/smoke"), split="test"))
+    scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(scene_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
-    real = str(home / "datasets/smoke")
+    real = str(smoke / "datasets/smoke")
     scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores")))
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
