@@ -81,13 +81,15 @@ def smoke(tmp_path_factory, cluster) -> Path:
     """A $PRITTI_HOME for what comes after training: as `home`, but trained in this process, without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
+    import torch
+
     import jobs.ray_training
     from jobs.ray_training import as_tensors
     from jobs.train_dit import Config, train
     from pipelines.feed import batches
 
     def fit_here(run, num_workers: int, output: str) -> str:
-        trainer = run.build("cpu", lambda model: model)
+        trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(as_tensors(batch), range(run.stream.batch_size))
         trainer.averaged().save_pretrained(output)
