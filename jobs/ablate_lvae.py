@@ -13,6 +13,7 @@ Run it again with the same options to go on: finished trials are kept. Scores al
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, print_table, run, start_ray
 
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
@@ -361,27 +362,13 @@ def write_tables(
 
     storage.write_json({"machine": machine(), "rows": rows}, storage.join(output, f"{name}.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, f"{name}.parquet"))
-    files = {"txt": "\n".join(as_text(table) for table in tables)}
-    files |= {"svg": standalone_svg(figure)} if figure else {}
-    for kind, text in files.items():
+    text = io.StringIO()
+    for table in tables:
+        print_table(table, text)
+    files = {"txt": text.getvalue()} | ({"svg": standalone_svg(figure)} if figure else {})
+    for kind, content in files.items():
         path = storage.join(output, f"{name}.{kind}")
-        storage.write_whole(path, lambda stream, text=text: stream.write(text.encode()))
-
-
-def as_text(table: Table) -> str:
-    """A report's table as lines of text."""
-    import io
-
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table as Lines
-
-    lines = Lines(*table.columns, title=table.title, caption=table.note, box=box.SIMPLE)
-    for row in table.rows:
-        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
-    console = Console(file=io.StringIO(), width=200)
-    console.print(lines)
-    return console.file.getvalue()
+        storage.write_whole(path, lambda stream, content=content: stream.write(content.encode()))
 
 
 def publish(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -> None:
@@ -393,7 +380,7 @@ def publish(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -
     tracker.client.log_text(tracker.run_id, html, "report.html")
     tracker.finish("FINISHED")
     for table in tables:
-        print(as_text(table))
+        print_table(table)
 
 
 def machine() -> str:

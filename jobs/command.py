@@ -9,7 +9,10 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipelines.report import Table
 
 
 def home(*parts: str) -> str:
@@ -73,6 +76,18 @@ def root_cause(error: BaseException) -> BaseException:
             return error
         error = inner or error.__cause__ or error
     return error
+
+
+def print_table(table: Table, file: IO[str] | None = None) -> None:
+    """A report's table on the terminal; into a file, wide lines."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as Lines
+
+    lines = Lines(*table.columns, title=table.title, caption=table.note, box=box.SIMPLE)
+    for row in table.rows:
+        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
+    Console(file=file, width=None if file is None and sys.stdout.isatty() else 200).print(lines)
 
 
 def run(main: Callable[[Any], None], config: Any, **tyro_options: Any) -> None:

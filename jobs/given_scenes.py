@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GivenScenes:
-    """The first scenes of a dataset directory, and RePaint's numbers (paper, Sec. 3.3 and supplement B.3)."""
+    """The first scenes of a dataset directory, and what to do with them."""
 
     model: str = ""
     """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
@@ -28,12 +28,6 @@ class GivenScenes:
     label: str = ""
     """Label to aim at (default: the scene's own)."""
     seed: int = 0
-    steps: int = 250
-    """Denoising steps without detours."""
-    jump_length: int = 10
-    """Steps that RePaint goes back at a time."""
-    resamplings: int = 10
-    """How often it passes the same steps."""
     guidance: float = 1.0
     actors: int = 1
     """Pipelines at work at once; one per GPU."""
@@ -43,6 +37,18 @@ class GivenScenes:
 
         directory = absolute(self.input) if self.input else home("generated")
         return Selection(directory, self.source or None, self.split or None, self.limit, "first")
+
+
+@dataclass(frozen=True)
+class Repainting(GivenScenes):
+    """The same with one set of RePaint's numbers (paper, Sec. 3.3 and supplement B.3)."""
+
+    steps: int = 250
+    """Denoising steps without detours."""
+    jump_length: int = 10
+    """Steps that RePaint goes back at a time."""
+    resamplings: int = 10
+    """How often it passes the same steps."""
 
     def resampling(self) -> Resampling:
         from models.pipeline import Resampling

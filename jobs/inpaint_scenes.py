@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import GivenScenes, pipeline_directory
+from jobs.given_scenes import Repainting, pipeline_directory
 
 
 @dataclass(frozen=True)
-class Config(GivenScenes):
+class Config(Repainting):
     polygon_m: tuple[float, ...] = ()
     """Corners of a polygon, x y x y ..., in metres of the scene: x ahead, y left."""
     half_plane: tuple[float, ...] = ()

@@ -18,7 +18,7 @@ from math import ceil
 from typing import TYPE_CHECKING, Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import GivenScenes, pipeline_directory
+from jobs.given_scenes import Repainting, pipeline_directory
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -27,7 +27,7 @@ BLOCK_M = 64.0  # of every dataset's scenes (paper, Sec. 3.1)
 
 
 @dataclass(frozen=True)
-class Config(GivenScenes):
+class Config(Repainting):
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/outpainted)."""
     run: str = "outpainted"

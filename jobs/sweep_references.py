@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, print_table, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -94,16 +94,9 @@ def sweep_references(config: Config) -> list[dict]:
 
 
 def main(config: Config) -> None:
-    from rich.console import Console
-    from rich.table import Table as Lines
-
     from pipelines.sweep import sweep_table
 
-    table = sweep_table(sweep_references(config))
-    lines = Lines(*table.columns)
-    for row in table.rows:
-        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
-    Console().print(lines)
+    print_table(sweep_table(sweep_references(config)))
 
 
 if __name__ == "__main__":

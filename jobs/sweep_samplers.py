@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, print_table, run, start_ray
 from jobs.given_scenes import pipeline_directory
 
 
@@ -122,16 +122,9 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 
 def main(config: Config) -> None:
-    from rich.console import Console
-    from rich.table import Table as Lines
-
     from pipelines.sampler_sweep import sampler_table
 
-    table = sampler_table(sweep_samplers(config))
-    lines = Lines(*table.columns)
-    for row in table.rows:
-        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
-    Console().print(lines)
+    print_table(sampler_table(sweep_samplers(config)))
 
 
 if __name__ == "__main__":

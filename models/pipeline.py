@@ -97,6 +97,14 @@ class Resampling:
     jump_length: int = JUMP_LENGTH
     resamplings: int = RESAMPLINGS
 
+    def transitions(self) -> list[tuple[int, int]]:
+        return repaint_transitions(self.num_steps, self.jump_length, self.resamplings)
+
+    @property
+    def evaluations(self) -> int:
+        """How often the network is asked."""
+        return sum(to < state for state, to in self.transitions())
+
 
 class PrITTIPipeline(DiffusionPipeline):
     """Generates Scenes. `from_pretrained(directory)` and `save_pretrained(directory)` as in diffusers."""
@@ -249,12 +257,11 @@ class PrITTIPipeline(DiffusionPipeline):
     ) -> Float[Tensor, "b c h w"]:
         """RePaint: latents that keep `known` bit for bit where its mask is 0 (paper, Sec. 3.3)."""
         walk = Walk(self.diffusion, resampling.num_steps)
-        transitions = repaint_transitions(resampling.num_steps, resampling.jump_length, resampling.resamplings)
+        transitions = resampling.transitions()
         noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
         model = self._denoiser(walk.timesteps, label, guidance_scale)
-        evaluations = sum(to < state for state, to in transitions)
-        with self._watched(evaluations, callback_on_step_end) as on_step:
+        with self._watched(resampling.evaluations, callback_on_step_end) as on_step:
             return sample(model, walk, noise, label, transitions, known, on_step)
 
     def inpaint(

@@ -93,6 +93,8 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     from jobs.evaluate_seams import evaluate_seams
     from jobs.outpaint_scenes import Config as OutpaintConfig
     from jobs.outpaint_scenes import outpaint
+    from jobs.sweep_seams import Config as SweepConfig
+    from jobs.sweep_seams import sweep_seams
 
     model = str(smoke / "models/pritti-smoke")
     options = OutpaintConfig(
@@ -118,6 +120,13 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
     assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
+
+    (row,) = sweep_seams(
+        SweepConfig(model, str(samples), "generated-samples", settings=((4, 2, 2),), output=str(tmp_path / "sweep"))
+    )
+    assert row["seams"] == 4 and row["evaluations"] == 6 and row["class_changes_low"] <= row["class_changes"]
+    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,)]
+    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 1
 
     scores = evaluate(
         Config(

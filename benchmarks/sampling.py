@@ -1,0 +1,80 @@
+"""From noise to tables: how much of it is sampling, decoding, and writing.
+
+python benchmarks/sampling.py                       the town presets, untrained: the work is the same
+python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
+
+CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50 steps.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import tempfile
+import time
+from dataclasses import dataclass
+
+import torch
+import tyro
+from common import spread, where
+
+from models.dit import DiT
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.pipeline import LABELS, PrITTIPipeline, scheduler
+from models.zoo import DIT_PRESETS, LVAE_PRESETS
+from pipelines.generate import load_pipeline
+from pipelines.scenes.tables import Shard
+
+
+@dataclass(frozen=True)
+class Config:
+    model: str = ""
+    preset: str = "town"
+    steps: int = 50
+    batch: int = 8
+    rounds: int = 3
+
+
+def untrained(preset: str) -> PrITTIPipeline:
+    row = DIT_PRESETS[preset]
+    vae = LVAE_PRESETS[row.lvae]
+    torch.manual_seed(0)
+    lvae = LayoutVAE(layout=LayoutSpec().with_resolution(vae.raster_px).to_dict(), **vae.architecture())
+    channels, size, _ = lvae.latent_shape
+    dit = DiT(**row.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
+    pipeline = PrITTIPipeline(lvae, dit, scheduler())
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+def main(config: Config) -> None:
+    pipeline = load_pipeline(config.model) if config.model else untrained(config.preset)
+    print(where(), f"torch {torch.__version__}, latents {pipeline.lvae.latent_shape}")
+    known = LABELS[pipeline.dit.config.label]
+    labels = [known[k % len(known)] for k in range(config.batch)]
+    seconds: dict[str, list[float]] = {"sampling": [], "decoding": [], "writing": []}
+    clock = time.process_time
+    for number in range(config.rounds + 1):
+        marks = [clock()]
+        latents = pipeline.sample_latents(labels, number, range(config.batch), config.steps)
+        marks.append(clock())
+        identities = [pipeline.identity("run", number, k, label) for k, label in enumerate(labels)]
+        scenes = pipeline.decode(latents, identities)
+        marks.append(clock())
+        with tempfile.TemporaryDirectory() as directory:
+            Shard(directory, "generated-run", "generated", 0).write(scenes)
+        marks.append(clock())
+        if number:  # the first warms up
+            for name, start, end in zip(seconds, marks, marks[1:], strict=False):
+                seconds[name].append((end - start) / config.batch)
+    for name, found in seconds.items():
+        print(f"{name}: {spread(found, 1e3, 1)} ms a scene")
+    after = [(d + w) / s for s, d, w in zip(*seconds.values(), strict=True)]
+    print(f"after sampling / sampling, {config.steps} steps: {spread(after, 100, 1)} %; {len(scenes[0])} primitives")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))

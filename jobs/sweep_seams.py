@@ -1,0 +1,90 @@
+#!/usr/bin/env python3
+"""What does outpainting need? The same scenes extended with many and few steps, roll-backs and resamplings; their seams.
+
+    jobs/sweep_seams.py --limit 50                                          50 generated scenes, 200 seams a setting
+    jobs/sweep_seams.py --limit 50 --settings 250 10 10 50 5 5 50 1 1       steps, jump length and resamplings, in threes
+
+The paper's is 250 10 10: 2,410 network evaluations a block. Writes the scenes (source=generated-<steps>-<J>-<R>),
+sweep.json, sweep.parquet and sweep.html. Run it again with the same options to go on after an interruption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.given_scenes import GivenScenes, pipeline_directory
+
+
+@dataclass(frozen=True)
+class Config(GivenScenes):
+    settings: tuple[tuple[int, int, int], ...] = ((250, 10, 10), (250, 5, 5), (250, 1, 1), (50, 10, 10), (50, 5, 5), (50, 1, 1))  # fmt: skip
+    """Steps, jump length and resamplings, in threes."""
+    overlap: float = 0.5
+    mode: Literal["reencode", "copy"] = "reencode"
+    output: str = ""
+    """Where everything goes (default: $PRITTI_HOME/evaluations/sweep-seams)."""
+    batch_size: int = 4
+
+
+def sweep_seams(config: Config) -> list[dict]:
+    """Outpaint, measure, write and return a row per setting."""
+    model = pipeline_directory(config.model)
+    if not config.settings:
+        raise ValueError("no --settings: expected steps, jump length and resamplings, in threes")
+    import pyarrow as pa
+    from rich.progress import Progress
+
+    from models.pipeline import Resampling
+    from pipelines import storage
+    from pipelines.metrics.seams import seam_ratios
+    from pipelines.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.report import Picture
+    from pipelines.scenes.tables import read_scenes
+    from pipelines.seam_sweep import seam_row, seam_sweep_html
+    from pipelines.seams import Lines, measure, with_lines
+    from pipelines.selection import Selection
+
+    output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
+    selection = config.selection()
+    count = sum(len(rows) for _, rows in selection.shards())
+    rows, pictures = [], []
+    start_ray()
+    with Progress() as bar:
+        for setting in config.settings:
+            name = "-".join(map(str, setting))
+            request = OutpaintRequest(
+                model=model,
+                output=output,
+                run=name,
+                label=config.label or None,
+                seed=config.seed,
+                overlap=config.overlap,
+                mode=config.mode,
+                resampling=Resampling(*setting),
+                guidance_scale=config.guidance,
+                batch_size=config.batch_size,
+            )
+            done = bar.add_task(f"{name}, blocks", total=8 * count)
+            outpaint_scenes(request, selection, config.actors, lambda blocks, task=done: bar.advance(task, blocks))
+            measured = measure(Selection(output, request.source), Lines(), config.actors)
+            rows.append(seam_row(request.resampling, int(measured.seams.sum()), seam_ratios(measured.records)))
+            first = next(read_scenes(output, request.source))
+            pictures.append(Picture(first.scene_id, with_lines(first, Lines()), name))
+    storage.write_json(rows, storage.join(output, "sweep.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "sweep.parquet"))
+    how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}, {config.mode}. Model: {model}."]
+    html = seam_sweep_html(rows, pictures, how)
+    storage.write_whole(storage.join(output, "sweep.html"), lambda stream: stream.write(html.encode()))
+    return rows
+
+
+def main(config: Config) -> None:
+    from pipelines.seam_sweep import seam_table
+
+    print_table(seam_table(sweep_seams(config)))
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)
