@@ -26,7 +26,7 @@ from jobs.command import absolute, home, print_table, run, start_ray
 if TYPE_CHECKING:
     from jobs.ray_training import TrainingRun
     from jobs.tracking import Tracker
-    from models.layout import LayoutBatch
+    from models.batch import LayoutBatch
     from models.lvae import LayoutVAE
     from pipelines.ablation import Variant
     from pipelines.chart import Chart

@@ -29,12 +29,13 @@ class Config:
 
 def encode(config: Config) -> dict:
     """Encode and return the content of latents.json."""
-    from rich.progress import Progress
-
     from pipelines.dataset import Dataset
-    from pipelines.encode import encode_latents
 
     dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
+    from rich.progress import Progress
+
+    from pipelines.encode import encode_latents
+
     lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
     output = absolute(config.output) if config.output else dataset.root
     start_ray()

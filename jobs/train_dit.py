@@ -57,20 +57,10 @@ class Config:
 
 def prepare(config: Config) -> tuple[TrainingRun, str]:
     """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs."""
-    from functools import partial
-
-    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.smoke import smoke_dataset, smoke_latents
-    from jobs.tracking import Tracker
-    from jobs.validation import SamplingCheck
-    from models.pipeline import LABELS
-    from models.training import Execution, Optimisation
     from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
     from pipelines import storage
     from pipelines.dataset import Dataset
-    from pipelines.encode import load_lvae, weights_digest
-    from pipelines.feed import LatentReader, Stream
-    from pipelines.scenes.tables import find_shards
 
     row = preset(DIT_PRESETS, config.preset)
     smoke = config.preset == "smoke" and not config.dataset
@@ -86,6 +76,18 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     latents = storage.read_json(storage.join(latents_root, "latents.json"))
     if not latents["complete"]:
         raise ValueError(f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {root} again")
+
+    from functools import partial
+
+    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
+    from jobs.tracking import Tracker
+    from jobs.validation import SamplingCheck
+    from models.pipeline import LABELS
+    from models.training import Execution, Optimisation
+    from pipelines.encode import load_lvae, weights_digest
+    from pipelines.feed import LatentReader, Stream
+    from pipelines.scenes.tables import find_shards
+
     lvae = load_lvae(latents["lvae"])
     if weights_digest(lvae) != latents["lvae_digest"]:
         raise ValueError(
@@ -149,10 +151,10 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
 
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
+    training, lvae = prepare(config)
     from jobs.ray_training import fit
     from pipelines import storage
 
-    training, lvae = prepare(config)
     output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
     fit(training, config.workers, storage.join(output, "dit"))
     return complete_pipeline(lvae, output)

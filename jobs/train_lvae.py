@@ -61,21 +61,9 @@ class Config:
 
 def prepare(config: Config) -> TrainingRun:
     """The run that the options mean; makes the smoke preset's data."""
-    from dataclasses import asdict
-    from functools import partial
-
-    import numpy as np
-
-    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.smoke import smoke_dataset
-    from jobs.tracking import Tracker
-    from jobs.validation import ReconstructionCheck
-    from models.augment import Augmentation
-    from models.training import Execution, Optimisation
     from models.zoo import LVAE_PRESETS, preset
     from pipelines.dataset import Dataset
-    from pipelines.feed import LayoutReader, Stream
-    from pipelines.scenes.tables import find_shards
 
     row = preset(LVAE_PRESETS, config.preset)
     root = (
@@ -86,6 +74,20 @@ def prepare(config: Config) -> TrainingRun:
     if config.preset == "smoke" and not config.dataset:
         smoke_dataset(root)
     dataset = Dataset.open(root)
+
+    from dataclasses import asdict
+    from functools import partial
+
+    import numpy as np
+
+    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
+    from jobs.tracking import Tracker
+    from jobs.validation import ReconstructionCheck
+    from models.augment import Augmentation
+    from models.training import Execution, Optimisation
+    from pipelines.feed import LayoutReader, Stream
+    from pipelines.scenes.tables import find_shards
+
     spec = dataset.spec.with_resolution(row.raster_px)
     name = config.name or f"lvae-{config.preset}"
     settings = settings_with(
@@ -148,9 +150,9 @@ def prepare(config: Config) -> TrainingRun:
 
 def train(config: Config) -> str:
     """Train and return the model's directory."""
+    training = prepare(config)
     from jobs.ray_training import fit
 
-    training = prepare(config)
     return fit(training, config.workers, absolute(config.output) if config.output else home("models", training.name))
 
 
@@ -172,7 +174,7 @@ def build(architecture: dict, layout: dict, settings, kl_weight: float, executio
     import torch
 
     from jobs.ray_training import as_tensors
-    from models.layout import LayoutBatch
+    from models.batch import LayoutBatch
     from models.lvae import LayoutVAE
     from models.training import lvae_trainer
 

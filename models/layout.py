@@ -1,4 +1,4 @@
-"""The tensor contract between scenes and networks: LayoutSpec says what the numbers mean, LayoutBatch holds them.
+"""The contract between scenes and networks: LayoutSpec says what the numbers of a LayoutBatch (batch.py) mean.
 
 A LayoutSpec is made once per dataset (pipelines/ingest.py writes it to dataset.json), travels inside every
 checkpoint and inverts a network's outputs without the data.
@@ -11,9 +11,6 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from models.scene import CATEGORIES, GROUND_CLASSES, KITTI_GROUND_CLASSES, Grid
 
@@ -126,30 +123,4 @@ class LayoutSpec:
         raise ValueError(
             f"{what} has another LayoutSpec: {name} is {theirs[name]}, expected {mine[name]}; "
             "use the dataset or checkpoint that belongs to it, or train anew"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class LayoutBatch:
-    """A batch of normalised layouts L = {H, B, F} (paper, Sec. 3.1), every value in [0, 1]."""
-
-    height: Float[Tensor, "batch ground rows cols"]
-    occupied: Float[Tensor, "batch ground rows cols"]
-    features: Float[Tensor, "batch slots 9"]
-    real: Bool[Tensor, "batch slots"]  # the padding flag p
-
-    def __len__(self) -> int:
-        return len(self.real)
-
-    def to(self, device: torch.device | str) -> LayoutBatch:
-        return LayoutBatch(*(getattr(self, name).to(device, non_blocking=True) for name in self.__dataclass_fields__))
-
-    @classmethod
-    def from_compact(cls, arrays: dict[str, Tensor]) -> LayoutBatch:
-        """From stacked arrays of `tensors.compact_layout`, unpacked on whatever device they are on."""
-        return cls(
-            height=arrays["height"].to(torch.float32) / 65535,
-            occupied=arrays["occupied"].to(torch.float32),
-            features=arrays["features"].to(torch.float32),
-            real=arrays["real"].to(torch.bool),
         )

@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from models.layout import LayoutBatch, LayoutSpec
+from models.batch import LayoutBatch
+from models.layout import LayoutSpec
 from models.lvae import LayoutOutput, Posterior
 from models.matching import match
 

@@ -12,10 +12,11 @@ from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float
 from torch import Tensor
 
+from models.batch import LayoutBatch
 from models.cells import CellDecoder
 from models.ground import GroundDecoder, GroundEncoder
 from models.ground import start_at as start_ground
-from models.layout import FEATURES, LayoutBatch, LayoutSpec
+from models.layout import FEATURES, LayoutSpec
 from models.matching import MatchWeights
 from models.objects import ObjectDecoder, ObjectEncoder
 from models.tensors import DecodedLayout

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from models.batch import LayoutBatch
 from models.cholesky import boxes_from_cholesky, cholesky_parameters
-from models.layout import FEATURES, LayoutBatch, LayoutSpec
+from models.layout import FEATURES, LayoutSpec
 from models.scene import CATEGORY_INDEX, Grid, Scene, canonical_boxes
 
 EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details

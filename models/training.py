@@ -20,9 +20,10 @@ from diffusers import ModelMixin
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from models.batch import LayoutBatch
 from models.diffusion import Diffusion, keyed_generator
 from models.dit import DiT
-from models.layout import LayoutBatch, LayoutSpec
+from models.layout import LayoutSpec
 from models.losses import lvae_loss
 from models.lvae import LayoutVAE
 from models.matching import NotFiniteError

@@ -33,6 +33,12 @@ def test_imports_point_one_way(package):
     assert not {name: found for name, found in wrong.items() if found}
 
 
+def test_data_jobs_import_no_torch():
+    """A second or two of every process that preprocesses."""
+    code = "import sys, pipelines.ingest; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
 def test_models_import_without_ray_or_pyarrow():
     code = (
         "import sys\n"

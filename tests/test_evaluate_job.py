@@ -18,7 +18,7 @@ from pipelines.metrics.intervals import Estimate
 from pipelines.scenes.render import bev_picture
 from pipelines.selection import Selection
 
-SAMPLES = 6  # of a network that takes a second per picture
+SAMPLES = 5  # of a network that takes a second per picture
 
 
 @pytest.fixture(scope="module")

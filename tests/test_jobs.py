@@ -92,9 +92,9 @@ def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
-def test_the_same_command_resumes_after_a_failed_run(home, tmp_path):
+def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_run(home, tmp_path):
     from jobs.ray_training import fit
-    from jobs.train_dit import Config, prepare
+    from jobs.train_dit import Config, prepare, train
 
     seen = tmp_path / "validated"
 
@@ -108,24 +108,16 @@ def test_the_same_command_resumes_after_a_failed_run(home, tmp_path):
             raise KeyError("stopped")
         return {}, {}
 
-    run, _ = prepare(Config(preset="smoke", name="dit-stopped", checkpoint_every=2))
+    run, _ = prepare(Config(preset="smoke", name="dit-two", workers=2, checkpoint_every=2))
+    assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):
-        fit(replace(run, validate=stop_at_four), 1, str(home / "models/stopped"))
-    fit(replace(run, validate=note), 1, str(home / "models/stopped"))
+        fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
+    fit(replace(run, validate=note), 2, str(home / "models/two"))
     assert seen.read_text().split() == ["4", "6", "8"]  # from the checkpoint at 2, not from the start
-    whole, resumed = weights(home / "models/pritti-smoke/dit"), weights(home / "models/stopped")
-    assert all((whole[k] == resumed[k]).all() for k in whole)
-    assert not list((home / "runs").rglob("*.pkl"))
-
-
-def test_two_workers_on_two_cores_learn_what_one_does(home):
-    from jobs.train_dit import Config, prepare, train
-
-    assert prepare(Config(preset="smoke", name="dit-two", workers=2))[0].stream.batch_size == 8
-    train(Config(preset="smoke", name="dit-two", workers=2, output=str(home / "models/two")))
-    one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two/dit")
+    one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two")
     for name in one:
         assert np.allclose(one[name], two[name], atol=1e-4), name
+    assert not list((home / "runs").rglob("*.pkl"))
     with pytest.raises(ValueError, match=r"--workers is 4, this cluster of 2 CPUs has room for 1 to 3"):
         train(Config(preset="smoke", name="dit-four", workers=4))
     with pytest.raises(ValueError, match="--batch-size 7 does not divide by --workers 2"):

@@ -10,9 +10,10 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from torch.nn import functional as F
 
+from models.batch import LayoutBatch
 from models.dit import DiT
 from models.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
-from models.layout import LayoutBatch, LayoutSpec
+from models.layout import LayoutSpec
 from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
 from models.matching import MatchWeights, match

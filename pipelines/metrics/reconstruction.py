@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from models.batch import LayoutBatch
 from models.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
-from models.layout import LayoutBatch
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.scenes.palette import CLASS_ID, EMPTY
 from pipelines.scenes.voxels import NUM_CLASSES
