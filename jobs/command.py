@@ -34,6 +34,7 @@ RAY_ENVIRONMENT = {
     "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
     "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
     "RAY_TRAIN_ENABLE_PREEMPTION_WATCHER": "0",
+    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # a busy machine or a slow disk imports torch for a minute
     # Few CPUs mean few idle processes: a reader would be killed after every read and start again, 10 s of imports each.
     "RAY_idle_worker_killing_time_threshold_ms": "300000",
     "OMP_WAIT_POLICY": "PASSIVE",  # spinning threads slow torch fivefold beside a busy process
