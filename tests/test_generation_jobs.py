@@ -124,7 +124,7 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     (row,) = sweep_seams(
         SweepConfig(model, str(samples), "generated-samples", settings=((4, 2, 2),), output=str(tmp_path / "sweep"))
     )
-    assert row["seams"] == 4 and row["evaluations"] == 6 and row["class_changes_low"] <= row["class_changes"]
+    assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
     assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,)]
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 1
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
+from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Grid
+from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.seams import MEASURES, footprint_ranges, neighbours, seam_ratios, seam_record
+from pipelines.seam_sweep import seam_row, seam_sweep_html, seam_table
 
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
@@ -113,3 +116,12 @@ def test_a_seam_on_the_edge_is_refused_and_an_empty_scene_judges_nothing():
     empty = replace(speckled(0), occupied=np.zeros((5, 256, 256), bool))
     assert set(seam_ratios(seam_record(empty, rows=[128])[None]).values()) == {None}
     assert len(MEASURES) == 4
+
+
+def test_a_row_of_the_sweep_says_what_a_setting_costs_and_shows():
+    ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
+    row = seam_row(Resampling(), 200, ratios)
+    assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
+    (cells,) = seam_table([row]).rows
+    assert cells[:5] == (250, 10, 10, 2410, 200) and cells[6] == "1.20 (1.00 to 1.50)" and cells[7] is None
+    assert "2410" in seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")
