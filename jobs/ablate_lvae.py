@@ -368,7 +368,7 @@ def write_tables(
     files = {"txt": text.getvalue()} | ({"svg": standalone_svg(figure)} if figure else {})
     for kind, content in files.items():
         path = storage.join(output, f"{name}.{kind}")
-        storage.write_whole(path, lambda stream, content=content: stream.write(content.encode()))
+        storage.write_text(content, path)
 
 
 def publish(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -> None:
@@ -376,7 +376,7 @@ def publish(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -
     from pipelines import storage
 
     path = storage.join(output, "report.html")
-    storage.write_whole(path, lambda stream: stream.write(html.encode()))
+    storage.write_text(html, path)
     tracker.client.log_text(tracker.run_id, html, "report.html")
     tracker.finish("FINISHED")
     for table in tables:

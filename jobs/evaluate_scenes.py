@@ -135,7 +135,7 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
     counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
     shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
     html = evaluation_html(plain(scores), counts, shown, protocol(config, sides, looks))
-    storage.write_whole(storage.join(output, "evaluation.html"), lambda stream: stream.write(html.encode()))
+    storage.write_text(html, storage.join(output, "evaluation.html"))
     return scores
 
 
@@ -221,7 +221,7 @@ def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress)
         drawn = draw(chosen, lvae, config.actors, lambda: bar.advance(drawing))
     subtitle = f"{lvae} on {rebuilt.scores['scenes']} scenes of {real.root}, split {real.split}"
     html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
-    storage.write_whole(storage.join(output, "reconstruction.html"), lambda stream: stream.write(html.encode()))
+    storage.write_text(html, storage.join(output, "reconstruction.html"))
     return rebuilt.scores
 
 

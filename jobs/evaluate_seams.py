@@ -82,7 +82,7 @@ def evaluate_seams(config: Config) -> dict:
     scores = join_sides(measured)
     storage.write_parquet(seams_table(measured), storage.join(output, "seams.parquet"))
     html = seams_html(plain(scores), *sides["generated"], SHOWN)
-    storage.write_whole(storage.join(output, "seams.html"), lambda stream: stream.write(html.encode()))
+    storage.write_text(html, storage.join(output, "seams.html"))
     tags = {name: selection.root for name, (selection, _) in sides.items()}
     return publish_scores(output, scores, tags, ["seams.html"])
 

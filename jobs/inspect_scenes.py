@@ -193,7 +193,7 @@ def write_page(config: Report) -> str:
             scenes.append((Picture(name, oblique), Picture(remark, above)))
     html = dataset_html(facts, scenes)
     path = destination(config, "report.html")
-    storage.write_whole(path, lambda stream: stream.write(html.encode()))
+    storage.write_text(html, path)
     return path
 
 

@@ -89,7 +89,7 @@ def sweep_references(config: Config) -> list[dict]:
     for name, chart in zip(("apart", "farthest"), sweep_charts(rows), strict=True):
         texts[f"sweep-{name}.svg"] = standalone_svg(chart)
     for name, text in texts.items():
-        storage.write_whole(storage.join(output, name), lambda stream, text=text: stream.write(text.encode()))
+        storage.write_text(text, storage.join(output, name))
     return rows
 
 

@@ -11,9 +11,17 @@ Run it again with the same options to go on after an interruption.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
 
 from jobs.command import absolute, home, print_table, run, start_ray
 from jobs.given_scenes import pipeline_directory
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from pipelines.generate import SampleRequest
+    from pipelines.report import Picture
 
 
 @dataclass(frozen=True)
@@ -43,46 +51,44 @@ def sweep_samplers(config: Config) -> list[dict]:
     model = pipeline_directory(config.model)
     if config.num_scenes < 5 or config.pictures < 0:
         raise ValueError(f"--num-scenes is {config.num_scenes}, --pictures {config.pictures}: expected 5 and 0 or more")
-    import pyarrow as pa
+    if not config.samplers or not config.steps or min(config.steps) < 1:
+        raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
     from rich.progress import Progress
 
     from models.pipeline import LABELS, SAMPLERS
     from pipelines import storage
-    from pipelines.chart import standalone_svg
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks, describe
     from pipelines.evaluate import compare
-    from pipelines.generate import SampleRequest, sample_scenes
+    from pipelines.generate import SampleRequest
     from pipelines.report import Picture
-    from pipelines.sampler_sweep import sampler_charts, sampler_html, sampler_row
+    from pipelines.sampler_sweep import sampler_row
     from pipelines.scenes.render import bev_picture
     from pipelines.scenes.tables import read_scenes
     from pipelines.selection import Selection
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
-    if not config.samplers or not config.steps or min(config.steps) < 1:
-        raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     output = absolute(config.output) if config.output else home("evaluations", "samplers")
     real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
     count = sum(len(rows) for _, rows in real.shards())
     labels = LABELS[storage.read_json(storage.join(model, "dit/config.json"))["label"]]
-    settings = [(sampler, steps) for sampler in config.samplers for steps in config.steps]
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:
-        done = bar.add_task("describe real", total=count)
-        described = storage.join(output, "described")
-        truth = describe(
-            real, dataset, Looks(), f"{described}/real", config.actors, lambda n, task=done: bar.advance(task, n)
-        )
-        for sampler, steps in settings:
-            name = f"{sampler}-{steps}"
+
+        def described(side: Selection, name: str) -> dict:
+            task = bar.add_task(f"describe {name}", total=count)
+            directory = storage.join(output, "described", name)
+            return describe(side, dataset, Looks(), directory, config.actors, lambda n: bar.advance(task, n))
+
+        truth = described(real, "real")
+        for sampler, steps in product(config.samplers, config.steps):
             request = SampleRequest(
                 model=model,
                 output=output,
-                run=name,
+                run=f"{sampler}-{steps}",
                 num_scenes=config.num_scenes,
                 labels=labels,
                 seed=config.seed,
@@ -91,34 +97,51 @@ def sweep_samplers(config: Config) -> list[dict]:
                 sampler=sampler,
                 shard_scenes=max(1, config.num_scenes // (4 * config.actors)),
             )
-            done = bar.add_task(name, total=config.num_scenes)
-            record = storage.join(output, "times", f"{name}.json")
-            times = storage.read_json(record) if storage.exists(record) else {}
-
-            def advance(row: dict, task=done, times=times, record=record) -> None:
-                bar.advance(task, row["scenes"])
-                times.setdefault(str(row["id"]), row["seconds"])  # of when the shard was made
-                storage.write_json(times, record)
-
-            sample_scenes(request, config.actors, config.batch_size, advance)
-            chosen = Selection(output, request.source, None, count, "spread")
-            made = describe(chosen, dataset, Looks(), f"{described}/{name}", config.actors)
+            seconds = timed_sampling(config, request, bar)
+            made = described(Selection(output, request.source, None, count, "spread"), request.run)
             scores = compare(truth, made, dataset.spec.ground_classes)
-            rows.append(sampler_row(sampler, steps, sum(times.values()), config.num_scenes, scores))
+            rows.append(sampler_row(sampler, steps, seconds, config.num_scenes, scores))
             scenes = read_scenes(output, request.source, limit=config.pictures) if config.pictures else ()
-            pictures += [Picture(f"{name}, {scene.frame}", bev_picture(scene, supersample=2)) for scene in scenes]
-    storage.write_json(rows, storage.join(output, "samplers.json"))
-    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
+            pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
     how = [
         f"Real: {count} scenes of {dataset.root}, split {config.real_split}, evenly spread. Model: {model}.",
         f"Seed {config.seed}, guidance scale {config.guidance:g}, labels in turn: {', '.join(labels)}.",
     ]
-    texts = {"samplers.html": sampler_html(rows, pictures, max(1, config.pictures), how)}
-    for chart in sampler_charts(rows):
-        texts[f"samplers-{chart.title.split()[0].lower()}.svg"] = standalone_svg(chart)
-    for name, text in texts.items():
-        storage.write_whole(storage.join(output, name), lambda stream, text=text: stream.write(text.encode()))
+    publish(output, rows, pictures, max(1, config.pictures), how)
     return rows
+
+
+def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> float:
+    """Generate what is missing; seconds of actors that all shards took when they were made."""
+    from pipelines import storage
+    from pipelines.generate import sample_scenes
+
+    record = storage.join(request.output, "times", f"{request.run}.json")
+    times = storage.read_json(record) if storage.exists(record) else {}
+    shown = bar.add_task(request.run, total=request.num_scenes)
+
+    def advance(row: dict) -> None:
+        bar.advance(shown, row["scenes"])
+        times.setdefault(str(row["id"]), row["seconds"])
+        storage.write_json(times, record)
+
+    sample_scenes(request, config.actors, config.batch_size, advance)
+    return sum(times.values())
+
+
+def publish(output: str, rows: list[dict], pictures: list[Picture], columns: int, how: list[str]) -> None:
+    """Write rows, figures and the page."""
+    import pyarrow as pa
+
+    from pipelines import storage
+    from pipelines.chart import standalone_svg
+    from pipelines.sampler_sweep import CHARTED, sampler_charts, sampler_html
+
+    storage.write_json(rows, storage.join(output, "samplers.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
+    storage.write_text(sampler_html(rows, pictures, columns, how), storage.join(output, "samplers.html"))
+    for name, chart in zip(CHARTED, sampler_charts(rows), strict=True):
+        storage.write_text(standalone_svg(chart), storage.join(output, f"samplers-{name}.svg"))
 
 
 def main(config: Config) -> None:

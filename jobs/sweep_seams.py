@@ -76,7 +76,7 @@ def sweep_seams(config: Config) -> list[dict]:
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "sweep.parquet"))
     how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}, {config.mode}. Model: {model}."]
     html = seam_sweep_html(rows, pictures, how)
-    storage.write_whole(storage.join(output, "sweep.html"), lambda stream: stream.write(html.encode()))
+    storage.write_text(html, storage.join(output, "sweep.html"))
     return rows
 
 

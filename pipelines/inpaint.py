@@ -191,7 +191,7 @@ def inpaint_scenes(
     table = Table("Drift outside the region", tuple(scores), [tuple(scores.values())], note=how)
     html = report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
     page = storage.join(request.output, f"{request.run}.html")
-    storage.write_whole(page, lambda stream: stream.write(html.encode()))
+    storage.write_text(html, page)
     return scores
 
 

@@ -122,8 +122,12 @@ def file_bytes(uri: str) -> int:
     return fs.get_file_info(path).size
 
 
+def write_text(text: str, uri: str) -> None:
+    write_whole(uri, lambda stream: stream.write(text.encode()))
+
+
 def write_json(value: Any, uri: str) -> None:
-    write_whole(uri, lambda stream: stream.write(json.dumps(value, indent=1, allow_nan=False).encode()))
+    write_text(json.dumps(value, indent=1, allow_nan=False), uri)
 
 
 def read_json(uri: str) -> Any:

@@ -73,6 +73,8 @@ def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
     assert all(row["layout_frechet_low"] <= row["layout_frechet"] and row["seconds_per_scene"] > 0 for row in rows)
     assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
     assert (tmp_path / "samplers.html").read_text().count("<img") == 4
+    assert "<svg" in (tmp_path / "samplers-layout_frechet.svg").read_text()
+    assert sweep_samplers(config) == rows  # nothing is made again, nor timed
     found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
     assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
     with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
