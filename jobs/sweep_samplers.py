@@ -100,7 +100,7 @@ def sweep_samplers(config: Config) -> list[dict]:
             seconds = timed_sampling(config, request, bar)
             made = described(Selection(output, request.source, None, count, "spread"), request.run)
             scores = compare(truth, made, dataset.spec.ground_classes)
-            rows.append(sampler_row(sampler, steps, seconds, config.num_scenes, scores))
+            rows.append(sampler_row(sampler, steps, seconds / config.num_scenes, scores))
             scenes = read_scenes(output, request.source, limit=config.pictures) if config.pictures else ()
             pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
     how = [

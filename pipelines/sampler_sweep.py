@@ -21,9 +21,10 @@ MEASURES = {
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
 
 
-def sampler_row(sampler: str, steps: int, seconds: float, count: int, scores: Mapping) -> dict:
-    """One row: each measure with the ends of its interval, None where it has no value; seconds of actors per scene."""
-    row = {"sampler": sampler, "steps": steps, "scenes": count, "seconds_per_scene": seconds / count}
+def sampler_row(sampler: str, steps: int, seconds_per_scene: float, scores: Mapping) -> dict:
+    """One row: each measure with the ends of its interval, None where it has no value; seconds of an actor."""
+    count = scores["scenes"]["generated"]
+    row = {"sampler": sampler, "steps": steps, "scenes": count, "seconds_per_scene": seconds_per_scene}
     for name, (place, _) in MEASURES.items():
         found: Mapping | Estimate | None = scores
         for part in place:

@@ -51,12 +51,13 @@ def test_no_reference_that_fits_is_an_error():
 def row_of(sampler: str, steps: int, frechet: Estimate) -> dict:
     validity = {name: {"generated": Estimate(0.5, 0.4, 0.6)} for name in ("road_connectivity", "overlapping")}
     scores = {
+        "scenes": {"real": 6, "generated": 6},
         "layout_frechet": frechet,
         "random_frechet": frechet,
         "validity": validity | {"sunken": {"generated": None}},
     }
     scores |= {f"random_{name}_k3": Estimate(0.3, 0.2, 0.4) for name in ("precision", "recall")}
-    return sampler_row(sampler, steps, 12.0, 6, scores)
+    return sampler_row(sampler, steps, 2.0, scores)
 
 
 def test_few_steps_are_held_against_the_papers_sampler_with_most():
