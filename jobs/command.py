@@ -44,8 +44,12 @@ RAY_ENVIRONMENT = {
 }
 
 
-def start_ray() -> None:
-    """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs."""
+def start_ray(training: bool = False) -> None:
+    """Join the cluster that RAY_ADDRESS names or start one on this machine; nothing if Ray already runs.
+
+    A Ray of this command's own ends with it and nobody would open its dashboard; but Ray Train asks that once a second
+    who is still alive, and complains if there is none.
+    """
     for name, value in RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     import ray
@@ -53,8 +57,7 @@ def start_ray() -> None:
 
     if ray.is_initialized():
         return
-    # A Ray of this command's own ends with it: nobody would open its dashboard. A cluster keeps its own.
-    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=False)
+    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False

@@ -147,7 +147,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
     Raises ValueError for a number of workers that does not fit, or for a loss that is not finite.
     """
-    start_ray()
+    start_ray(training=True)
     scaling = scaling_for(num_workers, run.stream.batch_size)
     trainer = ray.train.torch.TorchTrainer(
         train_worker,

@@ -92,7 +92,7 @@ def main(config: Config) -> None:
         home("models", f"pritti-{config.preset}"),
     )
     stages = Stages(home("stages.json"), total=8)
-    start_ray()
+    start_ray(training=True)
     stages.run(
         "preprocess the town",
         lambda: preprocess_scenes.main(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jobs.command import home
+from jobs.command import home, start_ray
 from pipelines import storage
 
 NUM_TRAIN, NUM_TEST = 32, 16
@@ -14,11 +14,13 @@ def smoke_dataset(root: str) -> None:
         return
     from jobs.preprocess_scenes import Town, main
 
+    start_ray(training=True)  # what the town is made for
     main(Town(output=root, num_train=NUM_TRAIN, num_test=NUM_TEST))
 
 
 def smoke_latents(root: str) -> None:
     """Latents of the smoke town by the smoke LVAE, unless they are there."""
+    start_ray(training=True)
     if not storage.exists(storage.join(home("models", "lvae-smoke"), "config.json")):
         from jobs.train_lvae import Config, train
 

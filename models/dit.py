@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
@@ -18,9 +19,10 @@ from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from models.diffusion import Denoiser
+from models.diffusion import Denoiser, Diffusion
 
 FREQUENCIES = 256
+Prediction = Literal["noise", "velocity"]
 
 
 def timestep_frequencies(timestep: Float[Tensor, batch]) -> Float[Tensor, "batch 256"]:
@@ -76,6 +78,10 @@ class DiT(ModelMixin, ConfigMixin):
 
     Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
     divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
+
+    `prediction` is what the network itself puts out: "noise" as in the paper, or "velocity", sqrt(alpha_bar) noise -
+    sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), of which the noise is made here. A small network then need not carry the
+    noise it is given through all its layers.
     """
 
     @register_to_config
@@ -92,8 +98,11 @@ class DiT(ModelMixin, ConfigMixin):
         layout: dict | None = None,
         shift: tuple[float, ...] | None = None,
         scale: tuple[float, ...] | None = None,
+        prediction: Prediction = "noise",
     ) -> None:
         super().__init__()
+        if prediction not in get_args(Prediction):
+            raise ValueError(f"DiT: prediction {prediction!r}, expected one of: {', '.join(get_args(Prediction))}")
         if size % patch or width % heads or width % 4:
             raise ValueError(f"DiT: size {size} / patch {patch} and width {width} / heads {heads} must be whole")
         self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
@@ -103,6 +112,9 @@ class DiT(ModelMixin, ConfigMixin):
         self.modulation = nn.Linear(width, 2 * width)
         self.patch_out = nn.Linear(width, patch * patch * channels)
         self.register_buffer("positions", sincos_positions(size // patch, width), persistent=False)
+        alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
+        shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
+        self.register_buffer("noise_shares", shares, persistent=False)  # of the latent and of the velocity
         self.initialise()
 
     def initialise(self) -> None:
@@ -133,9 +145,15 @@ class DiT(ModelMixin, ConfigMixin):
         return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
 
     def modulations(self, timestep: Int[Tensor, batch], label: Int[Tensor, batch]) -> list[Tensor]:
-        """Shifts, scales and gates of every block (b, 6 d), and shift and scale of the output (b, 2 d)."""
+        """Shifts, scales and gates of every block (b, 6 d), of the output (b, 2 d), and the noise's shares (b, 2)."""
         condition = self.condition(timestep, label)
-        return [layer(condition) for layer in self.modulating()]
+        return [*(layer(condition) for layer in self.modulating()), self.noise_shares[timestep]]
+
+    def loss_weight(self, timestep: Int[Tensor, batch]) -> Float[Tensor, batch]:
+        """What the squared error of the noise counts in training: that of what the network puts out counts 1."""
+        if self.config.prediction == "noise":
+            return torch.ones(len(timestep), device=timestep.device)
+        return self.noise_shares[timestep, 1] ** -2
 
     def forward(
         self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, batch], label: Int[Tensor, batch]
@@ -153,7 +171,7 @@ class DiT(ModelMixin, ConfigMixin):
         labels = sorted(set(labels))
         # Label by label: what one's rows round to must not depend on which others there are.
         rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
-        table, sizes = torch.cat(rows), [layer.out_features for layer in self.modulating()]
+        table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.modulating()), 2]
         row_of = torch.full((int(timestep[-1]) + 1, labels[-1] + 1), len(table), device=timestep.device)
         for k, label in enumerate(labels):
             row_of[timestep, label] = torch.arange(len(timestep), device=timestep.device) + k * len(timestep)
@@ -169,9 +187,14 @@ class DiT(ModelMixin, ConfigMixin):
         """`forward` from modulations that are computed already."""
         patch, tokens = self.config.patch, self.config.size // self.config.patch
         x = self.patch_in(latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
-        for block, modulation in zip(self.blocks, modulations, strict=False):
+        *of_blocks, of_output, shares = modulations
+        for block, modulation in zip(self.blocks, of_blocks, strict=True):
             x = block(x, modulation)
-        shift, scale = modulations[-1].chunk(2, dim=1)
+        shift, scale = of_output.chunk(2, dim=1)
         x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c)
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c)
-        return x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
+        x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
+        if self.config.prediction == "noise":
+            return x
+        of_latent, of_velocity = shares[:, :, None, None, None].unbind(1)
+        return of_latent * latent + of_velocity * x

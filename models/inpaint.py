@@ -18,21 +18,25 @@ from models.scene import Grid, Scene, merge, yaw_rotation
 Contents = Literal["both", "ground", "objects"]  # what to make anew inside a region
 
 
-def polygon_region(grid: Grid, corners_m: Sequence[Sequence[float]]) -> np.ndarray:
-    """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres; even-odd rule.
+def polygon_contains(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
 
     Raises ValueError for fewer than three corners or numbers that are not finite.
     """
     corners = np.asarray(corners_m, float)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise ValueError(f"polygon {np.asarray(corners_m).tolist()}: expected three or more corners (x, y) in metres")
-    x, y = grid.x_m()[:, None], grid.y_m()[None, :]
-    inside = np.zeros((grid.rows, grid.cols), bool)
+    inside = np.zeros(np.broadcast_shapes(np.shape(x_m), np.shape(y_m)), bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if x0 != x1:  # does the edge cross the ray from the pixel towards +y?
-            crosses = (x0 > x) != (x1 > x)
-            inside ^= crosses & (y < y0 + (x - x0) / (x1 - x0) * (y1 - y0))
+        if x0 != x1:  # does the edge cross the ray from the point towards +y?
+            crosses = (x0 > x_m) != (x1 > x_m)
+            inside ^= crosses & (y_m < y0 + (x_m - x0) / (x1 - x0) * (y1 - y0))
     return inside
+
+
+def polygon_region(grid: Grid, corners_m: Sequence[Sequence[float]]) -> np.ndarray:
+    """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
+    return polygon_contains(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
 
 def half_plane_region(grid: Grid, normal: Sequence[float], offset_m: float) -> np.ndarray:

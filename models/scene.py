@@ -206,6 +206,22 @@ class Scene:
     def yaw_rad(self) -> np.ndarray:
         return yaw_of(self.rotation)
 
+    @property
+    def bottom_m(self) -> np.ndarray:
+        """(n,) z of each primitive's lowest point."""
+        half_m = 0.5 * np.abs(self.rotation[:, 2, :]) * self.size_m
+        down_m = np.where(self.category == ELLIPSOID, np.sqrt((half_m**2).sum(axis=1)), half_m.sum(axis=1))
+        return self.center_m[:, 2] - down_m
+
+    def ground_under(self) -> tuple[np.ndarray, np.ndarray]:
+        """height_m (n,) and class (n,) of the fused ground under each centre; NaN and -1 where there is none."""
+        height_m, winner = self.surface()
+        x_m, y_m = self.center_m[:, 0], self.center_m[:, 1]
+        row, col = self.grid.pixel(x_m, y_m)
+        pixel = row.clip(0, self.grid.rows - 1), col.clip(0, self.grid.cols - 1)
+        known = self.grid.contains(x_m, y_m) & (winner[pixel] >= 0)
+        return np.where(known, height_m[pixel], np.nan), np.where(known, winner[pixel], -1)
+
     def counts(self) -> np.ndarray:
         """(11,) primitives per category."""
         return np.bincount(self.category, minlength=len(CATEGORIES))

@@ -110,7 +110,7 @@ def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight:
 
 
 def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunction:
-    """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM").
+    """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
 
     Latents are sampled anew from the cached posterior; one label-dropout mask per sample.
     """
@@ -128,7 +128,8 @@ def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunc
         timestep = (uniform[:, 0] * diffusion.num_timesteps).long()
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
-        return {"loss": F.mse_loss(predicted.float(), noise)}
+        error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
+        return {"loss": (dit.loss_weight(timestep) * error).mean(), "noise_error": error.mean()}
 
     return loss
 

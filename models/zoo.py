@@ -73,6 +73,7 @@ class DiTPreset:
     batch_size: int
     steps: int
     normalise_latents: bool = False  # the paper and SLEDGE use latents as they are
+    prediction: str = "noise"  # the paper's, or "velocity"
     learning_rate: float = 1e-4
     weight_decay: float = 1e-6
     grad_clip: float | None = 1.0
@@ -80,7 +81,7 @@ class DiTPreset:
     label_dropout: float = 0.1  # the paper leaves it open; DiT's value
 
     def architecture(self) -> dict:
-        return {name: getattr(self, name) for name in ("patch", "depth", "width", "heads")}
+        return {name: getattr(self, name) for name in ("patch", "depth", "width", "heads", "prediction")}
 
 
 DIT_PRESETS = {

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 
 import ray.data
 import torch
+from diffusers.utils.logging import disable_progress_bar
 
 from models.layout import LayoutSpec
 from models.pipeline import LABELS, PrITTIPipeline
@@ -57,6 +58,7 @@ class SampleRequest(Request):
 
 def load_pipeline(directory: str) -> PrITTIPipeline:
     """Raises ValueError if the directory holds no complete pipeline."""
+    disable_progress_bar()  # of three files
     try:
         pipeline = PrITTIPipeline.from_pretrained(directory, low_cpu_mem_usage=False)
     except (OSError, ValueError, TypeError, AttributeError) as error:

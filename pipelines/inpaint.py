@@ -17,7 +17,7 @@ from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_m
 from pipelines.metrics.reconstruction import pair_sums
 from pipelines.report import Picture, Pictures, Table, report_html
 from pipelines.scenes.mesh import scene_glb
-from pipelines.scenes.render import MARK_COLOR, bev_picture
+from pipelines.scenes.render import outlined_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
 
@@ -180,8 +180,8 @@ def inpaint_scenes(
         given = on_model_grid(source.scenes([position])[0], pipeline.spec)
         new = whole_cells(request.where.region(given), given.grid, pipeline.lvae.latent_shape[-1])
         made = request.shard(number).scenes()[: PER_ROW - 1]
-        shown.append(Picture(given.scene_id, outlined(given, new), "given"))
-        shown += [Picture(scene.scene_id, outlined(scene, new), "made anew") for scene in made]
+        shown.append(Picture(given.scene_id, outlined_picture(given, new, PICTURE_PX), "given"))
+        shown += [Picture(scene.scene_id, outlined_picture(scene, new, PICTURE_PX), "made anew") for scene in made]
     columns = min(PER_ROW, 1 + request.variants)
     note = f"Inside the red line {described(request.contents)} made anew; the rest is the given scene's."
     how = (
@@ -197,15 +197,3 @@ def inpaint_scenes(
 
 def described(contents: Contents) -> str:
     return {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}[contents]
-
-
-def outlined(scene: Scene, region: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 from above, with the border of a region."""
-    picture = bev_picture(scene, PICTURE_PX, supersample=2).copy()
-    inside = region.repeat(-(-picture.shape[0] // len(region)), 0)[: picture.shape[0]]
-    inside = inside.repeat(-(-picture.shape[1] // region.shape[1]), 1)[:, : picture.shape[1]]
-    border = np.zeros_like(inside)
-    border[1:] |= inside[1:] != inside[:-1]
-    border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
-    picture[border] = MARK_COLOR
-    return picture

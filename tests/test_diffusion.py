@@ -14,9 +14,9 @@ from models.training import Execution, NotFinite, Optimisation, dit_trainer
 SHAPE = (4, 8, 8)
 
 
-def random_dit(seed: int = 0) -> DiT:
+def random_dit(seed: int = 0, **options) -> DiT:
     torch.manual_seed(seed)
-    dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)
+    dit = DiT(channels=4, size=8, width=32, depth=2, heads=2, **options)
     for parameter in dit.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     return dit.eval()
@@ -54,6 +54,31 @@ def test_noising_in_two_steps_has_the_variance_of_one():
         assert np.isclose(ratio * (1 - walk.alpha_bar[low]) + 1 - ratio, 1 - walk.alpha_bar[high])
     zero, one = torch.zeros(1), torch.ones(1)
     assert torch.isclose(walk.up(one, zero, 3, 9) ** 2 + walk.up(zero, one, 3, 9) ** 2, one)
+
+
+def test_of_the_true_velocity_the_true_noise_is_made():
+    """diffusers' velocity, put through the shares of a DiT that predicts velocities."""
+    clean, noise, t = torch.randn(4, *SHAPE), torch.randn(4, *SHAPE), torch.tensor([0, 250, 600, 999])
+    latent, velocity = scheduler().add_noise(clean, noise, t), scheduler().get_velocity(clean, noise, t)
+    of_latent, of_velocity = random_dit(prediction="velocity").noise_shares[t][:, :, None, None, None].unbind(1)
+    assert torch.allclose(of_latent * latent + of_velocity * velocity, noise, atol=1e-5)
+
+
+def test_a_dit_of_velocities_is_one_of_noise_with_shares_around_it():
+    noise_dit, velocity_dit = random_dit(), random_dit(prediction="velocity")
+    latent, t, label = torch.randn(4, *SHAPE), torch.tensor([0, 250, 600, 999]), torch.tensor([0, 1, 2, 3])
+    alpha_bar = torch.from_numpy(Diffusion().alpha_bar[t]).float()[:, None, None, None]
+    velocity = noise_dit(latent, t, label)
+    expected = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * velocity
+    assert torch.allclose(velocity_dit(latent, t, label), expected, atol=1e-6)
+    assert torch.allclose(velocity_dit.prepared(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5)
+    assert (noise_dit.loss_weight(t) == 1).all()
+    other = torch.randn(4, *SHAPE)  # the error of any answer in noise, weighted, is its error in velocity
+    wrong = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * other
+    weighted = velocity_dit.loss_weight(t) * ((wrong - expected) ** 2).mean((1, 2, 3))
+    assert torch.allclose(weighted, ((other - velocity) ** 2).mean((1, 2, 3)), rtol=1e-3)
+    with pytest.raises(ValueError, match="'x0', expected one of: noise, velocity"):
+        DiT(prediction="x0")
 
 
 def test_a_scene_depends_on_its_seed_and_index_only():
@@ -143,17 +168,19 @@ def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
     return {"mean": mean, "logvar": torch.full_like(mean, -6.0), "label": torch.arange(n) % 3}
 
 
-def new_trainer(execution: Execution | None = None, **changes):
+def new_trainer(execution: Execution | None = None, prediction: str = "noise", **changes):
     torch.manual_seed(0)
     settings = Optimisation(**({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes))
-    dit = DiT(channels=4, size=8, width=64, depth=2, heads=2)
+    dit = DiT(channels=4, size=8, width=64, depth=2, heads=2, prediction=prediction)
     return dit_trainer(dit, settings, 0.1, torch.device("cpu"), execution=execution)
 
 
-def test_dit_overfits_one_batch():
-    trainer, batch = new_trainer(), dit_batch(2)
-    losses = [float(trainer.step(batch, range(2))["loss"]) for _ in range(300)]
-    assert np.mean(losses[:5]) > 0.9 and np.mean(losses[-50:]) < 0.35
+@pytest.mark.parametrize("prediction", ["noise", "velocity"])
+def test_dit_overfits_one_batch(prediction):
+    trainer, batch = new_trainer(prediction=prediction), dit_batch(2)
+    losses = [trainer.step(batch, range(2)) for _ in range(300)]
+    assert np.mean([float(loss["loss"]) for loss in losses[:5]]) > 0.9
+    assert np.mean([float(loss["noise_error"]) for loss in losses[-50:]]) < 0.35
 
 
 def test_training_resumes_exactly(tmp_path):

@@ -23,6 +23,7 @@ from pipelines import storage
 from pipelines.labels import density, density_thresholds
 from pipelines.scenes.tables import (
     CATEGORY_MEANING,
+    EDITS,
     HEIGHT_STEP_M,
     PRIMITIVES,
     RASTERS,
@@ -42,6 +43,7 @@ SCHEMAS = {
     "primitives": PRIMITIVES,
     "rasters": RASTERS,
     "rejects": REJECTS,
+    "edits": EDITS,
     "latents": latents_schema((4, 8, 8)),
 }
 SETUP, COLUMNS = "Questions", "On disk"  # headings whose SQL is no question

@@ -42,35 +42,37 @@ ROAD_CLASSES = ("road", "crossing")
 DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 
-def scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
-    """(7, 2) numerators and denominators of MEASURES for one scene.
+def faults(scene: Scene, slab_offset_m: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """For each of MEASURES but the last: which primitives (n,) bool are at fault, and among which it is looked for.
 
     slab_offset_m is how far the scene's ground heights lie above the surface that objects stand on (SLAB_OFFSET_M).
     """
     category = scene.category
-    bottom_m = scene.center_m[:, 2] - 0.5 * (np.abs(scene.rotation[:, 2, :]) * scene.size_m).sum(axis=1)
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
     inside = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
     pixel = row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1)
-    height_m, ground_class = scene.surface()
-    known = inside & (ground_class[pixel] >= 0)
-    above_m = bottom_m - (height_m[pixel] - slab_offset_m)
+    height_m, ground_class = scene.ground_under()
+    known = ground_class >= 0
+    above_m = scene.bottom_m - (height_m - slab_offset_m)
 
     standing = np.isin(category, STANDING)
     vehicles, buildings = np.isin(category, VEHICLES), category == BUILDING
-    drivable, road = (_mask(scene, classes) for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
-    return np.array(
-        [
-            _share(_overlapping(scene), np.isin(category, SOLID)),
-            _share(above_m > TOLERANCE_M, standing & known),
-            _share(above_m < -TOLERANCE_M, standing & known),
-            _share(~known, standing & inside),
-            _share(~drivable[pixel], vehicles & known),
-            _share(road[pixel], buildings & known),
-            _largest_component(road),
-        ],
-        np.float64,
-    )
+    drivable, road = (_mask(scene, classes)[pixel] for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
+    looked_for = {
+        "overlapping": (_overlapping(scene), np.isin(category, SOLID)),
+        "floating": (above_m > TOLERANCE_M, standing & known),
+        "sunken": (above_m < -TOLERANCE_M, standing & known),
+        "over_unknown_ground": (~known, standing & inside),
+        "off_road_vehicles": (~drivable, vehicles & known),
+        "buildings_on_road": (road, buildings & known),
+    }
+    return {name: (bad & among, among) for name, (bad, among) in looked_for.items()}
+
+
+def scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
+    """(7, 2) numerators and denominators of MEASURES for one scene; slab_offset_m as for `faults`."""
+    shares = [(int(bad.sum()), int(among.sum())) for bad, among in faults(scene, slab_offset_m).values()]
+    return np.array([*shares, _largest_component(_mask(scene, ROAD_CLASSES))], np.float64)
 
 
 def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
@@ -97,10 +99,6 @@ def validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T
     return {n: float(a / b) if b > 0 else None for n, a, b in zip(names, numerator, denominator, strict=True)}
-
-
-def _share(bad: np.ndarray, among: np.ndarray) -> tuple[int, int]:
-    return int((bad & among).sum()), int(among.sum())
 
 
 def _overlapping(scene: Scene) -> np.ndarray:

@@ -43,6 +43,18 @@ def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nd
     return picture if supersample == 1 else np.round(block_mean(picture, supersample)).astype(np.uint8)
 
 
+def outlined_picture(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
+    """The smooth picture from above with the border of a region (rows, cols), True = inside: (H, W, 3) uint8."""
+    picture = bev_picture(scene, size_px, supersample=2).copy()
+    view = _view_from_above(scene.grid, size_px)
+    inside = region[scene.grid.pixel(view.x_m(), 0.0)[0]][:, scene.grid.pixel(0.0, view.y_m())[1]]
+    border = np.zeros_like(inside)
+    border[1:] |= inside[1:] != inside[:-1]
+    border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
+    picture[border] = MARK_COLOR
+    return picture
+
+
 @cache
 def _color_pairs() -> np.ndarray:
     """(18 x 256, 6): the colours of two neighbouring pixels, by the class id of the first plus 256 that of the second."""

@@ -137,6 +137,19 @@ REJECTS = _schema(
 )
 
 
+EDITS = _schema(
+    "One row per primitive that a step of the list of edits touched, in the scene that was given under the same scene_id.",
+    _SCENE_ID,
+    ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
+    ("edit",       pa.string(),  "",    "remove, duplicate, translate, rotate, scale, relabel, snap or repair."),
+    ("primitive",  pa.int32(),   "1",   "Number of the primitive in the scene as it was before this step, from 0."),
+    ("change",     pa.string(),  "",    "removed, copied or changed."),
+    ("moved_m",    pa.float32(), "m",   "How far the centre moved; a copy's distance from its original."),
+    ("turned_rad", pa.float32(), "rad", "The most that one of its axes turned, as a line."),
+    ("resized",    pa.float32(), "1",   "The largest change of an extent, as a share of what it was."),
+)
+
+
 def latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """(C, h, w) posterior moments per scene; float16, channels first."""
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
@@ -210,7 +223,9 @@ def _fixed_lists(values: np.ndarray, width: int) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values, np.float32).reshape(-1)), width)
 
 
-def _primitives_table(scenes: Sequence[Scene]) -> pa.Table:
+def primitives_table(scenes: Sequence[Scene]) -> pa.Table:
+    """The rows of `primitives` for some scenes, one or more."""
+
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
 
@@ -254,7 +269,7 @@ def _rasters_table(scenes: Sequence[Scene]) -> pa.Table:
 
 def scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
     """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
-    return {"scenes": _scenes_table(scenes), "primitives": _primitives_table(scenes), "rasters": _rasters_table(scenes)}
+    return {"scenes": _scenes_table(scenes), "primitives": primitives_table(scenes), "rasters": _rasters_table(scenes)}
 
 
 # -------------------------------------------------------------------------------------------------- from tables
@@ -353,7 +368,7 @@ class Shard:
         return storage.join(self.root, table, f"source={self.source}", f"split={self.split}", name)
 
     def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
-        schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS}.get(table)
+        schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS, "edits": EDITS}.get(table)
         return storage.read_parquet(self.path(table), columns, schema)
 
     def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
