@@ -87,8 +87,8 @@ class DiTPreset:
 DIT_PRESETS = {
     #                         lvae       patch depth width heads batch steps
     "smoke":       DiTPreset("smoke",    2,    1,    32,   2,    8,    8, normalise_latents=True, learning_rate=1e-3),
-    "demo":        DiTPreset("demo",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999),
-    "town":        DiTPreset("town",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999),
+    "demo":        DiTPreset("demo",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999, prediction="velocity"),
+    "town":        DiTPreset("town",     2,    6,    256,  4,    16,   30_000, normalise_latents=True, learning_rate=1e-3, ema_decay=0.999, prediction="velocity"),
     # The paper gives three days on four A100s, not a number of steps.
     "kitti360":    DiTPreset("kitti360", 2,    12,   768,  12,   256,  400_000),
     "kitti360-l":  DiTPreset("kitti360", 2,    24,   1024, 16,   256,  400_000),

@@ -1,0 +1,316 @@
+"""The roads of a Scene as lines: centrelines with height and width, joined at nodes, from the road mask alone.
+
+The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks; spurs that only come from the outline are
+pruned, and forks closer together than the road is wide become one node. Beyond the scene's border the mask goes on as it
+is there, so that a road leaves the scene straight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import networkx as nx
+import numpy as np
+from scipy import ndimage
+from skimage.morphology import skeletonize
+
+from models.scene import Scene
+
+ROAD_CLASSES = ("road", "crossing")
+CELL_M = 0.5  # of the mask that is thinned
+HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands left out
+MARGIN_M = 16.0  # how far the mask goes on beyond the border
+SPUR = 1.6  # a dead end shorter than this many half widths of its fork is no road
+ONE_NODE = 1.0  # forks closer than this many half widths are one
+SMOOTH_M = 3.0  # standard deviation of the Gaussian along a line
+LEAST_M = 4.0  # a shorter line is no road
+AROUND = np.ones((3, 3), int)  # eight neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """One line between two nodes; k points, evenly spaced, in the scene frame."""
+
+    xyz_m: np.ndarray  # (k, 3), on the ground
+    width_m: np.ndarray  # (k,) of the whole road
+    start: int  # node, -1 where the road leaves the scene or ends
+    end: int
+    number: int  # in the network
+
+    @property
+    def length_m(self) -> float:
+        return float(np.linalg.norm(np.diff(self.xyz_m[:, :2], axis=0), axis=1).sum())
+
+    def reversed(self) -> Road:
+        return Road(self.xyz_m[::-1], self.width_m[::-1], self.end, self.start, self.number)
+
+
+@dataclass(frozen=True, eq=False)
+class RoadNetwork:
+    """Roads, and the nodes where three or more of their ends meet."""
+
+    roads: tuple[Road, ...]
+    nodes_m: np.ndarray  # (n, 3)
+
+    def leaving(self, node: int) -> list[Road]:
+        """The roads at a node, each leading away from it."""
+        return [r for road in self.roads for r in (road, road.reversed()) if r.start == node]
+
+
+def road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
+    """The centrelines of a scene's roads, points about spacing_m apart; no roads where there is no road class."""
+    mask = _mask(scene)
+    margin = round(MARGIN_M / CELL_M)
+    wide = np.pad(mask, margin, mode="edge")
+    half_m = ndimage.distance_transform_edt(wide) * CELL_M
+    graph = _graph(skeletonize(wide))
+    _prune(graph, half_m, margin)
+    _unite_close_nodes(graph, half_m)
+    height_m = _height(scene, mask.shape)
+
+    roads, ends = [], []
+    for u, v, path in graph.edges(data="path"):
+        path = path - margin
+        for inside, first, last in _inside(_smooth(path, SMOOTH_M / CELL_M), mask.shape):
+            if len(inside) * CELL_M < LEAST_M:
+                continue
+            line = inside if first else _leaving_straight(inside[::-1], half_m, margin)[::-1]
+            line = line if last else _leaving_straight(line, half_m, margin)
+            line = _resampled(line, spacing_m / CELL_M)
+            x_m = scene.grid.front_m - (line[:, 0] + 0.5) * CELL_M
+            y_m = scene.grid.left_m - (line[:, 1] + 0.5) * CELL_M
+            z_m = _smooth(ndimage.map_coordinates(height_m, line.T, order=1, mode="nearest"), SMOOTH_M / spacing_m)
+            width_m = 2 * ndimage.map_coordinates(half_m, line.T + margin, order=1, mode="nearest")
+            roads.append(Road(np.stack([x_m, y_m, z_m], axis=1), width_m, -1, -1, len(roads)))
+            ends.append([node if whole and graph.degree(node) > 2 else None for node, whole in ((u, first), (v, last))])
+    nodes = sorted({node for pair in ends for node in pair if node is not None})
+    number = {node: k for k, node in enumerate(nodes)} | {None: -1}
+    roads = [replace(road, start=number[a], end=number[b]) for road, (a, b) in zip(roads, ends, strict=True)]
+    network = RoadNetwork(tuple(roads), np.zeros((len(nodes), 3)))
+    meeting = [np.mean([road.xyz_m[0] for road in network.leaving(k)], axis=0) for k in range(len(nodes))]
+    return replace(network, nodes_m=np.reshape(meeting, (-1, 3)))
+
+
+def _mask(scene: Scene) -> np.ndarray:
+    """(h, w) bool: where the road is, in cells of CELL_M, without small holes and islands."""
+    index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
+    road = scene.occupied[index].any(axis=0)
+    factor = max(1, round(CELL_M / scene.grid.resolution_m))
+    rows, cols = (n // factor for n in road.shape)
+    cells = road[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor).mean(axis=(1, 3)) >= 0.5
+    cells = ~_large(~cells, HOLE_M2, border=True)
+    return _large(cells, ISLAND_M2)
+
+
+def _large(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
+    """The 4-connected parts of a mask that are large enough, or, if so asked, touch its border."""
+    parts, count = ndimage.label(mask)
+    keep = np.bincount(parts.ravel(), minlength=count + 1) * CELL_M**2 >= area_m2
+    if border:
+        keep[np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = True
+    keep[0] = False
+    return keep[parts]
+
+
+def _graph(skeleton: np.ndarray) -> nx.MultiGraph:
+    """Forks and ends as nodes (`place` (2,), row and column), the lines between them as edges (`path` (k, 2) from u to v, u < v)."""
+    neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1
+    forks, count = ndimage.label(skeleton & (neighbours > 2), AROUND)
+    graph = nx.MultiGraph()
+    for fork in range(1, count + 1):
+        graph.add_node(fork, place=np.argwhere(forks == fork).mean(axis=0))
+    lines, number = ndimage.label(skeleton & (forks == 0), AROUND)
+    touching = ndimage.maximum_filter(forks, size=3)
+    for where, line in zip(ndimage.find_objects(lines, number), range(1, number + 1), strict=True):
+        path = _ordered(np.argwhere(lines[where] == line)) + [s.start for s in where]
+        ends = []
+        for end in (0, -1):
+            fork = int(touching[tuple(path[end])])
+            if len(path) == 1 and end == -1 and fork:  # one pixel between two forks: they differ around it
+                around = forks[path[0][0] - 1 : path[0][0] + 2, path[0][1] - 1 : path[0][1] + 2]
+                fork = int(min(set(around[around > 0].tolist()) - {ends[0]}, default=0))
+            if not fork:
+                fork = graph.number_of_nodes() + count + 1
+                graph.add_node(fork, place=path[end].astype(float))
+            ends.append(fork)
+        _join(graph, *ends, path.astype(float))
+    return graph
+
+
+def _join(graph: nx.MultiGraph, u: int, v: int, path: np.ndarray) -> None:
+    """An edge whose path (k, 2) leads from u to v, their places added at its ends."""
+    path = np.concatenate([[graph.nodes[u]["place"]], path, [graph.nodes[v]["place"]]])
+    graph.add_edge(min(u, v), max(u, v), path=path if u <= v else path[::-1])
+
+
+def _ordered(pixels: np.ndarray) -> np.ndarray:
+    """The pixels (k, 2) of an 8-connected line without forks, from one end to the other."""
+    left = {tuple(p) for p in pixels.tolist()}
+
+    def beside(p: tuple[int, int]) -> Iterator[tuple[int, int]]:
+        steps = ((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+        return ((p[0] + i, p[1] + j) for i, j in steps if (p[0] + i, p[1] + j) in left)
+
+    here = min(left, key=lambda p: (sum(1 for _ in beside(p)), p))
+    found = []
+    while here is not None:
+        found.append(here)
+        left.discard(here)
+        here = next(beside(here), None)
+    return np.array(found)
+
+
+def _length(path: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) * CELL_M
+
+
+def _half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> float:
+    return float(half_m[tuple(np.round(graph.nodes[node]["place"]).astype(int))])
+
+
+def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
+    """Takes out spurs, the shortest first, and joins what is left at nodes that are no forks any more."""
+    while True:
+        spurs = []
+        for u, v, key, path in graph.edges(keys=True, data="path"):
+            for end, fork in ((u, v), (v, u)):
+                row, col = graph.nodes[end]["place"]
+                inner = margin <= row < half_m.shape[0] - margin and margin <= col < half_m.shape[1] - margin
+                longest = SPUR * _half_width(graph, fork, half_m)
+                if graph.degree(end) == 1 and graph.degree(fork) > 2 and inner and _length(path) < longest:
+                    spurs.append((_length(path), end, fork, key))
+        if not spurs:
+            return
+        _, end, _, _ = min(spurs)
+        graph.remove_node(end)
+        _straighten(graph)
+
+
+def _straighten(graph: nx.MultiGraph) -> None:
+    """Joins the two lines at every node where only two meet."""
+    for node in [n for n, degree in graph.degree() if degree == 2]:
+        edges = list(graph.edges(node, keys=True, data="path"))
+        if len(edges) == 2:  # else one line from the node to itself
+            parts, ends = [], []
+            for u, v, _, path in edges:
+                other = v if u == node else u
+                ends.append(other)
+                parts.append(path if other <= node else path[::-1])  # towards the node
+            graph.remove_node(node)
+            _join(graph, ends[0], ends[1], np.concatenate([parts[0][1:-1], parts[1][::-1][1:-1]]))
+
+
+def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
+    """Makes one node of two forks whose line is shorter than the road is wide, the closest first."""
+    while True:
+        close = []
+        for u, v, path in graph.edges(data="path"):
+            if u != v and graph.degree(u) > 2 and graph.degree(v) > 2:
+                length = _length(path)
+                if length < ONE_NODE * (_half_width(graph, u, half_m) + _half_width(graph, v, half_m)):
+                    close.append((length, u, v))
+        if not close:
+            return
+        _, u, v = min(close)
+        graph.remove_edges_from([(u, v, key) for key in list(graph[u][v])])
+        graph.nodes[u]["place"] = (graph.nodes[u]["place"] + graph.nodes[v]["place"]) / 2
+        ways = [edge for node in (u, v) for edge in graph.edges(node, keys=True, data="path")]
+        for a, b, key, path in ways:
+            graph.remove_edge(a, b, key) if graph.has_edge(a, b, key) else None
+            ends = [u if node in (u, v) else node for node in sorted((a, b))]
+            _join(graph, *ends, path[1:-1])
+        graph.remove_node(v)
+        _straighten(graph)
+
+
+def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
+    """A line (k,) or (k, 2), smoothed along k with its ends held."""
+    reach = min(len(line) - 1, int(4 * sigma))
+    if reach < 1:
+        return line
+    before, after = 2 * line[0] - line[reach:0:-1], 2 * line[-1] - line[-2 : -reach - 2 : -1]
+    long = np.concatenate([before, line, after])
+    return ndimage.gaussian_filter1d(long, sigma, axis=0)[reach : reach + len(line)]
+
+
+def _inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
+    """The runs of a line (k, 2) inside the scene, and whether each holds the line's first and last point."""
+    inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
+    border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    for start, stop in border.tolist():
+        yield line[start:stop], start == 0, stop == len(line)
+
+
+def _leaving_straight(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
+    """A line (k, 2) whose last point is at the scene's border: near it straight on from before.
+
+    Within half a width of the border the line turns towards where the mask was made to go on.
+    """
+    half = half_m[tuple(np.round(line[-1] + margin).astype(int))] / CELL_M
+    left = len(line) - int(2 * half)
+    if left < 4 * half:
+        return line
+    step = (line[left - 1] - line[left - 1 - int(2 * half)]) / int(2 * half)
+    ahead = line[left - 1] + np.arange(1, 4 * int(half) + 2)[:, None] * step
+    shape = np.array(half_m.shape) - 2 * margin
+    outside = ((ahead < -0.5) | (ahead > shape - 0.5)).any(axis=1)
+    return np.concatenate([line[:left], ahead[: int(outside.argmax())]]) if outside.any() else line
+
+
+def _resampled(line: np.ndarray, spacing: float) -> np.ndarray:
+    """(n, 2) points of a line, evenly spaced along it, both ends among them."""
+    along = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+    wanted = np.linspace(0, along[-1], max(2, round(along[-1] / spacing) + 1))
+    return np.stack([np.interp(wanted, along, line[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
+    """(h, w) height of the road in cells of CELL_M; beyond it the nearest road's."""
+    index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
+    known = scene.occupied[index].any(axis=0)
+    height_m = np.where(scene.occupied[index], scene.height_m[index], -np.inf).max(axis=0, initial=-np.inf)
+    if not known.any():
+        return np.zeros(shape)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    factor = max(1, round(CELL_M / scene.grid.resolution_m))
+    middle = np.s_[factor // 2 :: factor]
+    return height_m[tuple(nearest)][middle, middle][: shape[0], : shape[1]]
+
+
+def drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
+    """(k, 3) a way along the roads, points as far apart as theirs, on the ground, smooth; (0, 3) where no road is.
+
+    It begins at the end of a road nearest to start_m, and at each node goes on along the road that turns least and has not
+    been driven. `right` is how far right of the centreline, as a share of the road's width: 0.25 is the middle of the right
+    half.
+    """
+    starts = [r for road in network.roads for r in (road, road.reversed()) if r.start == -1]
+    starts = starts or [r for road in network.roads for r in (road, road.reversed())]
+    if not starts:
+        return np.zeros((0, 3))
+    here = min(starts, key=lambda r: float(np.hypot(*(r.xyz_m[0, :2] - start_m))))
+    ways, driven = [here], {here.number}
+    while here.end >= 0:
+        onward = [road for road in network.leaving(here.end) if road.number not in driven]
+        if not onward:
+            break
+        here = max(onward, key=lambda road, last=here: float(_direction(last.reversed()) @ -_direction(road)))
+        ways.append(here)
+        driven.add(here.number)
+    line = np.concatenate([way.xyz_m for way in ways])
+    width_m = np.concatenate([way.width_m for way in ways])
+    apart = np.append(True, np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6)
+    line, width_m = line[apart], width_m[apart]
+    ahead = np.gradient(line[:, :2], axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+    beside = right * np.minimum(width_m, np.median(width_m))[:, None] * np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    line = line + np.pad(beside, ((0, 0), (0, 1)))
+    spacing_m = np.median(np.linalg.norm(np.diff(line, axis=0), axis=1))
+    return _smooth(line, SMOOTH_M / spacing_m)
+
+
+def _direction(road: Road) -> np.ndarray:
+    """(2,) of a road's first metres, away from its start."""
+    way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
+    return way / np.linalg.norm(way)
