@@ -29,6 +29,8 @@ lint: .venv/ready
 .venv/ready: pyproject.toml infra/constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
+	@# The schemas of OpenDRIVE, for a test; what else is in there wants an older numpy.
+	$(BIN)/pip install --disable-pip-version-check -q --no-deps asam-qc-opendrive==1.0.0
 	touch $@
 
 clean:

@@ -136,6 +136,29 @@ def scene_glb(scene: Scene) -> bytes:
     return trimesh.exchange.gltf.export_glb(world)
 
 
+def scene_ply(scene: Scene) -> bytes:
+    """The scene as one binary PLY mesh in the scene frame, z up, metres.
+
+    Vertices carry palette colours (sRGB), `class_id` and `primitive` (its number, GROUND for the ground).
+    """
+    ground_m, triangles, class_id = ground_mesh(scene)
+    vertices, faces, classes, primitives = [ground_m], [triangles], [class_id], [np.full(len(ground_m), GROUND)]
+    count = len(ground_m)
+    for index, transform in enumerate(scene_from_unit(scene)):
+        unit, unit_faces = unit_ellipsoid() if scene.category[index] == ELLIPSOID else unit_cuboid()
+        vertices.append(unit @ transform[:3, :3].T + transform[:3, 3])
+        faces.append(unit_faces + count)
+        classes.append(np.full(len(unit), CATEGORY_IDS[scene.category[index]]))
+        primitives.append(np.full(len(unit), index))
+        count += len(unit)
+    class_id = np.concatenate(classes).astype(np.uint8)
+    mesh = trimesh.Trimesh(
+        np.concatenate(vertices), np.concatenate(faces), vertex_colors=CLASS_COLORS[class_id], process=False
+    )
+    mesh.vertex_attributes = {"class_id": class_id, "primitive": np.concatenate(primitives).astype(np.int32)}
+    return trimesh.exchange.ply.export_ply(mesh)
+
+
 def write_glb(scene: Scene, path: str | Path) -> None:
     """Writes `scene_glb` to a temporary name beside `path` and moves it into place."""
     path = Path(path)

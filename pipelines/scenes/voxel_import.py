@@ -73,17 +73,23 @@ def in_our_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
     return turned[tuple(slice(None, None, int(step)) for step in ours_from_file.sum(axis=1))]
 
 
-def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
+def scene_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
     """The scene's voxels as `read_voxels` takes them: a compressed .npz, the same bytes on every call.
 
     Raises ValueError if the grid's shape is none of SHAPES.
     """
     voxels = voxelise(scene, grid or VoxelGrid())
     if voxels.shape not in SHAPES:
-        raise ValueError(f"{uri}: a voxel grid of {voxels.shape} cannot be read back, expected one of {SHAPES}")
+        raise ValueError(f"a voxel grid of {voxels.shape} cannot be read back, expected one of {SHAPES}")
     content = io.BytesIO()
     np.savez_compressed(content, **{ARRAY: voxels})
-    storage.write_whole(uri, lambda stream: stream.write(content.getvalue()))
+    return content.getvalue()
+
+
+def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
+    """Writes `scene_voxels_npz`."""
+    content = scene_voxels_npz(scene, grid)
+    storage.write_whole(uri, lambda stream: stream.write(content))
 
 
 def voxel_picture(voxels: np.ndarray) -> np.ndarray:
