@@ -133,6 +133,8 @@ class Repair(Chosen):
     """As elsewhere, but everything by default."""
     slab_offset_m: float = 0.3
     """As for snap."""
+    ground: Literal["both", "floating", "sunken", "none"] = "both"
+    """What to put on the ground."""
     push_m: float = 0.25
     """How far overlapping things may be pushed, each."""
     shrink: float = 0.95
@@ -194,7 +196,7 @@ def edits_of(config: Chosen | Replay) -> list[Edit]:
         case Snap():
             return [edit.Snap(select, config.slab_offset_m)]
         case Repair():
-            return [edit.Repair(select, config.slab_offset_m, config.push_m, config.shrink, config.drop)]
+            return [edit.Repair(select, config.slab_offset_m, config.ground, config.push_m, config.shrink, config.drop)]
     raise ValueError(f"no edit: {config!r}")
 
 

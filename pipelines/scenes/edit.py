@@ -22,7 +22,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from models.inpaint import polygon_contains
 from models.scene import CATEGORIES, CATEGORY_INDEX, Scene, canonical_boxes, joined, yaw_rotation
 from pipelines.metrics.validity import SLAB_OFFSET_M
-from pipelines.scenes.repair import apart, onto_ground, superfluous
+from pipelines.scenes.repair import GroundFaults, apart, onto_ground, superfluous
 from pipelines.scenes.tables import PRIMITIVES, primitives_table
 
 SIZES_M = (1e-3, 1e3)  # what an edit may leave
@@ -250,6 +250,8 @@ class Repair(Edit):
 
     slab_offset_m: float = SLAB_OFFSET_M
     """As for snap."""
+    ground: GroundFaults = "both"
+    """What to put on the ground."""
     push_m: float = 0.25
     """How far overlapping things may be pushed, each."""
     shrink: float = 0.95
@@ -258,8 +260,9 @@ class Repair(Edit):
     """Take out one of two that overlap all the same."""
 
     def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        scene = onto_ground(scene, chosen, self.slab_offset_m)
+        scene = onto_ground(scene, chosen, self.slab_offset_m, self.ground)
         scene = require_sound(apart(scene, chosen, self.push_m, self.shrink))
+        scene = onto_ground(scene, chosen, self.slab_offset_m, self.ground)  # where a push led over a slope
         gone = superfluous(scene, chosen) if self.drop else np.zeros(len(scene), bool)
         return scene.select(~gone), np.flatnonzero(~gone)
 

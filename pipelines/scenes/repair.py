@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
+from typing import Literal
 
 import numpy as np
 
@@ -23,10 +24,15 @@ STEPS = 20  # lengths of a push that are tried
 CANDIDATES = 6  # shortest pushes that are tried against everything around
 
 
-def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float) -> Scene:
+GroundFaults = Literal["both", "floating", "sunken", "none"]
+
+
+def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
     """Chosen (n,) primitives that float or are sunken, with their lowest point on the surface."""
     found = faults(scene, slab_offset_m)
-    wrong = chosen & (found["floating"][0] | found["sunken"][0])
+    wrong = np.zeros(len(scene), bool)
+    for name in ("floating", "sunken"):
+        wrong |= chosen & found[name][0] & (which in ("both", name))
     height_m, _ = scene.ground_under()
     center_m = scene.center_m.astype(float)
     center_m[wrong, 2] += (height_m - slab_offset_m - scene.bottom_m)[wrong]
