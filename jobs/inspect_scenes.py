@@ -6,6 +6,7 @@
     jobs/inspect_scenes.py sheet --dataset DIR --sort vegetation           64 scenes from bare to overgrown
     jobs/inspect_scenes.py sheet --dataset DIR --sort num_human --pick highest --view 3d
     jobs/inspect_scenes.py report --dataset DIR                            one self-contained HTML page
+    jobs/inspect_scenes.py gallery --dataset DIR --count 200               another: filters, every scene in 3D
 
 Reads the tables only. Files go to $PRITTI_HOME/inspect/<dataset> unless --output says otherwise.
 """
@@ -92,18 +93,37 @@ class Report:
     """The HTML file to write."""
 
 
+@dataclass(frozen=True)
+class Gallery:
+    """One HTML page to put online: scenes to filter by label and statistics, each in 3D. About 35 kB a scene."""
+
+    dataset: str = ""
+    """Dataset directory or URI (default: $PRITTI_HOME/datasets/town)."""
+    source: str = ""
+    """Only this source (default: whatever is there)."""
+    split: str = ""
+    """Only this split (default: whatever is there)."""
+    count: int = 100
+    """How many scenes, at most, evenly spread over the dataset."""
+    title: str = "Scenes"
+    """Of the page."""
+    output: str = ""
+    """The HTML file to write."""
+
+
 Config = (
     Annotated[OneScene, tyro.conf.subcommand("scene")]
     | Annotated[Sheet, tyro.conf.subcommand("sheet")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Gallery, tyro.conf.subcommand("gallery")]
 )
 
 
-def directory(config: OneScene | Sheet | Report) -> str:
+def directory(config: OneScene | Sheet | Report | Gallery) -> str:
     return absolute(config.dataset) if config.dataset else home("datasets", "town")
 
 
-def destination(config: OneScene | Sheet | Report, name: str) -> str:
+def destination(config: OneScene | Sheet | Report | Gallery, name: str) -> str:
     """--output, or a place under $PRITTI_HOME named after the dataset."""
     if config.output:
         return absolute(config.output)
@@ -197,9 +217,32 @@ def write_page(config: Report) -> str:
     return path
 
 
-def main(config: OneScene | Sheet | Report) -> None:
+def write_gallery(config: Gallery) -> str:
+    """Write the page and return its path."""
+    from rich.progress import Progress
+
+    from pipelines import storage
+    from pipelines.gallery import Catalogue
+    from pipelines.gallery_page import gallery_html
+
+    if config.count < 1:
+        raise ValueError(f"--count is {config.count}, expected at least 1")
+    catalogue = Catalogue.read(directory(config), config.source or None, config.split or None)
+    chosen = catalogue.choose(config.count, "drive")
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("pack scenes", total=len(chosen))
+        html = gallery_html(catalogue, chosen, config.title, lambda: bar.advance(shown))
+    path = destination(config, "gallery.html")
+    storage.write_text(html, path)
+    return path
+
+
+def main(config: OneScene | Sheet | Report | Gallery) -> None:
     if isinstance(config, OneScene):
         print("\n".join(draw_scenes(config)))
+    elif isinstance(config, Gallery):
+        print(write_gallery(config))
     else:
         print(draw_sheet(config) if isinstance(config, Sheet) else write_page(config))
 
