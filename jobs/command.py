@@ -63,6 +63,7 @@ def start_ray(training: bool = False) -> None:
     context.print_on_execution_start = False
     context.raise_original_map_exception = True  # a worker's ValueError stays one: see `root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
+    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # that its bars are off: ours are on
     for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # tracebacks of what reaches us anyway
         logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
@@ -88,9 +89,13 @@ def print_table(table: Table, file: IO[str] | None = None) -> None:
     from rich.console import Console
     from rich.table import Table as Lines
 
-    lines = Lines(*table.columns, title=table.title, caption=table.note, box=box.SIMPLE)
+    from pipelines.report import written
+
+    lines = Lines(title=table.title, caption=table.note, box=box.SIMPLE)
+    for name in table.columns:
+        lines.add_column(name, overflow="fold")  # names are told apart by their ends
     for row in table.rows:
-        lines.add_row(*("–" if cell is None else str(cell) for cell in row))
+        lines.add_row(*map(written, row))
     Console(file=file, width=None if file is None and sys.stdout.isatty() else 200).print(lines)
 
 
@@ -106,6 +111,7 @@ def run(main: Callable[[Any], None], config: Any, **tyro_options: Any) -> None:
     except Exception as error:
         cause = root_cause(error)
         if isinstance(cause, (ValueError, OSError)):
-            print(f"error: {cause}", file=sys.stderr)
+            said = str(cause).split("\nFailed to apply UDF transform", 1)[0]  # Ray's remark on how to retry
+            print(f"error: {said}", file=sys.stderr)
             sys.exit(2)
         raise

@@ -37,16 +37,18 @@ class Scenes:
     source: str = ""
     """Source of the scenes (default: whatever is there)."""
     split: str = ""
+    """Split of the scenes (default: whatever is there)."""
     limit: int | None = None
     """So many scenes, from the first on (default: all)."""
     output: str = ""
-    """Dataset directory (default: $PRITTI_HOME/edited)."""
+    """Dataset directory (default: $PRITTI_HOME/edited/<run>)."""
     run: str = "edited"
+    """Name of the run: scenes get source=edited-<run>."""
     pictures: int = 8
     """So many scenes on the page, as given and as edited."""
 
     def output_directory(self) -> str:
-        return absolute(self.output) if self.output else home("edited")
+        return absolute(self.output) if self.output else home("edited", self.run)
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class Translate(Chosen):
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x (ahead), y (left), z (up); with --along own along each one's length, width and height."""
     along: Literal["scene", "own"] = "scene"
+    """The scene's axes, or each primitive's own."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +211,7 @@ def edit_scenes(config: Chosen | Replay) -> Edited:
         raise ValueError(f"--pictures is {config.pictures}, --run {config.run!r}: expected 0 or more, a plain word")
     edits = edits_of(config)
     for edit in edits:
-        edit.select.check()
+        edit.check()
     directory = absolute(config.input) if config.input else home("generated")
     selection = Selection(directory, config.source or None, config.split or None, config.limit, "first")
     total = sum(len(rows) for _, rows in selection.shards())
@@ -228,6 +231,7 @@ def main(config: Chosen | Replay) -> None:
     print_table(made.table)
     rejected = f"; {made.rejects} scenes rejected, see the rejects table" if made.rejects else ""
     print(f"{made.scenes} scenes, source edited-{config.run}, in {config.output_directory()}{rejected}")
+    print(f"before and after: {made.page}")
 
 
 if __name__ == "__main__":

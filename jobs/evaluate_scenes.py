@@ -45,6 +45,8 @@ class Config:
     """Only this split of them (default: whatever is there); --generated may be any dataset directory."""
     run: str = ""
     """Only source generated-<run> (default: whatever is there)."""
+    generated_source: str = ""
+    """Only this source, such as edited-<run> or imported-<name> (default: whatever is there)."""
     samples: int = 1000
     """At most so many scenes on each side, equally many; the paper takes 1000, also 5000 and 10000."""
     reference: Literal["farthest", "apart", "spread"] = "farthest"
@@ -64,7 +66,7 @@ class Config:
     lvae_split: str = "test"
     """Split to reconstruct."""
     limit: int | None = None
-    """Reconstruct at most so many scenes, spread evenly."""
+    """With --lvae: reconstruct at most so many scenes, spread evenly."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
     """Lowest and highest z of the 256 x 256 x 32 voxels."""
     pictures: int = 3
@@ -84,11 +86,19 @@ def evaluate(config: Config) -> dict:
     for name, least in (("pictures", 0), ("samples", 2), ("supersample", 1)):
         if (given := getattr(config, name)) < least:
             raise ValueError(f"--{name} is {given}, expected {least} or more")
+    if config.limit is not None and not config.lvae:
+        raise ValueError("--limit counts scenes to reconstruct, with --lvae; of generated scenes --samples")
     dataset = None
     if config.lvae or not config.real.endswith(".npz"):
         dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     wanted = config.generated or ("" if config.lvae else home("generated"))
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
+    from pipelines import storage
+
+    if config.inception and not storage.exists(absolute(config.inception)):
+        raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
+    if config.lvae and not storage.exists(storage.join(absolute(config.lvae), "config.json")):
+        raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")
     scores: dict = {}
     start_ray()
     with Progress() as bar:
@@ -147,7 +157,7 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     from pipelines.metrics.adm_npz import picture_shape
     from pipelines.selection import Selection
 
-    source = f"generated-{config.run}" if config.run else None
+    source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = absolute(config.generated) if config.generated else home("generated")
     labels = "balanced" if config.balance else "spread"
     sides, counts, sizes = {}, {}, {}

@@ -73,6 +73,8 @@ def evaluate_seams(config: Config) -> dict:
             Lines(config.real_rows_m, ()),
         ),
     }
+    for selection, _ in sides.values():
+        selection.shards()  # what is not there is said before anything starts
     start_ray()
     with Progress() as bar:
         measured = {}

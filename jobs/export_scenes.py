@@ -25,6 +25,7 @@ class Config:
     source: str = ""
     """Source of the scenes (default: whatever is there)."""
     split: str = ""
+    """Split of the scenes (default: whatever is there)."""
     limit: int | None = None
     """So many scenes, from the first on (default: all)."""
     formats: tuple[Literal["glb", "ply", "npz", "xodr"], ...] = ("glb",)

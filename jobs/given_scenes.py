@@ -23,12 +23,15 @@ class GivenScenes:
     source: str = ""
     """Source of the scenes (default: whatever is there)."""
     split: str = ""
+    """Split of the scenes (default: whatever is there)."""
     limit: int = 1
     """How many scenes, from the first on."""
     label: str = ""
     """Label to aim at (default: the scene's own)."""
     seed: int = 0
+    """Another seed, other results."""
     guidance: float = 1.0
+    """Classifier-free guidance scale; 1 is none."""
     actors: int = 1
     """Pipelines at work at once; one per GPU."""
 
@@ -44,11 +47,11 @@ class Repainting(GivenScenes):
     """The same with one set of RePaint's numbers (paper, Sec. 3.3 and supplement B.3)."""
 
     steps: int = 250
-    """Denoising steps without detours."""
+    """Denoising steps, those that RePaint repeats not counted."""
     jump_length: int = 10
-    """Steps that RePaint goes back at a time."""
+    """How many steps RePaint rolls back at a time (J of the paper)."""
     resamplings: int = 10
-    """How often it passes the same steps."""
+    """How often it passes the same steps (R of the paper)."""
 
     def resampling(self) -> Resampling:
         from models.pipeline import Resampling
@@ -61,6 +64,10 @@ def pipeline_directory(model: str) -> str:
     from pipelines import storage
 
     directory = absolute(model) if model else home("models", "pritti-town")
+    if not model and not storage.exists(storage.join(directory, "model_index.json")):
+        found = storage.list_files(home("models"), "model_index.json")
+        if len(found) == 1:  # the only one there is
+            return found[0].removesuffix("/model_index.json")
     if not storage.exists(storage.join(directory, "model_index.json")):
         raise ValueError(f"{directory}: no PrITTI pipeline here; run jobs/train_dit.py first")
     return directory

@@ -38,6 +38,7 @@ class Config(Repainting):
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/inpainted)."""
     run: str = "inpainted"
+    """Name of the run: scenes get source=generated-<run>."""
     pictures: int = 8
     """So many scenes on the page."""
 
@@ -51,7 +52,14 @@ def inpaint(config: Config) -> dict[str, float | None]:
         raise ValueError("no region: give --polygon-m, --half-plane or --objects")
     if config.variants < 1 or config.pictures < 0:
         raise ValueError(f"--variants is {config.variants}, --pictures {config.pictures}: expected 1 and 0 or more")
+    if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
+        raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of three corners or more")
     model = pipeline_directory(config.model)
+    if config.label:
+        from models.labels import require_labels
+        from pipelines import storage
+
+        require_labels(storage.read_json(storage.join(model, "dit/config.json"))["label"], [config.label])
     from rich.progress import Progress
 
     from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes

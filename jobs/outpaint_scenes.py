@@ -31,6 +31,7 @@ class Config(Repainting):
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/outpainted)."""
     run: str = "outpainted"
+    """Name of the run: scenes get source=generated-<run>."""
     extent_m: tuple[float, float] | None = None
     """Length (ahead) and width of the whole in metres, the scene in its middle; instead of the four numbers below."""
     ahead: int = 1
@@ -75,6 +76,11 @@ def outpaint(config: Config) -> pa.Table:
         raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
     last = last_blocks(config)
     model = pipeline_directory(config.model)
+    if config.label:
+        from models.labels import require_labels
+        from pipelines import storage
+
+        require_labels(storage.read_json(storage.join(model, "dit/config.json"))["label"], [config.label])
     from rich.progress import MofNCompleteColumn, Progress
 
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes

@@ -25,11 +25,13 @@ class Config:
     source: str = ""
     """Source of the scenes (default: whatever is there)."""
     split: str = ""
+    """Split of the scenes (default: whatever is there)."""
     limit: int = 1
     """How many scenes, from the first on."""
     output: str = ""
     """Where streets/ goes (default: the input directory)."""
     run: str = "drive"
+    """Name of the run, a directory under streets/."""
     spacing_m: float = 1.0
     """Between two frames."""
     camera_height_m: float = 1.55

@@ -31,6 +31,7 @@ class Config:
     labels: tuple[str, ...] = ()
     """Labels, in turn over the scenes (default: all that the model knows, balanced)."""
     seed: int = 0
+    """Scene i depends on the seed, i and its label alone."""
     sampler: Literal["ddpm", "ddim", "dpm++"] = "ddpm"
     """The paper's, DDIM, or DPM-Solver++, which needs the fewest steps."""
     steps: int = 250
@@ -40,25 +41,29 @@ class Config:
     actors: int = 1
     """Pipelines at work at once; one per GPU."""
     batch_size: int = 8
+    """Scenes at once in each pipeline; changes no scene."""
     glb: int = 0
     """Also export the first N scenes as GLB under <output>/glb/<run>."""
 
 
 def sample(config: Config) -> str:
     """Generate and return the dataset directory."""
-    if config.num_scenes < 1:
-        raise ValueError(f"--num-scenes is {config.num_scenes}, expected at least 1")
+    for name in ("num_scenes", "steps", "actors", "batch_size"):
+        if (given := getattr(config, name)) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} is {given}, expected at least 1")
     model = pipeline_directory(config.model)
+    from models.labels import LABELS, require_labels
+    from pipelines import storage
+
+    kind = storage.read_json(storage.join(model, "dit/config.json"))["label"]
+    require_labels(kind, config.labels)
     from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
-    from models.pipeline import LABELS
-    from pipelines import storage
     from pipelines.generate import SampleRequest, sample_scenes
     from pipelines.scenes.mesh import scene_glb
     from pipelines.scenes.tables import read_scenes
 
     output = absolute(config.output) if config.output else home("generated")
-    kind = storage.read_json(storage.join(model, "dit/config.json"))["label"]
     request = SampleRequest(
         model=model,
         output=output,

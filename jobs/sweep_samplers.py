@@ -55,7 +55,8 @@ def sweep_samplers(config: Config) -> list[dict]:
         raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
     from rich.progress import Progress
 
-    from models.pipeline import LABELS, SAMPLERS
+    from models.labels import LABELS
+    from models.pipeline import SAMPLERS
     from pipelines import storage
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks, describe

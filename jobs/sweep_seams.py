@@ -22,10 +22,13 @@ class Config(GivenScenes):
     settings: tuple[tuple[int, int, int], ...] = ((250, 10, 10), (250, 5, 5), (250, 1, 1), (50, 10, 10), (50, 5, 5), (50, 1, 1))  # fmt: skip
     """Steps, jump length and resamplings, in threes."""
     overlap: float = 0.5
+    """Of neighbouring blocks."""
     mode: Literal["reencode", "copy"] = "reencode"
+    """How a block knows its neighbours: encoded anew in its own frame, or the shifted latent (the paper)."""
     output: str = ""
     """Where everything goes (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     batch_size: int = 4
+    """Blocks of a scene to make at once."""
 
 
 def sweep_seams(config: Config) -> list[dict]:

@@ -82,7 +82,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
     from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
     from jobs.tracking import Tracker
     from jobs.validation import SamplingCheck
-    from models.pipeline import LABELS
+    from models.labels import LABELS
     from models.training import Execution, Optimisation
     from pipelines.encode import load_lvae, weights_digest
     from pipelines.feed import LatentReader, Stream

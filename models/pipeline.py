@@ -28,11 +28,12 @@ from models.diffusion import (
 )
 from models.dit import DiT
 from models.inpaint import Contents, composited, latent_mask, whole_cells
+from models.labels import label_index
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.outpaint import Block, Lattice, Place, World, height_near
 from models.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
-from models.scene import DENSITIES, Scene
+from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
 
 NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
@@ -45,21 +46,6 @@ SAMPLERS = {
     "dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True}),
 }
 StepCallback = Callable[[DiffusionPipeline, int, int, dict], dict]  # diffusers' callback_on_step_end
-
-# What a DiT may be conditioned on; the joint label is 3 * vegetation + vehicle.
-LABELS = {
-    "vegetation": DENSITIES,
-    "vehicle": DENSITIES,
-    "joint": tuple(f"{vegetation}-{vehicle}" for vegetation in DENSITIES for vehicle in DENSITIES),
-    "none": ("any",),
-}
-
-
-def label_index(kind: str, name: str) -> int:
-    """Index of a label's name; ValueError lists the names of this kind."""
-    if name not in LABELS[kind]:
-        raise ValueError(f"label {name!r} is unknown to a {kind} model, expected one of: {', '.join(LABELS[kind])}")
-    return LABELS[kind].index(name)
 
 
 def seeds_of(generator: torch.Generator | Sequence[torch.Generator] | None, seed: int, count: int) -> list[int]:
@@ -116,6 +102,11 @@ class PrITTIPipeline(DiffusionPipeline):
         self.dit.eval().requires_grad_(False)
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
+
+    @classmethod
+    def from_pretrained(cls, directory: str, **options) -> PrITTIPipeline:
+        """A pipeline from a directory that `save_pretrained` or jobs/train_dit.py wrote, as in diffusers."""
+        return super().from_pretrained(directory, **{"low_cpu_mem_usage": False} | options)
 
     @property
     def spec(self) -> LayoutSpec:

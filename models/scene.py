@@ -197,6 +197,10 @@ class Scene:
     def __len__(self) -> int:
         return len(self.category)
 
+    def __repr__(self) -> str:
+        grid = self.grid
+        return f"Scene({self.scene_id!r}, {len(self)} primitives, ground {grid.rows} x {grid.cols} at {grid.resolution_m} m)"
+
     @property
     def volume_m3(self) -> np.ndarray:
         """(n,) volume of each primitive: l w h for cuboids, pi/6 l w h for ellipsoids."""

@@ -13,11 +13,12 @@ import ray.data
 from models.inpaint import object_region
 from models.scene import Scene
 from pipelines import storage
+from pipelines.claims import claim
 from pipelines.ingest import per_row
 from pipelines.report import Picture, Pictures, Section, Table, report_html
 from pipelines.scenes.edit import Edit, edits_to_json, replayed
 from pipelines.scenes.render import bev_picture, outlined_picture
-from pipelines.scenes.tables import EDITS, Shard, rejects_table
+from pipelines.scenes.tables import EDITS, TABLES, Shard, rejects_table
 from pipelines.selection import Selection
 
 PICTURE_PX = 512
@@ -41,18 +42,14 @@ class EditRequest:
         return Shard(self.output, self.source, given.split, number)
 
     def claim(self, selection: Selection) -> None:
-        """Keep the source for these edits of these scenes. Raises ValueError if it holds others."""
-        record = storage.join(self.output, f"{self.source}.json")
-        chosen = {"input": selection.root, "source": selection.source, "split": selection.split}
-        options = {"edits": edits_to_json(self.edits), **chosen, "limit": selection.limit}
-        if storage.exists(record):
-            made = storage.read_json(record)
-            if differing := [name for name in options if made.get(name) != options[name]]:
-                raise ValueError(
-                    f"{self.output} holds a run {self.run!r} of other {' and '.join(differing)}; choose another --run or"
-                    " --output"
-                )
-        storage.write_json(options, record)
+        """Keep the source for these edits of these scenes (claims.py)."""
+        chosen = {
+            "input": selection.root,
+            "source": selection.source,
+            "split": selection.split,
+            "limit": selection.limit,
+        }
+        claim(self.output, self.source, self.run, {"edits": edits_to_json(self.edits)} | chosen)
 
 
 def edited(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table]]:
@@ -96,6 +93,7 @@ class Edited:
     scenes: int
     rejects: int
     table: Table
+    page: str
 
 
 def edit_scenes(
@@ -106,8 +104,10 @@ def edit_scenes(
     Raises ValueError if the output holds a run of other edits, for a list that no scene can take, or one that changes
     nothing anywhere.
     """
+    if not request.edits:
+        raise ValueError("the list of edits is empty")
     for edit in request.edits:
-        edit.select.check()
+        edit.check()
     parts = selection.shards()
     request.claim(selection)
     rows = ray.data.from_items([{"shard": k} for k in range(len(parts))], override_num_blocks=len(parts))
@@ -124,14 +124,18 @@ def edit_scenes(
         raise ValueError(f"none of the {rejects} scenes can be edited so; the first: {reason}")
     changes = pa.concat_tables([shard.read("edits") for shard in shards])
     if not len(changes):
-        raise ValueError(f"no primitive of the {scenes} scenes was changed; the scenes written are as given")
+        for table in TABLES:
+            storage.delete_directory(storage.join(request.output, table, f"source={request.source}"))
+        raise ValueError(
+            f"nothing is changed: no primitive in {scenes} scene(s) fits the selection; nothing is written"
+        )
     table = _totals(request.edits, changes)
     sections: list[Section] = [table]
     if pictures:
         sections.append(_before_after(request, parts, pictures))
     page = storage.join(request.output, f"{request.run}.html")
     storage.write_text(report_html("Edited scenes", sections, request.run), page)
-    return Edited(scenes, rejects, table)
+    return Edited(scenes, rejects, table, page)
 
 
 def _totals(edits: Sequence[Edit], changes: pa.Table) -> Table:

@@ -28,6 +28,8 @@ def weights_digest(model: torch.nn.Module) -> str:
 
 def load_lvae(directory: str) -> LayoutVAE:
     """Raises ValueError if the directory holds no LVAE."""
+    if not storage.exists(storage.join(directory, "config.json")):
+        raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
     try:
         return LayoutVAE.from_pretrained(directory, low_cpu_mem_usage=False).eval().requires_grad_(False)
     except (OSError, ValueError, TypeError) as error:

@@ -21,8 +21,8 @@ import pyarrow as pa
 import ray
 
 from models.augment import Augmentation
+from models.labels import LABELS, label_index
 from models.layout import LayoutSpec
-from models.pipeline import LABELS, label_index
 from models.scene import Grid
 from models.tensors import compact_height, compact_layout, compact_primitives, resampled
 from pipelines.scenes.tables import Shard, category_indices, fixed_lists, ground_steps, scenes_from_tables

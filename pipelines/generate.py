@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import ray.data
 import torch
 from diffusers.utils.logging import disable_progress_bar
 
+from models.labels import LABELS, require_labels
 from models.layout import LayoutSpec
-from models.pipeline import LABELS, PrITTIPipeline
+from models.pipeline import PrITTIPipeline
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
+from pipelines.claims import claim
 from pipelines.encode import gpus_per_actor, weights_digest
 from pipelines.scenes.tables import Shard
 
@@ -60,29 +61,17 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
     """Raises ValueError if the directory holds no complete pipeline."""
     disable_progress_bar()  # of three files
     try:
-        pipeline = PrITTIPipeline.from_pretrained(directory, low_cpu_mem_usage=False)
+        pipeline = PrITTIPipeline.from_pretrained(directory)
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def claim_run(request: Request, pipeline: PrITTIPipeline, **also: object) -> None:
-    """Keep source generated-<run> of a directory for one request, and only with the model that began it.
-
-    Raises ValueError if the directory holds a run of that name that was asked for otherwise.
-    """
-    digest = f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"
-    options = json.loads(json.dumps(asdict(request) | also | {"weights": digest}))
-    output = options.pop("output")
-    record = storage.join(output, f"{request.source}.json")
-    if storage.exists(record) and (made := storage.read_json(record)) != options:
-        name = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
-        raise ValueError(
-            f"{output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options.get(name)}; "
-            "choose another --run or --output"
-        )
-    storage.write_json(options, record)
+def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
+    """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
+    options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
+    claim(options.pop("output"), request.source, request.run, options, parts)
 
 
 def on_model_grid(scene: Scene, spec: LayoutSpec) -> Scene:
@@ -138,11 +127,7 @@ def sample_scenes(
     Raises ValueError for labels the model does not know, or if the output holds a run made with other options.
     """
     pipeline = load_pipeline(request.model)
-    known = LABELS[pipeline.dit.config.label]
-    if unknown := set(request.labels) - set(known):
-        raise ValueError(
-            f"labels {sorted(unknown)} are unknown to {request.model}, expected some of: {', '.join(known)}"
-        )
+    require_labels(pipeline.dit.config.label, request.labels)
     claim_run(request, pipeline)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):

@@ -9,6 +9,7 @@ import numpy as np
 import ray.data
 
 from models.inpaint import Contents, composited, half_plane_region, object_region, polygon_region, whole_cells
+from models.labels import require_labels
 from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene, merge
 from pipelines import storage
@@ -162,7 +163,9 @@ def inpaint_scenes(
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
     request.where.region(on_model_grid(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
-    claim_run(request, pipeline, input=asdict(selection))
+    if request.label:
+        require_labels(pipeline.dit.config.label, [request.label])
+    claim_run(request, pipeline, [storage.join(request.output, "drift", request.run)], input=asdict(selection))
     graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
         Inpainter,
         fn_constructor_args=(request, chosen),

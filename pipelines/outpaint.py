@@ -186,7 +186,8 @@ def outpaint_scenes(
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     lattice = request.lattice(pipeline.lvae.latent_shape[-1])
-    claim_run(request, pipeline, input=asdict(selection))
+    parts = [storage.join(request.output, "blocks", request.run)]
+    claim_run(request, pipeline, parts, input=asdict(selection))
 
     waiting, done = [], {}
     for number in range(len(chosen)):

@@ -144,7 +144,7 @@ def _paragraph(text: str) -> str:
 
 def _figure(figure: Figure) -> str:
     note = f"<small>{escape(figure.note)}</small>" if figure.note else ""
-    return f"<div><strong>{_written(figure.value)}</strong><span>{escape(figure.label)}</span>{note}</div>"
+    return f"<div><strong>{written(figure.value)}</strong><span>{escape(figure.label)}</span>{note}</div>"
 
 
 def _pictures(section: Pictures) -> str:
@@ -201,11 +201,12 @@ def _cell(value: Cell) -> str:
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
     if isinstance(value, bool | np.bool):
-        return f'<td class="number {"yes" if value else "no"}">{_written(value)}</td>'
-    return f'<td class="number">{_written(value)}</td>'
+        return f'<td class="number {"yes" if value else "no"}">{written(value)}</td>'
+    return f'<td class="number">{written(value)}</td>'
 
 
-def _written(value: Cell) -> str:
+def written(value: Cell) -> str:
+    """A cell as people read it."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool):

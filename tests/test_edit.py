@@ -84,7 +84,7 @@ def test_a_selection_fits_all_that_it_names(scene):
 @pytest.mark.parametrize(
     "select, message",
     [
-        (Select(), "no primitives: name category"),
+        (Select(), "no primitives are chosen: give category"),
         (Select(category=("car",)), "category 'car' is unknown"),
         (Select(polygon_m=(0, 1, 2)), "3 numbers: expected x y"),
         (Select(where="speed > 3"), "speed.*docs/tables.md"),
@@ -101,9 +101,7 @@ def test_a_wrong_selection_is_refused(scene, select, message):
 
 
 def test_primitives_that_a_scene_does_not_have(scene):
-    with pytest.raises(
-        ValueError, match=r"edit 1 \(remove\): scene test-0005 has 60 primitives, from 0 on, not \(60,\)"
-    ):
+    with pytest.raises(ValueError, match=r"edit 1 \(remove\): scene test-0005 has 60 primitives, from 0 on, not 60"):
         replayed(scene, [edit.Snap(ALL), edit.Remove(Select(primitives=(60,)))])
 
 
@@ -373,7 +371,7 @@ def test_edits_over_a_table(table, town_scenes, tmp_path, cluster):
     part = next((tmp_path / "out" / "scenes" / "source=edited-bare" / "split=test").glob("*.parquet"))
     written = part.stat().st_mtime_ns
     assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # nothing is done twice
-    with pytest.raises(ValueError, match="holds a run 'bare' of other edits; choose another --run"):
+    with pytest.raises(ValueError, match="holds a run 'bare' with other edits; choose another --run"):
         edit_scenes(Remove(category=("pole",), **options))
 
     record = str(tmp_path / "out" / "edited-bare.json")
@@ -396,5 +394,5 @@ def test_a_scene_that_cannot_be_edited_is_rejected_and_the_rest_goes_on(table, t
     assert all("primitives, from 0 on, not" in row["reason"] for row in rejects)
     with pytest.raises(ValueError, match="none of the 4 scenes can be edited so; the first: edit 0"):
         edit_scenes(Remove(primitives=(9999,), input=table, output=str(tmp_path), run="none"))
-    with pytest.raises(ValueError, match="no primitive of the 4 scenes was changed"):
+    with pytest.raises(ValueError, match="nothing is changed: no primitive in 4 scene"):
         edit_scenes(Remove(where="length_m > 900", input=table, output=str(tmp_path), run="nothing"))

@@ -155,7 +155,7 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
 def test_a_killed_sampler_loses_and_doubles_nothing(smoke, samples, tmp_path):
     from test_faults import psutil
 
-    from models.pipeline import LABELS
+    from models.labels import LABELS
     from pipelines.generate import SampleRequest, sample_scenes
 
     model = str(smoke / "models/pritti-smoke")

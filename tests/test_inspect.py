@@ -344,5 +344,5 @@ def test_scenes_are_written_without_ray(generated, tmp_path, monkeypatch):
     assert Path(again).read_bytes() == (tmp_path / f"{names[0]}.png").read_bytes()
     with pytest.raises(ValueError, match="--count is 0, expected at least 1"):
         draw_scenes(OneScene(dataset=generated, count=0))
-    with pytest.raises(ValueError, match="no shards of split=test"):
+    with pytest.raises(ValueError, match="no split=test; there are source="):
         draw_scenes(OneScene(dataset=generated, split="test"))

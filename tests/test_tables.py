@@ -87,10 +87,12 @@ def test_the_readmes_decoder(tmp_path, scenes):
 
 
 def test_truncated_and_missing_files_are_named(tmp_path, scenes):
-    with pytest.raises(ValueError, match=r"no shards of source=av2; run jobs/preprocess_scenes.py first"):
+    with pytest.raises(ValueError, match="scenes: no scenes there; give a directory"):
         find_shards(str(tmp_path), source="av2")
     shard = Shard(str(tmp_path), "town", "train", 0)
     shard.write(scenes)
+    with pytest.raises(ValueError, match="no source=av2; there are source=town/split=train"):
+        find_shards(str(tmp_path), source="av2")
     path = tmp_path / "rasters/source=town/split=train/part-00000.parquet"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"part-00000.parquet: cannot be read as Parquet"):

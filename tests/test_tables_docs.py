@@ -20,7 +20,9 @@ from scenes import random_scene
 
 from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, yaw_rotation
 from pipelines import storage
+from pipelines.edits import EditRequest, edited
 from pipelines.labels import density, density_thresholds
+from pipelines.scenes.edit import Remove, Select
 from pipelines.scenes.tables import (
     CATEGORY_MEANING,
     EDITS,
@@ -163,6 +165,8 @@ def root(town, fake, rejects, tmp_path_factory) -> Path:
     Shard(f"{path}/generated", "generated-docs", "generated", 0).write(fake)
     shard = Shard(f"{path}/real", "town", "train", 0)
     storage.write_parquet(rejects_table(rejects), shard.path("rejects"))
+    _, changes = edited(town[0], EditRequest((Remove(Select(where="length_m > 3")),), "", "docs"))
+    storage.write_parquet(pa.concat_tables(changes), shard.path("edits"))
     moments = pa.FixedShapeTensorArray.from_numpy_ndarray(np.zeros((len(shard.scenes()), 4, 8, 8), np.float16))
     ids = shard.read("scenes", ["scene_id"])["scene_id"].combine_chunks()
     storage.write_parquet(pa.table([ids, moments, moments], schema=SCHEMAS["latents"]), shard.path("latents"))

@@ -53,7 +53,7 @@ class Select:
 
     def _check_names(self) -> None:
         if self == Select():
-            raise ValueError("an edit of no primitives: name category, primitives, instances, polygon_m or where")
+            raise ValueError("no primitives are chosen: give category, primitives, instances, polygon-m or where")
         for name in self.category:
             _category(name)
         if len(self.polygon_m) % 2:
@@ -66,10 +66,9 @@ class Select:
         if self.category:
             fits &= np.isin(scene.category, [_category(name) for name in self.category])
         if self.primitives:
+            numbers = ", ".join(map(str, self.primitives))
             if not -1 < min(self.primitives) <= max(self.primitives) < len(scene):
-                raise ValueError(
-                    f"scene {scene.scene_id} has {len(scene)} primitives, from 0 on, not {self.primitives}"
-                )
+                raise ValueError(f"scene {scene.scene_id} has {len(scene)} primitives, from 0 on, not {numbers}")
             fits &= np.isin(np.arange(len(scene)), self.primitives)
         if self.instances:
             fits &= np.isin(scene.instance_id, self.instances)
@@ -88,7 +87,9 @@ def _where(table: pa.Table, condition: str) -> np.ndarray:
             rows = connection.from_arrow(table).filter(condition).project("row").fetchnumpy()["row"]
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
-            raise ValueError(f"where {condition!r}: {first}; docs/tables.md names the columns of primitives") from error
+            raise ValueError(
+                f"where {condition!r}: {first}; docs/tables.md names the columns, text stands in 'single quotes'"
+            ) from error
     return np.isin(np.arange(len(table)), rows)
 
 
@@ -103,6 +104,10 @@ class Edit(ABC):
     @property
     def name(self) -> str:
         return type(self).__name__.lower()
+
+    def check(self) -> None:
+        """Raises ValueError for an edit that no scene can take, or that changes none."""
+        self.select.check()
 
     @abstractmethod
     def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
@@ -149,6 +154,10 @@ class Duplicate(Edit):
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """x (ahead), y (left), z (up) in metres."""
 
+    def check(self) -> None:
+        super().check()
+        _check_way(self.by_m)
+
     def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
         copies = require_sound(Translate(by_m=self.by_m).changed(scene.select(chosen)))
         copies = replace(copies, instance_id=np.full(len(copies), -1, np.int64))
@@ -163,6 +172,10 @@ class Translate(Change):
     """x (ahead), y (left), z (up) in metres."""
     along: Literal["scene", "own"] = "scene"
     """Along the scene's axes, or each primitive's own: length (the way it heads, if known), width, height."""
+
+    def check(self) -> None:
+        super().check()
+        _check_way(self.by_m)
 
     def changed(self, part: Scene) -> Scene:
         way_m = np.broadcast_to(np.array(self.by_m, float), (len(part), 3))
@@ -181,6 +194,11 @@ class Rotate(Change):
     by_deg: float = 0.0
     about_m: tuple[float, float] | None = None
     """x and y of the axis (default: each primitive's own centre)."""
+
+    def check(self) -> None:
+        super().check()
+        if not np.isfinite(self.by_deg) or self.by_deg % 360 == 0:
+            raise ValueError(f"rotate by {self.by_deg} degrees turns nothing")
 
     def changed(self, part: Scene) -> Scene:
         by_rad = np.deg2rad(self.by_deg)
@@ -209,6 +227,11 @@ class Scale(Change):
     hold: Literal["bottom", "centre"] = "bottom"
     """What stays where it is."""
 
+    def check(self) -> None:
+        super().check()
+        if not all(np.isfinite(self.by)) or min(self.by) <= 0 or set(self.by) == {1}:
+            raise ValueError(f"scale by {list(self.by)}: expected factors above 0, not all of them 1")
+
     def changed(self, part: Scene) -> Scene:
         rotation, size_m = canonical_boxes(part.rotation, part.size_m * np.array(self.by, np.float32))
         part_scaled = replace(part, rotation=rotation, size_m=size_m)
@@ -225,6 +248,10 @@ class Relabel(Change):
     category: str = "object"
     label: str | None = None
     """The dataset's own class name (default: the category's)."""
+
+    def check(self) -> None:
+        super().check()
+        _category(self.category)
 
     def changed(self, part: Scene) -> Scene:
         index, label = _category(self.category), self.label or self.category
@@ -273,6 +300,11 @@ EDITS = {kind.__name__.lower(): kind for kind in (Remove, Duplicate, Translate, 
 def _raised(part: Scene, up_m: np.ndarray) -> np.ndarray:
     """(n, 3) centres moved up by up_m (n,)."""
     return (part.center_m + up_m[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)
+
+
+def _check_way(by_m: Sequence[float]) -> None:
+    if not np.isfinite(by_m).all() or not any(by_m):
+        raise ValueError(f"by_m is {list(by_m)}: expected metres along x, y and z, not all 0")
 
 
 def _category(name: str) -> int:
@@ -356,5 +388,7 @@ def edits_from_json(content: object) -> list[Edit]:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            raise ValueError(f"edit {step} ({kind}): {where}: {first['msg']}") from error
+            known = fields(Select if len(first["loc"]) > 1 and first["loc"][0] == "select" else EDITS[kind])
+            takes = ", ".join(f.name for f in known)
+            raise ValueError(f"edit {step} ({kind}): {where}: {first['msg']}; it takes {takes}") from error
     return edits

@@ -20,6 +20,7 @@ from models.cholesky import cholesky_parameters
 from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines import storage
 
+TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
 HEIGHT_STEP_M = 0.01
 MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # what 16 bits hold
@@ -396,9 +397,15 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
         if (source or found[0], split or found[1]) == found:
             shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
     if not shards:
-        wanted = "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v)
+        place, wanted = (
+            storage.join(root, table),
+            "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v),
+        )
+        there = sorted({"/".join(path.split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")})
+        if there:
+            raise ValueError(f"{place}: no {wanted}; there are {', '.join(there)}")
         raise ValueError(
-            f"{storage.join(root, table)}: no shards of {wanted or 'any source'}; run jobs/preprocess_scenes.py first"
+            f"{place}: no scenes there; give a directory that jobs/preprocess_scenes.py or another job wrote"
         )
     return shards
 

@@ -1,0 +1,30 @@
+"""A run's name in a directory stands for one set of options: who comes with others is told so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+from pipelines import storage
+from pipelines.scenes.tables import TABLES
+
+
+def claim(output: str, source: str, run: str, options: Mapping[str, object], parts: Sequence[str] = ()) -> None:
+    """Keep source `source` of a dataset directory for one set of options, in `<source>.json`.
+
+    A run that failed before it wrote a scene, or anything into the directories `parts`, gives its name free. Raises
+    ValueError if the directory holds a run of that name with other options.
+    """
+    options = json.loads(json.dumps(options))
+    record = storage.join(output, f"{source}.json")
+    made = storage.read_json(record) if storage.exists(record) else options
+    if made != options:
+        tables = [storage.join(output, table, f"source={source}") for table in TABLES]
+        if any(storage.list_files(place, "") for place in (tables[0], *parts)):
+            name = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
+            values = [json.dumps(side.get(name)) for side in (made, options)]
+            said = "{}={}, asked for {}".format(name, *values) if max(map(len, values)) < 80 else f"other {name}"
+            raise ValueError(f"{output} holds a run {run!r} with {said}; choose another --run or --output")
+        for table in tables:
+            storage.delete_directory(table)
+    storage.write_json(options, record)
