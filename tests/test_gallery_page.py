@@ -5,12 +5,12 @@ import gzip
 import io
 import json
 import re
-import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import faults, start_browser, wait_for
 from PIL import Image
 
 from models.scene import Scene
@@ -70,28 +70,7 @@ def test_the_page_holds_all_it_shows(page, town_scenes):
 
 @pytest.fixture(scope="module")
 def browser():
-    """Headless Chromium."""
-    if not (shutil.which("chromium") and shutil.which("chromedriver")):
-        pytest.skip("no browser: install chromium and chromium-driver")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for argument in (
-        "headless=new",
-        "no-sandbox",
-        "disable-background-networking",
-        "disable-component-update",
-        "disable-sync",
-        "no-first-run",
-        "use-angle=swiftshader",
-        "enable-unsafe-swiftshader",
-        "window-size=1200,900",
-    ):
-        options.add_argument(f"--{argument}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    driver = start_browser()
     yield driver
     driver.quit()
 
@@ -108,10 +87,7 @@ def test_a_reader_filters_opens_and_picks(page, town_scenes, browser):
     assert browser.execute_script("return document.getElementById('count').textContent") == "1 of 3 scenes"
     browser.execute_script("document.querySelector('.card:not([hidden])').click()")
     scene = next(scene for scene in town_scenes if len(scene) == fewest)
-    for _ in range(100):
-        if browser.execute_script("return document.body.dataset.shown") == scene.scene_id:
-            break
-        time.sleep(0.1)
+    wait_for(browser, f"document.body.dataset.shown === '{scene.scene_id}'")
     time.sleep(0.5)
     canvas = browser.find_element("id", "view")
     shown = np.asarray(Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("RGB"))
@@ -125,8 +101,4 @@ def test_a_reader_filters_opens_and_picks(page, town_scenes, browser):
     )
     number = int(picked.split(":")[0])
     assert scene.label[number] in picked
-    assert not [
-        line
-        for line in browser.get_log("browser")
-        if line["level"] == "SEVERE" and "setPointerCapture" not in line["message"]
-    ]
+    assert not [said for said in faults(browser) if "setPointerCapture" not in said]

@@ -1,0 +1,111 @@
+"""A scene grown to one side, whatever its size: a row of blocks along that side, one after another (paper, Sec. 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from models.diffusion import OUTPAINT, Known
+from models.outpaint import doubles, height_near
+from models.pipeline import PrITTIPipeline, Resampling, StepCallback
+from models.scene import Grid, Scene, merge
+from models.tensors import new_scene
+
+Side = Literal["ahead", "behind", "left", "right"]
+
+
+def grown(grid: Grid, side: Side, pixels: int) -> Grid:
+    """The grid with so many more pixels on a side. ValueError for a side that is none."""
+    if side not in get_args(Side):
+        raise ValueError(f"side {side!r}, expected one of: {', '.join(get_args(Side))}")
+    more_m = pixels * grid.resolution_m
+    if side in ("ahead", "behind"):
+        front_m = grid.front_m + (more_m if side == "ahead" else 0)
+        return replace(grid, front_m=front_m, rows=grid.rows + pixels)
+    return replace(grid, left_m=grid.left_m + (more_m if side == "left" else 0), cols=grid.cols + pixels)
+
+
+def windows(grid: Grid, side: Side, small: Grid, step_px: int) -> Iterator[Grid]:
+    """Blocks of the model's size along a side of a grid, every step_px, the last one flush with its end."""
+    along = grid.cols if side in ("ahead", "behind") else grid.rows
+    size = small.cols if side in ("ahead", "behind") else small.rows
+    for start in [*range(0, along - size, step_px), along - size]:
+        row = {"ahead": 0, "behind": grid.rows - small.rows}.get(side, start)
+        col = {"left": 0, "right": grid.cols - small.cols}.get(side, start)
+        front_m, left_m = grid.front_m - row * grid.resolution_m, grid.left_m - col * grid.resolution_m
+        yield replace(small, front_m=front_m, left_m=left_m)
+
+
+def extended(
+    pipeline: PrITTIPipeline,
+    scene: Scene,
+    side: Side,
+    label: str,
+    seed: int = 0,
+    overlap: float = 0.5,
+    resampling: Resampling | None = None,
+    guidance_scale: float = 1.0,
+    callback_on_step_end: StepCallback | None = None,
+) -> Scene:
+    """The scene with (1 - overlap) of a block more on one side; what was there stays as it is.
+
+    Each block knows what lies in it already, encoded anew in its own frame and height. Raises ValueError for a scene of
+    another resolution or of other ground classes than the model's, or smaller than a block.
+    """
+    spec, small = pipeline.spec, pipeline.spec.grid
+    if scene.grid.resolution_m != small.resolution_m or scene.ground_classes != spec.ground_classes:
+        raise ValueError(f"{scene}: the model needs {small.resolution_m} m and {', '.join(spec.ground_classes)}")
+    if scene.grid.rows < small.rows or scene.grid.cols < small.cols:
+        raise ValueError(f"{scene} is smaller than a block of {small.rows} x {small.cols}")
+    step_px = round(small.rows * (1 - overlap))
+    grid = grown(scene.grid, side, step_px)
+    canvas, level_m = scene.cropped(grid), height_near(scene, 0.0, 0.0)
+    made = np.zeros((grid.rows, grid.cols), bool)
+    made[grid.shared(scene.grid)[0]] = True
+    empty = new_scene(scene.scene_id, scene.source, scene.sequence, scene.frame, spec)
+    size = pipeline.lvae.latent_shape[-1]
+    for number, window in enumerate(windows(grid, side, small, step_px)):
+        here = grid.shared(window)[0]
+        unknown = ~made[here]
+        dx_m, dy_m = small.front_m - window.front_m, small.left_m - window.left_m
+        known = canvas.cropped(window).moved(dx_m, dy_m)
+        datum_m = height_near(known, 0.0, 0.0) - level_m
+        known = known.moved(0, 0, -datum_m)
+        cells = torch.from_numpy(unknown.reshape(size, -1, size, small.cols // size).any(axis=(1, 3))).float()
+        latent = pipeline.encode([known])
+        mask = cells.to(latent.device).expand_as(latent)
+        latent = pipeline.complete(
+            Known(latent, mask),
+            [label],
+            seed,
+            [(number, step_px, grid.rows, grid.cols, get_args(Side).index(side))],
+            resampling or Resampling(),
+            guidance_scale,
+            callback_on_step_end,
+            OUTPAINT,
+        )
+        block = pipeline.decode(latent, [empty])[0]
+        new = merge([block], [unknown], block)
+        new = new.select(~doubles(new, known)).moved(-dx_m, -dy_m, datum_m)
+        canvas = merge([canvas, _on(new, grid)], [made, _whole(unknown, here, made.shape)], canvas)
+        made[here] = True
+    return canvas
+
+
+def _on(part: Scene, grid: Grid) -> Scene:
+    """A block on a larger grid, empty around it."""
+    here, there = grid.shared(part.grid)
+    shape = (len(part.ground_classes), grid.rows, grid.cols)
+    height_m, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    height_m[:, *here], occupied[:, *here] = part.height_m[:, *there], part.occupied[:, *there]
+    return replace(part, grid=grid, height_m=height_m, occupied=occupied)
+
+
+def _whole(mask: np.ndarray, here: tuple[slice, slice], shape: tuple[int, int]) -> np.ndarray:
+    whole = np.zeros(shape, bool)
+    whole[here] = mask
+    return whole
