@@ -46,7 +46,7 @@ def sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
 
 
 def modulate(x: Float[Tensor, "batch n d"], shift: Tensor, scale: Tensor) -> Float[Tensor, "batch n d"]:
-    return x * (1 + scale[:, None]) + shift[:, None]
+    return torch.addcmul(shift[:, None], x, (1 + scale)[:, None])
 
 
 class Block(nn.Module):
@@ -68,9 +68,9 @@ class Block(nn.Module):
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
         q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # (b, heads, n, dh) each
         y = self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
-        x = x + gate1[:, None] * y
+        x = torch.addcmul(x, gate1[:, None], y)
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift2, scale2)
-        return x + gate2[:, None] * self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh"))
+        return torch.addcmul(x, gate2[:, None], self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh")))
 
 
 class DiT(ModelMixin, ConfigMixin):

@@ -52,7 +52,7 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
     assert [s.scene_id for s in read_scenes(str(samples))] == before
     with pytest.raises(ValueError, match="with seed=0, asked for 5"):
         sample(replace(config, seed=5))
-    with pytest.raises(ValueError, match=r"unknown to .*expected some of: low, medium, high"):
+    with pytest.raises(ValueError, match="unknown to a vegetation model, expected one of: low, medium, high"):
         sample(replace(config, run="x", labels=("dense",)))
 
 
