@@ -15,16 +15,22 @@ def claim(output: str, source: str, run: str, options: Mapping[str, object], par
     A run that failed before it wrote a scene, or anything into the directories `parts`, gives its name free. Raises
     ValueError if the directory holds a run of that name with other options.
     """
-    options = json.loads(json.dumps(options))
     record = storage.join(output, f"{source}.json")
-    made = storage.read_json(record) if storage.exists(record) else options
-    if made != options:
+    if said := changed_option(record, options):
         tables = [storage.join(output, table, f"source={source}") for table in TABLES]
         if any(storage.list_files(place, "") for place in (tables[0], *parts)):
-            name = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
-            values = [json.dumps(side.get(name)) for side in (made, options)]
-            said = "{}={}, asked for {}".format(name, *values) if max(map(len, values)) < 80 else f"other {name}"
             raise ValueError(f"{output} holds a run {run!r} with {said}; choose another --run or --output")
         for table in tables:
             storage.delete_directory(table)
     storage.write_json(options, record)
+
+
+def changed_option(record: str, options: Mapping[str, object]) -> str:
+    """The first option that differs from those in a JSON file, in words; "" if none does, or if there is no such file."""
+    asked = json.loads(json.dumps(options))
+    made = storage.read_json(record) if storage.exists(record) else asked
+    if made == asked:
+        return ""
+    name = next(key for key in sorted(made | asked) if made.get(key) != asked.get(key))
+    values = [json.dumps(side.get(name)) for side in (made, asked)]
+    return "{}={}, asked for {}".format(name, *values) if max(map(len, values)) < 80 else f"other {name}"

@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from pipelines import storage
+from pipelines.claims import changed_option
 from pipelines.encode import gpus_per_actor
 from pipelines.scenes.palette import CLASS_COLORS, EMPTY
 from pipelines.scenes.render import contact_sheet
@@ -130,14 +131,10 @@ def paint_streets(
     Raises ValueError if a drive was painted with other options.
     """
     for directory in directories:
-        record, options = storage.join(directory, "photos.json"), asdict(request)
-        if storage.exists(record) and (made := storage.read_json(record)) != options:
-            name = next(key for key in options if made.get(key) != options[key])
-            raise ValueError(
-                f"{directory} was painted with {name}={made.get(name)!r}, asked for {options[name]!r}; delete its photo/ "
-                "and photos.json to paint it anew"
-            )
-        storage.write_json(options, record)
+        record = storage.join(directory, "photos.json")
+        if said := changed_option(record, asdict(request)):
+            raise ValueError(f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it anew")
+        storage.write_json(asdict(request), record)
     graph = ray.data.from_items([{"directory": d} for d in directories], override_num_blocks=len(directories)).map(
         StreetPainter,
         fn_constructor_args=(request,),

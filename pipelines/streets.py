@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
@@ -13,6 +12,7 @@ from PIL import Image
 
 from models.scene import Scene
 from pipelines import storage
+from pipelines.claims import changed_option
 from pipelines.ingest import per_row
 from pipelines.scenes.palette import CLASS_ID
 from pipelines.scenes.render import contact_sheet
@@ -119,14 +119,9 @@ def render_streets(
     Raises ValueError if the output holds a run with other cameras, or if no scene has a road.
     """
     record = storage.join(request.output, "streets", f"{request.run}.json")
-    options = json.loads(json.dumps(asdict(request)))
-    if storage.exists(record) and (made := storage.read_json(record)) != options:
-        name = next(key for key in options if made.get(key) != options[key])
-        raise ValueError(
-            f"{request.output} holds a run {request.run!r} with {name}={made.get(name)}, asked for {options[name]}; "
-            "choose another --run or --output"
-        )
-    storage.write_json(options, record)
+    if said := changed_option(record, asdict(request)):
+        raise ValueError(f"{request.output} holds a run {request.run!r} with {said}; choose another --run or --output")
+    storage.write_json(asdict(request), record)
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
 
     def write(row: dict) -> dict:

@@ -144,7 +144,7 @@ def test_a_drive_is_painted_and_goes_on(weights, tmp_path, cluster):
     again = {path.name: path.stat().st_mtime_ns for path in (drive / "photo").iterdir()}
     assert again["000000.png"] == files["000000.png"] and again["000001.png"] != files["000001.png"]
     with pytest.raises(
-        ValueError, match=r"was painted with prompt='a photograph.*asked for 'night'; delete its photo/"
+        ValueError, match=r'was painted with prompt="a photograph.*asked for "night"; delete its photo/'
     ):
         paint(Config(**options, prompt="night"))
 
