@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,20 @@ class Repainting(GivenScenes):
         from models.pipeline import Resampling
 
         return Resampling(self.steps, self.jump_length, self.resamplings)
+
+
+def require_model_labels(model: str, labels: Iterable[str]) -> None:
+    """Raises ValueError for a label that the pipeline in a directory does not know; before torch is imported."""
+    from models.labels import require_labels
+
+    require_labels(model_label_kind(model), labels)
+
+
+def model_label_kind(model: str) -> str:
+    """What the pipeline in a directory is conditioned on."""
+    from pipelines import storage
+
+    return storage.read_json(storage.join(model, "dit/config.json"))["label"]
 
 
 def pipeline_directory(model: str) -> str:

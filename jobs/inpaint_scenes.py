@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import Repainting, pipeline_directory
+from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
     if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
         raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of three corners or more")
     model = pipeline_directory(config.model)
-    if config.label:
-        from models.labels import require_labels
-        from pipelines import storage
-
-        require_labels(storage.read_json(storage.join(model, "dit/config.json"))["label"], [config.label])
+    require_model_labels(model, [config.label] if config.label else [])
     from rich.progress import Progress
 
     from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes

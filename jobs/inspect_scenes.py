@@ -135,8 +135,9 @@ def draw_scenes(config: OneScene) -> list[str]:
     from rich.progress import Progress
 
     from pipelines import storage
-    from pipelines.gallery import Catalogue, png, scene_plate
+    from pipelines.gallery import Catalogue, scene_plate
     from pipelines.scenes.mesh import scene_glb
+    from pipelines.scenes.render import png
 
     if config.count < 1:
         raise ValueError(f"--count is {config.count}, expected at least 1")
@@ -170,7 +171,8 @@ def painted(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> list[list
 def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
     from pipelines import storage
-    from pipelines.gallery import Catalogue, View, captions, png, scene_sheet, sheet_title
+    from pipelines.gallery import Catalogue, View, captions, scene_sheet, sheet_title
+    from pipelines.scenes.render import png
 
     for name in ("count", "size"):
         if getattr(config, name) < 1:

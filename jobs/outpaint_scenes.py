@@ -18,7 +18,7 @@ from math import ceil
 from typing import TYPE_CHECKING, Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import Repainting, pipeline_directory
+from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -76,11 +76,7 @@ def outpaint(config: Config) -> pa.Table:
         raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
     last = last_blocks(config)
     model = pipeline_directory(config.model)
-    if config.label:
-        from models.labels import require_labels
-        from pipelines import storage
-
-        require_labels(storage.read_json(storage.join(model, "dit/config.json"))["label"], [config.label])
+    require_model_labels(model, [config.label] if config.label else [])
     from rich.progress import MofNCompleteColumn, Progress
 
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes

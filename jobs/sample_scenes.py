@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import pipeline_directory
+from jobs.given_scenes import model_label_kind, pipeline_directory, require_model_labels
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,11 @@ def sample(config: Config) -> str:
         if (given := getattr(config, name)) < 1:
             raise ValueError(f"--{name.replace('_', '-')} is {given}, expected at least 1")
     model = pipeline_directory(config.model)
-    from models.labels import LABELS, require_labels
-    from pipelines import storage
-
-    kind = storage.read_json(storage.join(model, "dit/config.json"))["label"]
-    require_labels(kind, config.labels)
+    require_model_labels(model, config.labels)
     from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
+    from models.labels import LABELS
+    from pipelines import storage
     from pipelines.generate import SampleRequest, sample_scenes
     from pipelines.scenes.mesh import scene_glb
     from pipelines.scenes.tables import read_scenes
@@ -69,7 +67,7 @@ def sample(config: Config) -> str:
         output=output,
         run=config.run,
         num_scenes=config.num_scenes,
-        labels=config.labels or LABELS[kind],
+        labels=config.labels or LABELS[model_label_kind(model)],
         seed=config.seed,
         num_inference_steps=config.steps,
         guidance_scale=config.guidance,

@@ -15,7 +15,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from jobs.command import absolute, home, print_table, run, start_ray
-from jobs.given_scenes import pipeline_directory
+from jobs.given_scenes import model_label_kind, pipeline_directory
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -74,7 +74,7 @@ def sweep_samplers(config: Config) -> list[dict]:
     output = absolute(config.output) if config.output else home("evaluations", "samplers")
     real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
     count = sum(len(rows) for _, rows in real.shards())
-    labels = LABELS[storage.read_json(storage.join(model, "dit/config.json"))["label"]]
+    labels = LABELS[model_label_kind(model)]
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:

@@ -128,6 +128,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         preset=config.preset,
         batch_size=batch_size,
         label=config.label,
+        prediction=row.prediction,
         lvae=latents["lvae_digest"],
         dataset=root,
     )

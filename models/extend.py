@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
-import torch
 
 from models.diffusion import OUTPAINT, Known
-from models.outpaint import doubles, height_near
+from models.inpaint import latent_mask
+from models.outpaint import Lattice, doubles, height_near
 from models.pipeline import PrITTIPipeline, Resampling, StepCallback
 from models.scene import Grid, Scene, merge
 from models.tensors import new_scene
@@ -54,20 +54,20 @@ def extended(
     """The scene with (1 - overlap) of a block more on one side; what was there stays as it is.
 
     Each block knows what lies in it already, encoded anew in its own frame and height. Raises ValueError for a scene of
-    another resolution or of other ground classes than the model's, or smaller than a block.
+    another resolution or of other ground classes than the model's, smaller than a block, or for an overlap between cells.
     """
     spec, small = pipeline.spec, pipeline.spec.grid
     if scene.grid.resolution_m != small.resolution_m or scene.ground_classes != spec.ground_classes:
         raise ValueError(f"{scene}: the model needs {small.resolution_m} m and {', '.join(spec.ground_classes)}")
     if scene.grid.rows < small.rows or scene.grid.cols < small.cols:
         raise ValueError(f"{scene} is smaller than a block of {small.rows} x {small.cols}")
-    step_px = round(small.rows * (1 - overlap))
+    size = pipeline.lvae.latent_shape[-1]
+    step_px = Lattice.of(size, overlap).step * (small.rows // size)
     grid = grown(scene.grid, side, step_px)
     canvas, level_m = scene.cropped(grid), height_near(scene, 0.0, 0.0)
     made = np.zeros((grid.rows, grid.cols), bool)
     made[grid.shared(scene.grid)[0]] = True
     empty = new_scene(scene.scene_id, scene.source, scene.sequence, scene.frame, spec)
-    size = pipeline.lvae.latent_shape[-1]
     for number, window in enumerate(windows(grid, side, small, step_px)):
         here = grid.shared(window)[0]
         unknown = ~made[here]
@@ -75,9 +75,8 @@ def extended(
         known = canvas.cropped(window).moved(dx_m, dy_m)
         datum_m = height_near(known, 0.0, 0.0) - level_m
         known = known.moved(0, 0, -datum_m)
-        cells = torch.from_numpy(unknown.reshape(size, -1, size, small.cols // size).any(axis=(1, 3))).float()
         latent = pipeline.encode([known])
-        mask = cells.to(latent.device).expand_as(latent)
+        mask = latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
         latent = pipeline.complete(
             Known(latent, mask),
             [label],
@@ -91,21 +90,7 @@ def extended(
         block = pipeline.decode(latent, [empty])[0]
         new = merge([block], [unknown], block)
         new = new.select(~doubles(new, known)).moved(-dx_m, -dy_m, datum_m)
-        canvas = merge([canvas, _on(new, grid)], [made, _whole(unknown, here, made.shape)], canvas)
+        before = made.copy()
         made[here] = True
+        canvas = merge([canvas, new.cropped(grid)], [before, made & ~before], canvas)
     return canvas
-
-
-def _on(part: Scene, grid: Grid) -> Scene:
-    """A block on a larger grid, empty around it."""
-    here, there = grid.shared(part.grid)
-    shape = (len(part.ground_classes), grid.rows, grid.cols)
-    height_m, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
-    height_m[:, *here], occupied[:, *here] = part.height_m[:, *there], part.occupied[:, *there]
-    return replace(part, grid=grid, height_m=height_m, occupied=occupied)
-
-
-def _whole(mask: np.ndarray, here: tuple[slice, slice], shape: tuple[int, int]) -> np.ndarray:
-    whole = np.zeros(shape, bool)
-    whole[here] = mask
-    return whole

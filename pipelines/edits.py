@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +18,7 @@ from pipelines import storage
 from pipelines.claims import claim
 from pipelines.ingest import per_row
 from pipelines.report import Picture, Pictures, Section, Table, report_html
-from pipelines.scenes.edit import Edit, edits_to_json, replayed
+from pipelines.scenes.edit import Done, Edit, edits_to_json, replayed
 from pipelines.scenes.render import bev_picture, outlined_picture
 from pipelines.scenes.tables import EDITS, TABLES, Shard, rejects_table
 from pipelines.selection import Selection
@@ -163,19 +165,21 @@ def _totals(edits: Sequence[Edit], changes: pa.Table) -> Table:
 
 
 def _before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
-    """The first scenes that an edit changed, each as given and as edited; what was chosen is outlined."""
+    """The first scenes that an edit changed, each as given and as edited; what was changed first is outlined."""
     shown: list[Picture] = []
-    for given, rows in parts:
-        for scene in given.scenes(rows):
-            if len(shown) >= 2 * count:
-                break
-            try:
-                after, done = replayed(scene, request.edits)
-            except ValueError:
-                continue
-            if any(len(changes.primitive) for changes in done):
-                before = outlined_picture(scene, object_region(scene, done[0].primitive, OUTLINE_M), PICTURE_PX)
-                shown.append(Picture(scene.scene_id, before, "given"))
-                shown.append(Picture(scene.scene_id, bev_picture(after, PICTURE_PX, 2), "edited"))
+    for scene, after, changes in islice(_changed(request, parts), count):
+        region = object_region(scene, changes.primitive, OUTLINE_M)
+        shown.append(Picture(scene.scene_id, outlined_picture(scene, region, PICTURE_PX), "given"))
+        shown.append(Picture(scene.scene_id, bev_picture(after, PICTURE_PX, 2), "edited"))
     note = "Left as given, what the first edit changed outlined in red; right after all edits."
     return Pictures("Before and after", shown, 4, note)
+
+
+def _changed(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]) -> Iterator[tuple[Scene, Scene, Done]]:
+    """Scenes that the edits change, before and after, and what the first edit did; one at a time."""
+    for given, rows in parts:
+        for scene in given.scenes(rows):
+            with suppress(ValueError):  # a scene that is rejected
+                after, done = replayed(scene, request.edits)
+                if any(len(changes.primitive) for changes in done):
+                    yield scene, after, done[0]

@@ -5,7 +5,6 @@ Works on any dataset directory, real or generated. Only `paint` uses Ray.
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -216,12 +215,6 @@ def write(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: int = 
 def swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int = 16) -> None:
     """The colour of a ground class or category, centred on y."""
     draw.rectangle((x, y - size / 2, x + size, y + size / 2), fill=rgb(COLOR_HEX[name]), outline=LINE)
-
-
-def png(image: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG", optimize=True)
-    return file.getvalue()
 
 
 # ------------------------------------------------------------------------------------------- one scene, every view

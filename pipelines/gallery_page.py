@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import io
 import json
 from collections.abc import Callable
 from dataclasses import asdict
@@ -16,10 +15,10 @@ from importlib.resources import files
 
 import numpy as np
 import pyarrow as pa
-from PIL import Image
 
 from models.scene import CATEGORIES, GROUND_CLASSES
 from pipelines.gallery import CHUNK, Catalogue
+from pipelines.report import data_uri
 from pipelines.report_style import STYLE
 from pipelines.scenes.render import bev_picture
 from pipelines.scenes.tables import Shard
@@ -37,10 +36,8 @@ def pack_scenes(row: dict) -> list[dict]:
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
-        file = io.BytesIO()
-        Image.fromarray(bev_picture(scene, THUMBNAIL_PX, 2)).save(file, "WEBP", quality=82, method=4)
         content = gzip.compress(json.dumps(web_scene(scene), separators=(",", ":")).encode(), mtime=0)
-        out.append({"place": place, "picture": file.getvalue(), "packed": content})
+        out.append({"place": place, "picture": data_uri(bev_picture(scene, THUMBNAIL_PX, 2)), "packed": content})
     return out
 
 
@@ -57,11 +54,10 @@ def gallery_html(
     values = scene_values(catalogue, indices)
     scenes: list[dict] = [{}] * len(indices)
     for row in graph.iter_rows():
-        picture, packed = (base64.b64encode(row[name]).decode() for name in ("picture", "packed"))
         scenes[row["place"]] = {
             "values": values[row["place"]],
-            "picture": f"data:image/webp;base64,{picture}",
-            "packed": packed,
+            "picture": row["picture"],
+            "packed": base64.b64encode(row["packed"]).decode(),
         }
         if on_scene:
             on_scene()

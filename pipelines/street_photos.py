@@ -15,8 +15,8 @@ from pipelines import storage
 from pipelines.claims import changed_option
 from pipelines.encode import gpus_per_actor
 from pipelines.scenes.palette import CLASS_COLORS, EMPTY
-from pipelines.scenes.render import contact_sheet
-from pipelines.streets import ON_SHEET, moving_picture, png
+from pipelines.scenes.render import contact_sheet, png
+from pipelines.streets import ON_SHEET, moving_picture
 
 SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view has nothing
 MULTIPLE_PX = 8  # of the sides of pictures that the network takes

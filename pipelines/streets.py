@@ -15,7 +15,7 @@ from pipelines import storage
 from pipelines.claims import changed_option
 from pipelines.ingest import per_row
 from pipelines.scenes.palette import CLASS_ID
-from pipelines.scenes.render import contact_sheet
+from pipelines.scenes.render import contact_sheet, png
 from pipelines.scenes.roads import drive, road_network
 from pipelines.scenes.street import Lens, StreetCamera, StreetRenderer, StreetView, shaded
 from pipelines.selection import Selection
@@ -69,13 +69,6 @@ def depth_image(view: StreetView) -> np.ndarray:
     """(H, W) uint16 of DEPTH_PER_M a metre."""
     depth = np.round(view.depth_m * DEPTH_PER_M)
     return np.where(depth < 2**16, depth, 0).astype(np.uint16)
-
-
-def png(image: np.ndarray) -> bytes:
-    """(H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
-    content = io.BytesIO()
-    Image.fromarray(image).save(content, "PNG")
-    return content.getvalue()
 
 
 def moving_picture(frames: list[np.ndarray]) -> bytes:

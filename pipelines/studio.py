@@ -6,9 +6,7 @@ in a thread, one at a time over all visitors, says how far it is and can be canc
 
 from __future__ import annotations
 
-import base64
 import hmac
-import io
 import json
 import secrets
 import threading
@@ -18,9 +16,9 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.resources import files
 from typing import Literal
+from urllib.parse import urlsplit
 
 from fastapi import FastAPI, HTTPException, Request, Response
-from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
 from models.extend import Side, extended
@@ -30,6 +28,7 @@ from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene
 from pipelines.gallery import Catalogue
 from pipelines.generate import label_of, load_pipeline, on_model_grid
+from pipelines.report import data_uri
 from pipelines.scenes.edit import edits_from_json, edits_to_json, replayed
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.opendrive import scene_opendrive
@@ -40,7 +39,7 @@ VISITORS, HISTORY, WAITING = 16, 50, 4
 MAX_BODY = 256 * 1024  # bytes of a request
 MAX_SIDE_M = 512.0  # of a scene that is extended
 THUMBNAIL_PX, PAGE = 128, 24
-LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class Cancelled(Exception):
@@ -312,9 +311,7 @@ class Studio:
 def thumbnail(catalogue: Catalogue, index: int) -> str:
     """A data URI."""
     scene = catalogue.shards[catalogue.shard[index]].scenes([int(catalogue.row[index])])[0]
-    file = io.BytesIO()
-    Image.fromarray(bev_picture(scene, THUMBNAIL_PX)).save(file, "WEBP", quality=80)
-    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return data_uri(bev_picture(scene, THUMBNAIL_PX))
 
 
 def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, ...] = LOOPBACK) -> FastAPI:
@@ -326,11 +323,7 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
 
     @app.middleware("http")
     async def guard(request: Request, call_next):
-        host = (
-            (request.headers.get("host") or "").rsplit(":", 1)[0]
-            if "]" not in (request.headers.get("host") or "")
-            else "[::1]"
-        )
+        host = urlsplit(f"//{request.headers.get('host', '')}").hostname
         if hosts and host not in hosts:
             return Response("unknown host", 421)
         if request.method not in ("GET", "HEAD") and request.headers.get("x-studio") != "1":

@@ -1,9 +1,14 @@
 """Random Scenes for tests: no structure, every category, any rotation."""
 
 import numpy as np
+import torch
 
+from models.dit import DiT
 from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline, scheduler
 from models.scene import CATEGORIES, KITTI_GROUND_CLASSES, Grid, Scene, canonical_boxes, yaw_rotation
+from models.zoo import LVAE_PRESETS
 
 
 def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) -> np.ndarray:
@@ -45,3 +50,16 @@ def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad:
 
 def small_spec(pixels: int = 32, slots: int = 6) -> LayoutSpec:
     return LayoutSpec(slots=(slots,) * len(CATEGORIES)).with_resolution(pixels)
+
+
+def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
+    """Random weights: a smoke LVAE and a DiT of one block."""
+    torch.manual_seed(0)
+    lvae = LayoutVAE(layout=spec.to_dict(), **LVAE_PRESETS["smoke"].architecture())
+    channels, size, _ = lvae.latent_shape
+    dit = DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=spec.to_dict())
+    for parameter in dit.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    made = PrITTIPipeline(lvae, dit, scheduler())
+    made.set_progress_bar_config(disable=True)
+    return made

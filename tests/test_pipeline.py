@@ -7,7 +7,7 @@ import pytest
 import shapely
 import torch
 from diffusers import DPMSolverMultistepScheduler
-from scenes import random_scene, small_spec
+from scenes import random_scene, small_spec, tiny_pipeline
 from test_diffusion import SHAPE
 
 from models.diffusion import Diffusion, SceneNoise, Walk, sample, solve
@@ -24,16 +24,7 @@ QUICK = Resampling(num_steps=6, jump_length=2, resamplings=2)
 
 @pytest.fixture(scope="module")
 def pipeline() -> PrITTIPipeline:
-    """Random weights: a smoke LVAE and a DiT of one block."""
-    torch.manual_seed(0)
-    lvae = LayoutVAE(layout=SPEC.to_dict(), **LVAE_PRESETS["smoke"].architecture())
-    channels, size, _ = lvae.latent_shape
-    dit = DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=SPEC.to_dict())
-    for parameter in dit.parameters():
-        torch.nn.init.normal_(parameter, std=0.05)
-    made = PrITTIPipeline(lvae, dit, scheduler())
-    made.set_progress_bar_config(disable=True)
-    return made
+    return tiny_pipeline(SPEC)
 
 
 def sampler_of(name: str):

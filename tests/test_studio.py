@@ -10,35 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import requests
-import torch
 from browser import faults, start_browser, wait_for
 from PIL import Image
-from scenes import random_scene, small_spec
+from scenes import random_scene, small_spec, tiny_pipeline
 
-from models.dit import DiT
 from models.extend import extended, grown, windows
-from models.lvae import LayoutVAE
-from models.pipeline import PrITTIPipeline, Resampling, scheduler
+from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Scene
-from models.zoo import LVAE_PRESETS
 from pipelines.scenes.mesh_import import scene_from_glb
 from pipelines.scenes.tables import Shard, read_scenes
 
 SPEC = small_spec()
 POST = {"x-studio": "1"}
 CAR = CATEGORY_INDEX["vehicle_small"]
-
-
-def tiny_pipeline() -> PrITTIPipeline:
-    torch.manual_seed(0)
-    lvae = LayoutVAE(layout=SPEC.to_dict(), **LVAE_PRESETS["smoke"].architecture())
-    channels, size, _ = lvae.latent_shape
-    dit = DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=SPEC.to_dict())
-    for parameter in dit.parameters():
-        torch.nn.init.normal_(parameter, std=0.05)
-    made = PrITTIPipeline(lvae, dit, scheduler())
-    made.set_progress_bar_config(disable=True)
-    return made
 
 
 def given_scene(number: int) -> Scene:
@@ -57,7 +41,7 @@ def given_scene(number: int) -> Scene:
 
 @pytest.mark.parametrize("side", ["ahead", "behind", "left", "right"])
 def test_a_scene_grows_to_a_side_and_what_was_there_stays(side):
-    pipeline, scene, quick = tiny_pipeline(), given_scene(1), Resampling(4, 2, 1)
+    pipeline, scene, quick = tiny_pipeline(SPEC), given_scene(1), Resampling(4, 2, 1)
     once = extended(pipeline, scene, side, "low", resampling=quick)
     assert once.grid == grown(scene.grid, side, SPEC.grid.rows // 2)
     twice = extended(pipeline, once, side, "low", seed=1, resampling=quick)
@@ -88,7 +72,7 @@ def free_port() -> int:
 def tables(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("studio")
     Shard(str(root / "tables"), "town", "test", 0).write([given_scene(k) for k in range(3)])
-    tiny_pipeline().save_pretrained(root / "model")
+    tiny_pipeline(SPEC).save_pretrained(root / "model")
     return root
 
 

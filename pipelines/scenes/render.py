@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from functools import cache
 
@@ -93,6 +94,13 @@ def picture_3d(
     camera = looking_at(scene.grid, width * supersample, height * supersample, azimuth_deg, elevation_deg)
     linear = block_mean(lit_picture(scene, camera), supersample)
     return np.round(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+
+
+def png(image: np.ndarray) -> bytes:
+    """(H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "PNG", optimize=True)
+    return file.getvalue()
 
 
 def block_mean(picture: np.ndarray, factor: int) -> np.ndarray:

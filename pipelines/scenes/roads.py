@@ -16,8 +16,8 @@ from scipy import ndimage
 from skimage.morphology import skeletonize
 
 from models.scene import Scene
+from pipelines.metrics.validity import ROAD_CLASSES
 
-ROAD_CLASSES = ("road", "crossing")
 CELL_M = 0.5  # of the mask that is thinned
 HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands left out
 MARGIN_M = 16.0  # how far the mask goes on beyond the border

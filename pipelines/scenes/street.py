@@ -7,7 +7,7 @@ KITTI-360: x right, y down, z ahead; metres. Pixel centres lie at whole numbers 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -241,8 +241,3 @@ def shaded(view: StreetView) -> np.ndarray:
     color = view.semantic * light[..., None]
     picture = np.where(np.isfinite(view.depth_m)[..., None], haze * color + (1 - haze) * 232, sky)
     return picture.clip(0, 255).astype(np.uint8)
-
-
-def lifted(camera: StreetCamera, by_m: float) -> StreetCamera:
-    """The same camera, higher."""
-    return replace(camera, position_m=camera.position_m + [0, 0, by_m])
