@@ -11,7 +11,7 @@ an sqlite file under $PRITTI_HOME).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import tyro
@@ -44,6 +44,10 @@ class Config:
     batch_size: int | None = None
     """Global batch size over all workers."""
     learning_rate: float | None = None
+    prediction: Literal["noise", "velocity"] | None = None
+    """What the network puts out (default: as the preset says; the paper: noise)."""
+    normalise_latents: bool | None = None
+    """Give each channel of the latents mean 0 and deviation 1 (default: as the preset says; the paper: no)."""
     accumulate: int = 1
     """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
     precision: str = "auto"
@@ -108,6 +112,10 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         steps=config.steps,
         learning_rate=config.learning_rate,
     )
+    if config.prediction is not None:
+        row = replace(row, prediction=config.prediction)
+    if config.normalise_latents is not None:
+        row = replace(row, normalise_latents=config.normalise_latents)
     channels, size, _ = latents["shape"]
     architecture = row.architecture() | {
         "channels": channels,
@@ -129,6 +137,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         batch_size=batch_size,
         label=config.label,
         prediction=row.prediction,
+        normalise_latents=row.normalise_latents,
         lvae=latents["lvae_digest"],
         dataset=root,
     )
