@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines import origin
 from pipelines.sources.drive import Drive
 from pipelines.sources.town import town_drive, write_kitti360
 
@@ -21,10 +19,7 @@ DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives
 
 def where() -> str:
     """Machine, versions and commit in one line."""
-    model = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), platform.machine())  # fmt: skip
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-    dirty = subprocess.run(["git", "status", "--porcelain"], capture_output=True, text=True).stdout.strip()
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}, commit {commit}{'+' if dirty else ''}"
+    return f"{origin.machine()}, {origin.versions()}, numpy {np.__version__}, commit {origin.commit()}"
 
 
 def interleaved(

@@ -83,7 +83,7 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
 
 def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
-    print(where(), f"torch {torch.__version__}, {config.threads} threads")
+    print(where(), f"{config.threads} threads")
     torch.manual_seed(0)
     ours = DiT(**DIT_PRESETS[config.preset].architecture()).eval().requires_grad_(False)
     for parameter in ours.parameters():  # zeros, as at the start, would hide most of the network

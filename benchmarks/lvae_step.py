@@ -69,7 +69,7 @@ def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch
 
 def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
-    print(where(), f"torch {torch.__version__}, {config.threads} threads")
+    print(where(), f"{config.threads} threads")
     for name in config.presets:
         row = preset(LVAE_PRESETS, name)
         batch_size = 2 if name == "kitti360" else row.batch_size

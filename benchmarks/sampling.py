@@ -52,7 +52,7 @@ def untrained(preset: str) -> PrITTIPipeline:
 
 def main(config: Config) -> None:
     pipeline = load_pipeline(config.model) if config.model else untrained(config.preset)
-    print(where(), f"torch {torch.__version__}, latents {pipeline.lvae.latent_shape}")
+    print(where(), f"latents {pipeline.lvae.latent_shape}")
     known = LABELS[pipeline.dit.config.label]
     labels = [known[k % len(known)] for k in range(config.batch)]
     seconds: dict[str, list[float]] = {"sampling": [], "decoding": [], "writing": []}

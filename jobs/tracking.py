@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 
 from jobs.command import home
-from pipelines import storage
+from pipelines import origin, storage
 
 METRICS_PER_CALL = 1000  # MLflow's limit
 
@@ -68,6 +68,8 @@ class Tracker:
         run_id = api.create_run(experiment_id, run_name=name).info.run_id
         for key, value in parameters.items():
             api.log_param(run_id, key, value)
+        for key in ("command", "commit", "machine", "versions"):
+            api.set_tag(run_id, key, getattr(origin, key)())
         storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
         return cls(uri, run_id)
 
