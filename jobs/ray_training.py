@@ -24,6 +24,7 @@ from jobs.command import root_cause, start_ray
 from jobs.tracking import Tracker
 from models.training import NotFinite, Optimisation, Trainer
 from pipelines import storage
+from pipelines.encode import weights_digest
 from pipelines.feed import READER_CPUS, Reader, Stream, batches
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
@@ -136,9 +137,12 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
+    model = trainer.averaged()
+    run.tracker.tag("weights", weights_digest(model))  # by which jobs/publish_model.py finds the run of a model
+    run.tracker.tag("steps", str(trainer.steps_done))
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
-        trainer.averaged().save_pretrained(os.path.join(directory, "model"))
+        model.save_pretrained(os.path.join(directory, "model"))
         ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
 
 

@@ -81,6 +81,9 @@ class Tracker:
         now = int(time.time() * 1000)
         self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
 
+    def tag(self, key: str, value: str) -> None:
+        self.client.set_tag(self.run_id, key, value)
+
     def picture(self, image, path: str) -> None:
         """A picture (H, W, 3) uint8 as an artifact."""
         from PIL import Image
@@ -125,7 +128,7 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     run_name = output.rstrip("/").rsplit("/", 1)[-1]
     tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join(output, "mlflow.json"))
     for key, value in tags.items():
-        tracker.client.set_tag(tracker.run_id, key, value)
+        tracker.tag(key, value)
     finite = [(name, number) for name, number in known.items() if isfinite(number)]
     for start in range(0, len(finite), METRICS_PER_CALL):
         tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
