@@ -31,6 +31,8 @@ lint: .venv/ready
 	PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
 	@# The schemas of OpenDRIVE, for a test; what else is in there wants an older numpy.
 	$(BIN)/pip install --disable-pip-version-check -q --no-deps asam-qc-opendrive==1.0.0
+	@# Khronos' validator of glTF, for a test that is skipped without it.
+	-command -v npm >/dev/null && npm install --silent --no-fund --no-audit --prefix .venv/npm gltf-validator@2.0.0-dev.3.10
 	touch $@
 
 clean:

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks, Side
 
-DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
-
 
 @dataclass(frozen=True)
 class Config:
@@ -100,12 +98,14 @@ def evaluate(config: Config) -> dict:
     if config.lvae and not storage.exists(storage.join(absolute(config.lvae), "config.json")):
         raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")
     scores: dict = {}
+    sides = chosen_sides(config, dataset) if wanted else {}
     start_ray()
     with Progress() as bar:
         if config.lvae:
             scores["reconstruction"] = reconstruction(config, dataset, output, bar)
         if wanted:
-            scores["generation"] = generation(config, dataset, output, bar)
+            scores["generation"] = generation(config, dataset, sides, output, bar)
+    storage.write_json(scored(config, dataset, sides), storage.join(output, "evaluation.json"))
     tags = {
         "real": config.real or home("datasets", "town"),
         "split": config.real_split,
@@ -116,7 +116,25 @@ def evaluate(config: Config) -> dict:
     return publish_scores(output, scores, tags, [pages[name] for name in scores])
 
 
-def generation(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
+def scored(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> dict:
+    """What scores are of: either side, how the generated one was sampled if one run made it all, the LVAE's weights."""
+    from pipelines import storage
+    from pipelines.encode import load_lvae, weights_digest
+    from pipelines.selection import Selection
+
+    about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
+    about["lvae_weights"] = weights_digest(load_lvae(absolute(config.lvae))) if config.lvae else None
+    made = sides.get("generated")
+    about["generated"] = made and made.root
+    sources = {shard.source for shard, _ in made.shards()} if isinstance(made, Selection) else ()
+    if len(sources) == 1:
+        about["source"] = sources.pop()
+        record = storage.join(made.root, f"{about['source']}.json")
+        about["sampling"] = storage.read_json(record) if storage.exists(record) else None
+    return about
+
+
+def generation(config: Config, dataset: Dataset | None, sides: dict[str, Side], output: str, bar: Progress) -> dict:
     """Scores of the generated scenes; writes evaluation.html and what is known of each scene, under described/."""
     from pipelines import storage
     from pipelines.describe import Looks, PictureFile, describe
@@ -126,7 +144,6 @@ def generation(config: Config, dataset: Dataset | None, output: str, bar: Progre
     from pipelines.sides import pictures_shown
 
     looks = Looks(config.supersample, config.inception and absolute(config.inception))
-    sides = chosen_sides(config, dataset)
     described = {}
     for name, side in sides.items():
         task, directory = bar.add_task(f"describe {name}", total=side.limit), storage.join(output, "described", name)
@@ -239,12 +256,11 @@ def main(config: Config) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pipelines.evaluation_report import leaves, written
+    from pipelines.evaluation_report import headlines, written
 
     lines = Table("metric", "value")
-    for name, value in leaves(evaluate(config)):
-        if not any(part in name for part in DETAILS):
-            lines.add_row(name, written(value))
+    for name, value in headlines(evaluate(config)):
+        lines.add_row(name, written(value))
     Console().print(lines)
 
 

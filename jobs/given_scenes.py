@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from jobs.command import absolute, home
 
@@ -13,12 +16,20 @@ if TYPE_CHECKING:
     from pipelines.selection import Selection
 
 
+ModelOption = Annotated[
+    str,
+    tyro.conf.arg(
+        help="Pipeline: a directory, a name (town comes with the package), models:/NAME/VERSION or an MLflow run of "
+        "jobs/publish_model.py (default: the one trained under $PRITTI_HOME, or town)."
+    ),
+]
+
+
 @dataclass(frozen=True)
 class GivenScenes:
     """The first scenes of a dataset directory, and what to do with them."""
 
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    model: ModelOption = ""
     input: str = ""
     """Dataset directory with the scenes (default: $PRITTI_HOME/generated)."""
     source: str = ""
@@ -75,14 +86,25 @@ def model_label_kind(model: str) -> str:
 
 
 def pipeline_directory(model: str) -> str:
-    """Where an option --model points. Raises ValueError if no trained pipeline is there."""
+    """Where an option --model points; what MLflow holds is brought to this machine. Raises ValueError if nothing is there.
+
+    Without it: $PRITTI_HOME/models/pritti-town, or the only pipeline trained there, or the weights that come with the
+    package.
+    """
+    from models.released import INDEX, pipeline_path
     from pipelines import storage
 
-    directory = absolute(model) if model else home("models", "pritti-town")
-    if not model and not storage.exists(storage.join(directory, "model_index.json")):
-        found = storage.list_files(home("models"), "model_index.json")
-        if len(found) == 1:  # the only one there is
-            return found[0].removesuffix("/model_index.json")
-    if not storage.exists(storage.join(directory, "model_index.json")):
-        raise ValueError(f"{directory}: no PrITTI pipeline here; run jobs/train_dit.py first")
-    return directory
+    if not model:
+        trained = home("models", "pritti-town")
+        found = storage.list_files(home("models"), INDEX)
+        if not storage.exists(storage.join(trained, INDEX)):
+            trained = found[0].removesuffix(f"/{INDEX}") if len(found) == 1 else pipeline_path("town")
+        return trained
+    for directory in (absolute(model), home("zoo", model)):
+        if storage.exists(storage.join(directory, INDEX)):
+            return directory
+    if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):
+        from jobs.registry import downloaded
+
+        return downloaded(model)
+    return pipeline_path(model)

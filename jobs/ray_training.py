@@ -137,13 +137,17 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
-    model = trainer.averaged()
-    run.tracker.tag("weights", weights_digest(model))  # by which jobs/publish_model.py finds the run of a model
-    run.tracker.tag("steps", str(trainer.steps_done))
+    tag_weights(run.tracker, trainer)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
-        model.save_pretrained(os.path.join(directory, "model"))
+        trainer.averaged().save_pretrained(os.path.join(directory, "model"))
         ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
+
+
+def tag_weights(tracker: Tracker, trainer: Trainer) -> None:
+    """Say in MLflow which weights a run has made so far: jobs/publish_model.py finds the run by them."""
+    tracker.tag("weights", weights_digest(trainer.averaged()))
+    tracker.tag("steps", str(trainer.steps_done))
 
 
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:

@@ -16,13 +16,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import model_label_kind, pipeline_directory, require_model_labels
+from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory, require_model_labels
 
 
 @dataclass(frozen=True)
 class Config:
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    model: ModelOption = ""
     output: str = ""
     """Dataset directory (default: $PRITTI_HOME/generated)."""
     run: str = "samples"

@@ -15,13 +15,12 @@ import time
 from dataclasses import dataclass
 
 from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import pipeline_directory
+from jobs.given_scenes import ModelOption, pipeline_directory
 
 
 @dataclass(frozen=True)
 class Config:
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    model: ModelOption = ""
     tables: tuple[str, ...] = ()
     """Dataset directories to open scenes from (default: $PRITTI_HOME/generated, if there are scenes)."""
     host: str = "127.0.0.1"

@@ -15,7 +15,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from jobs.command import absolute, home, print_table, run, start_ray
-from jobs.given_scenes import model_label_kind, pipeline_directory
+from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    model: str = ""
-    """Pipeline directory (default: $PRITTI_HOME/models/pritti-town)."""
+    model: ModelOption = ""
     real: str = ""
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"

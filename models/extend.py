@@ -1,4 +1,4 @@
-"""A scene grown to one side, whatever its size: a row of blocks along that side, one after another (paper, Sec. 3.3)."""
+"""Scenes of any size, block by block of the model's: grown to one side, or made anew inside a region (paper, Sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from models.diffusion import OUTPAINT, Known
-from models.inpaint import latent_mask
+from models.inpaint import Contents, composited, latent_mask, whole_cells
 from models.outpaint import Lattice, doubles, height_near
 from models.pipeline import PrITTIPipeline, Resampling, StepCallback
 from models.scene import Grid, Scene, merge
@@ -40,6 +40,90 @@ def windows(grid: Grid, side: Side, small: Grid, step_px: int) -> Iterator[Grid]
         yield replace(small, front_m=front_m, left_m=left_m)
 
 
+def covering(grid: Grid, region: np.ndarray, small: Grid, cell_px: int) -> list[Grid]:
+    """Blocks of the model's size, on whole cells of a grid, that hold all pixels of a region between them.
+
+    One in the middle of a region that fits into a block; else one every half a block.
+    """
+
+    def starts(found: np.ndarray, along: int, size: int) -> list[int]:
+        first, last = found[0] // cell_px * cell_px, -(-(found[-1] + 1) // cell_px) * cell_px
+        if last - first > size:
+            wanted = [*range(first, last - size, size // 2), last - size]
+        else:
+            wanted = [(first + last - size) // 2 // cell_px * cell_px]
+        return [min(max(start, 0), along - size) for start in wanted]
+
+    rows, cols = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    return [
+        replace(small, front_m=grid.front_m - row * grid.resolution_m, left_m=grid.left_m - col * grid.resolution_m)
+        for row in starts(rows, grid.rows, small.rows)
+        for col in starts(cols, grid.cols, small.cols)
+    ]
+
+
+def in_block(canvas: Scene, window: Grid, small: Grid, level_m: float) -> tuple[Scene, tuple[float, float, float]]:
+    """What a window of a scene holds, in the model's frame and at the height `level_m` there; the way back, x, y, z in metres."""
+    dx_m, dy_m = small.front_m - window.front_m, small.left_m - window.left_m
+    known = canvas.cropped(window).moved(dx_m, dy_m)
+    datum_m = height_near(known, 0.0, 0.0) - level_m
+    return known.moved(0, 0, -datum_m), (-dx_m, -dy_m, datum_m)
+
+
+def require_blocks(scene: Scene, pipeline: PrITTIPipeline) -> None:
+    """Raises ValueError for a scene of another resolution or of other ground classes than the model's, or smaller than a block."""
+    spec, small = pipeline.spec, pipeline.spec.grid
+    if scene.grid.resolution_m != small.resolution_m or scene.ground_classes != spec.ground_classes:
+        raise ValueError(f"{scene}: the model needs {small.resolution_m} m and {', '.join(spec.ground_classes)}")
+    if scene.grid.rows < small.rows or scene.grid.cols < small.cols:
+        raise ValueError(f"{scene} is smaller than a block of {small.rows} x {small.cols}")
+
+
+def region_blocks(pipeline: PrITTIPipeline, scene: Scene, region: np.ndarray) -> list[tuple[Grid, np.ndarray]]:
+    """Blocks with the part (rows, cols) of a region that each makes anew, in whole cells, no cell twice.
+
+    Raises ValueError as `require_blocks`.
+    """
+    require_blocks(scene, pipeline)
+    small, size = pipeline.spec.grid, pipeline.lvae.latent_shape[-1]
+    left, parts = region.copy(), []
+    for window in covering(scene.grid, region, small, small.rows // size) if region.any() else []:
+        here = scene.grid.shared(window)[0]
+        if left[here].any():
+            parts.append((window, whole_cells(left[here], small, size)))
+            left[here] &= ~parts[-1][1]
+    return parts
+
+
+def inpainted(
+    pipeline: PrITTIPipeline,
+    scene: Scene,
+    region: np.ndarray,
+    label: str,
+    contents: Contents = "both",
+    seed: int = 0,
+    resampling: Resampling | None = None,
+    guidance_scale: float = 1.0,
+    callback_on_step_end: StepCallback | None = None,
+) -> Scene:
+    """A scene of any size made anew inside a region (rows, cols) of its pixels, in whole cells; the rest stays bit for bit.
+
+    `PrITTIPipeline.inpaint` on a scene of the model's size; on a larger one block by block, each knowing what is there.
+    Raises ValueError as `require_blocks`.
+    """
+    canvas, level_m = scene, height_near(scene, 0.0, 0.0)
+    for number, (window, part) in enumerate(region_blocks(pipeline, scene, region)):
+        known, offset_m = in_block(canvas, window, pipeline.spec.grid, level_m)
+        made = pipeline.inpaint(
+            [known], [part], [label], contents, seed, [number], resampling, guidance_scale,
+            callback_on_step_end=callback_on_step_end,
+        )[0]  # fmt: skip
+        inside = np.zeros_like(region)
+        inside[scene.grid.shared(window)[0]] = part
+        canvas = composited(canvas, made.moved(*offset_m).cropped(scene.grid), inside, contents)
+    return canvas
+
+
 def extended(
     pipeline: PrITTIPipeline,
     scene: Scene,
@@ -57,10 +141,7 @@ def extended(
     another resolution or of other ground classes than the model's, smaller than a block, or for an overlap between cells.
     """
     spec, small = pipeline.spec, pipeline.spec.grid
-    if scene.grid.resolution_m != small.resolution_m or scene.ground_classes != spec.ground_classes:
-        raise ValueError(f"{scene}: the model needs {small.resolution_m} m and {', '.join(spec.ground_classes)}")
-    if scene.grid.rows < small.rows or scene.grid.cols < small.cols:
-        raise ValueError(f"{scene} is smaller than a block of {small.rows} x {small.cols}")
+    require_blocks(scene, pipeline)
     size = pipeline.lvae.latent_shape[-1]
     step_px = Lattice.of(size, overlap).step * (small.rows // size)
     grid = grown(scene.grid, side, step_px)
@@ -71,10 +152,7 @@ def extended(
     for number, window in enumerate(windows(grid, side, small, step_px)):
         here = grid.shared(window)[0]
         unknown = ~made[here]
-        dx_m, dy_m = small.front_m - window.front_m, small.left_m - window.left_m
-        known = canvas.cropped(window).moved(dx_m, dy_m)
-        datum_m = height_near(known, 0.0, 0.0) - level_m
-        known = known.moved(0, 0, -datum_m)
+        known, offset_m = in_block(canvas, window, small, level_m)
         latent = pipeline.encode([known])
         mask = latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
         latent = pipeline.complete(
@@ -89,7 +167,7 @@ def extended(
         )
         block = pipeline.decode(latent, [empty])[0]
         new = merge([block], [unknown], block)
-        new = new.select(~doubles(new, known)).moved(-dx_m, -dy_m, datum_m)
+        new = new.select(~doubles(new, known)).moved(*offset_m)
         before = made.copy()
         made[here] = True
         canvas = merge([canvas, new.cropped(grid)], [before, made & ~before], canvas)

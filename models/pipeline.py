@@ -32,6 +32,7 @@ from models.labels import label_index
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.outpaint import Block, Lattice, Place, World, height_near
+from models.released import pipeline_path
 from models.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
@@ -105,8 +106,11 @@ class PrITTIPipeline(DiffusionPipeline):
 
     @classmethod
     def from_pretrained(cls, directory: str, **options) -> PrITTIPipeline:
-        """A pipeline from a directory that `save_pretrained` or jobs/train_dit.py wrote, as in diffusers."""
-        return super().from_pretrained(directory, **{"low_cpu_mem_usage": False} | options)
+        """A pipeline from a directory that `save_pretrained` or jobs/train_dit.py wrote, or by the name of released weights.
+
+        "town" comes with the package (models/released.py); nothing is ever fetched. Raises ValueError for what is neither.
+        """
+        return super().from_pretrained(pipeline_path(directory), **{"low_cpu_mem_usage": False} | options)
 
     @property
     def spec(self) -> LayoutSpec:

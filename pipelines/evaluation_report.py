@@ -13,6 +13,7 @@ from pipelines.drawings import spelled
 from pipelines.metrics.distributions import HISTOGRAMS
 from pipelines.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, report_html
 
+DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
 MEANINGS = {
     "fid": "Frechet distance of Inception's pool3 features; 0 is equal. Falls with the number of samples: compare at equal numbers only",
@@ -98,6 +99,11 @@ def leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | f
             yield from leaves(value, f"{prefix}{name}.")
         elif value is not None and not isinstance(value, str):
             yield prefix + name, value
+
+
+def headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
+    """The leaves that are told in short lists: none of single categories, classes or thresholds."""
+    return ((name, value) for name, value in leaves(scores) if not any(part in name for part in DETAILS))
 
 
 def in_short(scores: Mapping) -> KeyFigures:

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 from fastapi import FastAPI, HTTPException, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.extend import Side, extended
+from models.extend import Side, extended, inpainted, region_blocks
 from models.inpaint import Contents, polygon_region
 from models.labels import LABELS, require_labels
 from models.pipeline import PrITTIPipeline, Resampling
@@ -227,36 +227,36 @@ class Studio:
 
         self.start(desk, f"generate {label}, seed {asked.seed}", asked.steps, make)
 
+    def at_resolution(self, scene: Scene) -> Scene:
+        """The scene at the model's resolution; one of any size that is made of the model's blocks stays as it is."""
+        spec = self.pipeline.spec
+        same = scene.grid.resolution_m == spec.grid.resolution_m and scene.ground_classes == spec.ground_classes
+        return scene if same else on_model_grid(scene, spec)
+
     def inpaint(self, desk: Desk, asked: Inpaint) -> None:
-        scene = on_model_grid(desk.require(), self.pipeline.spec)
-        given = desk.require().grid
-        if (
-            given.rows * given.resolution_m > scene.grid.rows * scene.grid.resolution_m
-            or given.cols * given.resolution_m > scene.grid.cols * scene.grid.resolution_m
-        ):
-            raise ValueError("a scene that was extended cannot be inpainted yet; undo the extension first")
+        scene = self.at_resolution(desk.require())
         region = polygon_region(scene.grid, asked.polygon_m)
         if not region.any():
             raise ValueError("the region holds no pixel of the scene; draw a larger one")
         label, resampling = self.label(asked, scene), asked.resampling()
+        blocks = len(region_blocks(self.pipeline, scene, region))
 
         def make(work: Work) -> Scene:
-            return self.pipeline.inpaint(
-                [scene],
-                [region],
-                [label],
+            return inpainted(
+                self.pipeline,
+                scene,
+                region,
+                label,
                 asked.contents,
                 asked.seed,
-                resampling=resampling,
+                resampling,
                 callback_on_step_end=work.step,
-            )[0]
+            )
 
-        self.start(desk, f"inpaint {asked.contents}", resampling.evaluations, make)
+        self.start(desk, f"inpaint {asked.contents}", blocks * resampling.evaluations, make)
 
     def extend(self, desk: Desk, asked: Extend) -> None:
-        scene, small = desk.require(), self.pipeline.spec.grid
-        if scene.grid.resolution_m != small.resolution_m:
-            scene = on_model_grid(scene, self.pipeline.spec)
+        scene, small = self.at_resolution(desk.require()), self.pipeline.spec.grid
         rows, cols = scene.grid.rows, scene.grid.cols
         if max(rows, cols) * small.resolution_m >= MAX_SIDE_M:
             raise ValueError(f"the scene is {MAX_SIDE_M:.0f} m long already; the studio stops there")

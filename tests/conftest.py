@@ -5,12 +5,20 @@ from pathlib import Path
 
 import pytest
 
-WITH_SMOKE = {f"tests/test_{name}.py" for name in ("evaluate_job", "generation_jobs", "voxel_import")}
+WITH_SMOKE = {f"tests/test_{name}.py" for name in ("evaluate_job", "generation_jobs", "publish", "voxel_import")}
+LONG = ("evaluate_job", "generation_jobs", "voxel_import", "faults", "jobs", "commands", "ablation", "ingest", "street")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules that take minutes go first, so that none of them is left for one process at the end."""
+    order = {f"test_{name}": place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(LONG)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """Under `-n 2` a module stays in one process, and so do all modules that use `smoke`."""
+    """Under `-n 2` a module stays in one process, and so do all modules that use `smoke`; in the order of collection."""
+    config.option.loadscopereorder = False
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
@@ -92,6 +100,7 @@ def smoke(tmp_path_factory, cluster) -> Path:
         trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(as_tensors(batch), range(run.stream.batch_size))
+        jobs.ray_training.tag_weights(run.tracker, trainer)
         trainer.averaged().save_pretrained(output)
         run.tracker.finish("FINISHED")
         return output

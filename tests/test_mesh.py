@@ -2,6 +2,11 @@
 
 import io
 import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -212,6 +217,22 @@ def test_empty_scene():
     assert scene_triangles(scene).corners_m.shape == (0, 3, 3)
     loaded = load(scene_glb(scene))
     assert len(loaded.graph.nodes_geometry) == 0 and "scene" in loaded.graph.nodes
+
+
+def test_khronos_validator_finds_nothing_to_say(tmp_path):
+    """glTF's own validator: no errors, warnings, remarks or hints, and it finds every mesh."""
+    modules = Path(sys.prefix) / "npm" / "node_modules"  # where the Makefile puts it, if there is npm
+    if not (shutil.which("node") and modules.is_dir()):
+        pytest.skip("no node, or no gltf-validator in .venv/npm")
+    scenes = [example_scene(), example_scene(3), replace(example_scene(2), occupied=np.zeros((5, 256, 256), bool))]
+    paths = [tmp_path / f"{number}.glb" for number in range(len(scenes))]
+    for scene, path in zip(scenes, paths, strict=True):
+        write_glb(scene, path)
+    script = Path(__file__).with_name("validate_glb.js")
+    done = subprocess.run(["node", script, modules, *paths], capture_output=True, text=True, check=True)
+    for report, scene in zip(json.loads(done.stdout), scenes, strict=True):
+        assert report["issues"]["messages"] == []
+        assert report["info"]["drawCallCount"] == len(np.unique(scene.category)) + scene.occupied.any()  # meshes
 
 
 def test_writing_leaves_only_the_file(tmp_path):

@@ -14,7 +14,8 @@ from browser import faults, start_browser, wait_for
 from PIL import Image
 from scenes import random_scene, small_spec, tiny_pipeline
 
-from models.extend import extended, grown, windows
+from models.extend import extended, grown, inpainted, region_blocks, windows
+from models.inpaint import polygon_region
 from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Scene
 from pipelines.scenes.mesh_import import scene_from_glb
@@ -57,6 +58,42 @@ def test_a_scene_grows_to_a_side_and_what_was_there_stays(side):
         extended(pipeline, scene, "up", "low")
     with pytest.raises(ValueError, match="is smaller than a block"):
         extended(pipeline, scene.cropped(replace(SPEC.grid, rows=16)), "ahead", "low")
+
+
+@pytest.mark.parametrize("contents", ["both", "objects", "ground"])
+def test_a_region_of_a_larger_scene_is_made_anew_and_nothing_else(contents):
+    pipeline, quick = tiny_pipeline(SPEC), Resampling(4, 2, 1)
+    scene = extended(pipeline, given_scene(1), "ahead", "low", resampling=quick)
+    scene = extended(pipeline, scene, "left", "low", resampling=quick)
+    for corners_m, least in (
+        ([(70, 20), (80, 20), (80, 30), (70, 30)], 1),
+        ([(2, -30), (94, -30), (94, 60), (2, 60)], 4),
+    ):
+        region = polygon_region(scene.grid, corners_m)
+        parts = region_blocks(pipeline, scene, region)
+        count, inside = np.zeros(region.shape, int), np.zeros_like(region)
+        for window, part in parts:
+            count[scene.grid.shared(window)[0]] += part
+        inside[count > 0] = True
+        assert len(parts) >= least and count.max() == 1 and (inside | ~region).all()
+        calls = []
+        new = inpainted(
+            pipeline, scene, region, "low", contents, resampling=quick,
+            callback_on_step_end=lambda _, number, __, kept, calls=calls: calls.append(number) or kept,
+        )  # fmt: skip
+        assert len(calls) == len(parts) * quick.evaluations
+        changed = (new.height_m != scene.height_m) | (new.occupied != scene.occupied)
+        assert not changed[:, ~inside].any() and changed.any() == (contents != "objects")
+        row, col = scene.grid.pixel(*scene.center_m[:, :2].T)
+        kept = scene.center_m[~inside[row, col] | (contents == "ground")]
+        assert np.array_equal(new.center_m[: len(kept)], kept)
+    # On a scene of the model's own size it is the pipeline's inpainting.
+    scene = given_scene(2)
+    region = polygon_region(scene.grid, [(20, -10), (40, -10), (40, 10), (20, 10)])
+    one = inpainted(pipeline, scene, region, "low", contents, resampling=quick)
+    assert np.array_equal(
+        one.height_m, pipeline.inpaint([scene], [region], ["low"], contents, resampling=quick)[0].height_m
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------- served

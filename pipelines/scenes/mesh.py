@@ -28,6 +28,7 @@ ABOUT = (  # what a file says of the scene as a whole
 
 # Cyclic, hence a proper rotation: glTF's +z is forward, +y up and +x left, ours are x, z and y.
 GLTF_FROM_SCENE = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF: vertices, indices
 
 
 class Triangles(NamedTuple):
@@ -133,7 +134,16 @@ def scene_glb(scene: Scene) -> bytes:
         name = CATEGORIES[scene.category[index]]
         node = f"{name}_{index:04d}"
         world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_extras(scene, index))
-    return trimesh.exchange.gltf.export_glb(world)
+    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=_say_what_buffers_hold)
+
+
+def _say_what_buffers_hold(tree: dict) -> None:
+    """glTF's hints for the GPU: which buffer views hold vertices, which indices."""
+    for mesh in tree.get("meshes", ()):
+        for part in mesh["primitives"]:
+            targets = {index: ARRAY_BUFFER for index in part["attributes"].values()}
+            for accessor, target in (targets | {part["indices"]: ELEMENT_ARRAY_BUFFER}).items():
+                tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"] = target
 
 
 def scene_ply(scene: Scene) -> bytes:

@@ -1,0 +1,183 @@
+#!/usr/bin/env python3
+"""A trained and evaluated pipeline -> an entry of the zoo: weights, configuration, card, and a version in MLflow.
+
+    jobs/sample_scenes.py --num-scenes 1000 --run judged --sampler dpm++ --steps 20
+    jobs/evaluate_scenes.py --real-split test --run judged --lvae DIR/lvae
+    jobs/publish_model.py --name town --evaluation $PRITTI_HOME/evaluations/judged
+
+The card is written from the MLflow runs that trained these weights and from the evaluation of scenes that they generated;
+without either, or with those of other weights, nothing is published. Afterwards jobs take it as --model NAME, its
+directory, models:/NAME/VERSION, or the id of its MLflow run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jobs.command import absolute, home, run
+from jobs.given_scenes import ModelOption, pipeline_directory
+
+if TYPE_CHECKING:
+    import torch
+
+    from pipelines.model_card import Training
+
+SHOWN = 32  # scenes on the card, the first ones
+JUDGED = 256  # of which the ones with most faults are shown
+FAILURES = 8
+CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
+
+
+@dataclass(frozen=True)
+class Config:
+    model: ModelOption = ""
+    evaluation: str = ""
+    """Directory that jobs/evaluate_scenes.py wrote, with --lvae (default: $PRITTI_HOME/evaluations/latest)."""
+    name: str = "town"
+    """Of the entry and of the registered model."""
+    output: str = ""
+    """Where the entry goes (default: $PRITTI_HOME/zoo/<name>)."""
+    register: bool = True
+    """Also make it a version of a model in MLflow."""
+
+
+def publish(config: Config) -> tuple[str, str]:
+    """Write the entry; its directory, and models:/NAME/VERSION or ""."""
+    import tempfile
+
+    from jobs.ray_training import publish_directory
+    from jobs.registry import EXPERIMENT, PIPELINE, registered
+    from jobs.tracking import Tracker
+    from models.labels import LABELS
+    from models.released import CHECKSUMS, checksums
+    from pipelines import storage
+    from pipelines.chart import standalone_svg
+    from pipelines.encode import weights_digest
+    from pipelines.generate import load_pipeline
+    from pipelines.model_card import Card
+
+    pipeline = load_pipeline(pipeline_directory(config.model))
+    weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
+    directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
+    about, scores = evaluation_of(directory, weights)
+    trainings = [
+        training_of("pritti-lvae", "Layout VAE", pipeline.lvae),
+        training_of("pritti-dit", "Diffusion transformer", pipeline.dit),
+    ]
+    output = absolute(config.output) if config.output else home("zoo", config.name)
+    kind = pipeline.dit.config.label
+    with tempfile.TemporaryDirectory() as staging:
+        pipeline.save_pretrained(staging)
+        sums = checksums(staging)
+        card = Card(
+            config.name,
+            "-".join(weights),
+            kind,
+            LABELS[kind],
+            trainings,
+            storage.read_json(storage.join(about["real"], "dataset.json")),
+            about["sampling"],
+            scores,
+            sums,
+        )
+        storage.write_text(card.markdown(), f"{staging}/README.md")
+        storage.write_json(sums, f"{staging}/{CHECKSUMS}")
+        storage.write_json(scores, f"{staging}/metrics.json")
+        for training, name in zip(trainings, ("lvae", "dit"), strict=True):
+            storage.write_text(standalone_svg(training.chart()), f"{staging}/curves-{name}.svg")
+        for name, image in pictures(about).items():
+            storage.write_whole(f"{staging}/{name}.png", lambda stream, image=image: stream.write(image))
+        publish_directory(staging, output)
+        if not config.register:
+            return output, ""
+        tracker = Tracker.start(EXPERIMENT, config.name, {"weights": card.version}, storage.join(output, "mlflow.json"))
+        tracker.artifacts(staging, PIPELINE)
+        tracker.finish("FINISHED")
+    return output, registered(config.name, tracker.run_id)
+
+
+def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
+    """What was evaluated, and its scores. Raises ValueError if that is missing or of other weights."""
+    from pipelines import storage
+
+    advice = "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and name its --output"
+    if not storage.exists(storage.join(directory, "evaluation.json")):
+        raise ValueError(f"--evaluation {directory}: no evaluation here; {advice}")
+    about, scores = (storage.read_json(storage.join(directory, f"{name}.json")) for name in ("evaluation", "metrics"))
+    for part in ("generation", "reconstruction"):
+        if part not in scores:
+            raise ValueError(f"--evaluation {directory} holds no scores of {part}; {advice}")
+    judged = (about["sampling"] or {}).get("weights"), about["lvae_weights"]
+    if judged != ("-".join(weights), weights[0]):
+        raise ValueError(f"--evaluation {directory} is of other weights ({judged[0]}); {advice}")
+    return about, scores
+
+
+def training_of(experiment: str, stage: str, model: torch.nn.Module) -> Training:
+    """The training of a model's weights, from MLflow. Raises ValueError if no run there has them."""
+    from jobs.tracking import Tracker, client, tracking_uri
+    from pipelines.encode import weights_digest
+    from pipelines.model_card import Training
+
+    uri, digest = tracking_uri(), weights_digest(model)
+    api = client(uri)
+    known = api.get_experiment_by_name(experiment)
+    runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
+    if not runs:
+        raise ValueError(
+            f"no MLflow run of {experiment} in {uri} made these weights ({digest}); set MLFLOW_TRACKING_URI"
+        )
+    found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
+    return Training(
+        stage,
+        sum(value.numel() for value in model.parameters()),
+        int(found.data.tags["steps"]),
+        hours_of_steps(tracker, int(found.data.params["batch_size"])),
+        {name: value for name, value in found.data.params.items() if name != "architecture"},
+        {name: found.data.tags.get(name, "not recorded") for name in ("command", "commit", "machine", "versions")},
+        {words: axes(tracker.history(name)) for name, words in CURVES.items()},
+    )
+
+
+def axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float]]:
+    return [step for step, _ in points], [value for _, value in points]
+
+
+def hours_of_steps(tracker, batch_size: int) -> float:
+    """From the logged speeds: what was between sessions, start-ups and validations do not count."""
+    last, seconds = 0, 0.0
+    for step, speed in tracker.history("scenes_per_second"):
+        seconds += (step - last) * batch_size / speed
+        last = step
+    return seconds / 3600
+
+
+def pictures(about: Mapping) -> dict[str, bytes]:
+    """PNGs of the first scenes of those that were evaluated, and of those with most faults among the first JUDGED."""
+    import numpy as np
+
+    from pipelines.dataset import Dataset
+    from pipelines.metrics.validity import SLAB_OFFSET_M, scene_validity
+    from pipelines.scenes.render import bev_picture, contact_sheet, png
+    from pipelines.scenes.tables import read_scenes
+
+    slab_offset_m = SLAB_OFFSET_M if Dataset.open(about["real"]).spec.surface == "top" else 0.0
+    scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
+    faults = np.array([scene_validity(scene, slab_offset_m)[:-1, 0].sum() for scene in scenes])
+    worst = [scenes[k] for k in np.argsort(-faults, kind="stable")[:FAILURES]]
+    sides = {"samples": (scenes[:SHOWN], 8), "failures": (worst, FAILURES)}
+    return {
+        name: png(contact_sheet([bev_picture(scene, 192, supersample=2) for scene in chosen], columns))
+        for name, (chosen, columns) in sides.items()
+    }
+
+
+def main(config: Config) -> None:
+    output, reference = publish(config)
+    print(f"published: {output}{reference and f', {reference}'}")
+
+
+if __name__ == "__main__":
+    run(main, Config, description=__doc__)

@@ -1,0 +1,51 @@
+"""Published models in MLflow: a run with the pipeline's files, and a version of a registered model that points to it."""
+
+from __future__ import annotations
+
+import os
+
+from jobs.command import home
+from jobs.tracking import client, tracking_uri
+
+EXPERIMENT = "pritti-zoo"
+PIPELINE = "pipeline"  # artifact directory of a publishing run
+
+
+def registered(name: str, run_id: str) -> str:
+    """Register a publishing run's pipeline as the next version of a model; models:/NAME/VERSION."""
+    from mlflow.exceptions import MlflowException
+
+    api = client(tracking_uri())
+    try:
+        api.get_registered_model(name)
+    except MlflowException:
+        api.create_registered_model(name, description="PrITTI on Ray: layout VAE and diffusion transformer")
+    source = f"{api.get_run(run_id).info.artifact_uri}/{PIPELINE}"
+    version = api.create_model_version(name, source, run_id, await_creation_for=None)
+    return f"models:/{name}/{version.version}"
+
+
+def downloaded(reference: str) -> str:
+    """The directory with the pipeline that models:/NAME/VERSION or the id of a publishing run means.
+
+    Copied to $PRITTI_HOME/registry once. Raises ValueError for what MLflow does not know, or that holds no pipeline.
+    """
+    from mlflow.exceptions import MlflowException
+
+    from models.released import INDEX
+
+    api = client(tracking_uri())
+    try:
+        run_id = reference
+        if reference.startswith("models:/"):
+            name, _, version = reference.removeprefix("models:/").rpartition("/")
+            run_id = api.get_model_version(name, version).run_id
+        directory = os.path.join(home("registry"), run_id)
+        if not os.path.exists(os.path.join(directory, PIPELINE, INDEX)):
+            os.makedirs(directory, exist_ok=True)
+            api.download_artifacts(run_id, PIPELINE, directory)
+    except (MlflowException, OSError) as error:
+        raise ValueError(
+            f"{reference}: no published pipeline in {tracking_uri()} ({error}); jobs/publish_model.py makes them"
+        ) from error
+    return os.path.join(directory, PIPELINE)

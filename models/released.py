@@ -1,0 +1,42 @@
+"""Weights that come with the package: a pipeline's directory each, models/weights/<name>, with its card beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+WEIGHTS = Path(__file__).parent / "weights"
+INDEX = "model_index.json"  # makes a directory a pipeline's
+CHECKSUMS = "checksums.json"
+
+
+def released() -> list[str]:
+    """Names that `PrITTIPipeline.from_pretrained` knows."""
+    return sorted(path.parent.name for path in WEIGHTS.glob(f"*/{INDEX}"))
+
+
+def pipeline_path(model: str | os.PathLike) -> str:
+    """The directory that a path or a name means; a path goes first. Raises ValueError where there is neither.
+
+    Never looks beyond this machine.
+    """
+    model = os.fspath(model)
+    if os.path.exists(os.path.join(model, INDEX)):
+        return model
+    if model in released():
+        return str(WEIGHTS / model)
+    raise ValueError(
+        f"{model}: no PrITTI pipeline here, and none of that name comes with the package ({', '.join(released())})"
+    )
+
+
+def checksums(directory: str | os.PathLike) -> dict[str, str]:
+    """SHA-256 of every file of a pipeline that is loaded, by its path in the directory."""
+    root = Path(directory)
+    files = sorted(path for path in root.rglob("*") if path.suffix in (".safetensors", ".json"))
+    return {
+        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+        if path.name != CHECKSUMS
+    }

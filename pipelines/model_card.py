@@ -1,0 +1,104 @@
+"""The card of a published model, in Markdown: what it is, how it was trained, what it scores, how it fails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from pipelines.chart import Chart
+from pipelines.evaluation_report import VALIDITY, headlines, written
+
+HIDDEN = ("stage", "dataset", "lvae")  # of a run's options: paths and digests, told elsewhere
+
+Points = tuple[Sequence[float], Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Training:
+    """One stage's training, as its MLflow run tells it."""
+
+    stage: str
+    parameters: int  # numbers in the network
+    steps: int
+    hours: float  # of training steps, without start-up and validation
+    options: Mapping[str, str]
+    origin: Mapping[str, str]  # command, commit, machine, versions
+    curves: Mapping[str, Points]
+
+    def chart(self) -> Chart:
+        return Chart(f"{self.stage}: losses", self.curves, "training step", "loss", log_y=True)
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        yield "parameters", f"{self.parameters:,}"
+        yield "steps done", f"{self.steps:,}"
+        yield "hours of steps", f"{self.hours:.1f}"
+        yield from self.origin.items()
+        yield "options", ", ".join(f"{key} {value}" for key, value in self.options.items() if key not in HIDDEN)
+
+
+@dataclass(frozen=True)
+class Card:
+    """All that a card says. `scores` as metrics.json has them; `dataset` as dataset.json; `sampling`: how scenes were made."""
+
+    name: str
+    version: str
+    label: str
+    labels: Sequence[str]
+    trainings: Sequence[Training]
+    dataset: Mapping
+    sampling: Mapping
+    scores: Mapping
+    checksums: Mapping[str, str]
+
+    def markdown(self) -> str:
+        return "\n".join([*self._head(), *self._training(), *self._scores(), *self._limits(), *self._files()]) + "\n"
+
+    def _head(self) -> Iterator[str]:
+        yield "---\nlicense: apache-2.0\nlibrary_name: diffusers\npipeline_tag: unconditional-image-generation"
+        yield "tags: [3d, urban-scenes, primitives, layout, diffusion]\n---\n"
+        yield f"# PrITTI on Ray: {self.name}\n"
+        yield f"Layout VAE and diffusion transformer that generate 3D semantic urban scenes of 64 m x 64 m as primitives on a rasterised ground. Version {self.version}, written by `jobs/publish_model.py`.\n"
+        yield "```python\nfrom models import PrITTIPipeline\n"
+        yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
+        yield f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, num_inference_steps=20)\n```\n'
+        yield f"![The first scenes, not chosen](samples.png)\n\n*Scenes 0 to 31 of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}.*\n"
+        yield f"Conditioned on: {self.label} ({', '.join(self.labels)}).\n"
+
+    def _training(self) -> Iterator[str]:
+        scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
+        yield f"## Data\n\n{self.dataset['source']}, {scenes}; no scene of the test split was trained on. Options of `jobs/preprocess_scenes.py`:\n"
+        yield f"```json\n{json.dumps(self.dataset['options'])}\n```\n"
+        for training, curves in zip(self.trainings, ("curves-lvae.svg", "curves-dit.svg"), strict=True):
+            yield f"## Training: {training.stage}\n\n![Losses by step]({curves})\n"
+            yield from table(("", ""), training.rows())
+
+    def _scores(self) -> Iterator[str]:
+        generation = self.scores["generation"]
+        sides = generation["scenes"]
+        yield f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones, and the layout VAE's reconstructions of {self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` has every figure; docs/evaluation.md says what each is.\n"
+        yield from table(("score", "value"), ((name, written(value)) for name, value in headlines(self.scores)))
+
+    def _limits(self) -> Iterator[str]:
+        validity = self.scores["generation"]["validity"]
+        yield "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*The scenes with most faults.*\n"
+        rows = [
+            (VALIDITY[k], *(written(v[side]) or "–" for side in ("generated", "real"))) for k, v in validity.items()
+        ]
+        yield from table(("share of", "generated", "real"), rows)
+        yield "## Use and limits\n"
+        yield "Meant for research on layouts, for trying the tools, and as a start for training on other data. It knows nothing but the data named above: a procedural town is no survey of any real place, and scenes must not be taken for one. Nothing here was tested for the safety of vehicles. Repair faults with `jobs/edit_scenes.py repair`.\n"
+        yield "Licence: Apache-2.0, weights and code.\n"
+
+    def _files(self) -> Iterator[str]:
+        yield "## SHA-256\n"
+        yield from table(("file", "SHA-256"), self.checksums.items())
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]] | Iterator) -> Iterator[str]:
+    """Lines of a Markdown table, an empty one after it."""
+    yield "| " + " | ".join(head) + " |"
+    yield "|" + "---|" * len(head)
+    for row in rows:
+        yield "| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |"
+    yield ""

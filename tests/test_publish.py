@@ -1,0 +1,85 @@
+"""A model becomes an entry of the zoo: only with its own evaluation and training, and found again by every name."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from models.released import CHECKSUMS, WEIGHTS, checksums, pipeline_path, released
+
+
+@pytest.fixture(scope="module")
+def evaluated(smoke) -> Path:
+    """Scores of the smoke model's own scenes and reconstructions."""
+    from jobs import evaluate_scenes, sample_scenes
+
+    sample_scenes.sample(sample_scenes.Config(num_scenes=6, run="judged", sampler="dpm++", steps=2))
+    real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
+    config = evaluate_scenes.Config(
+        real=real, real_split="test", generated=str(smoke / "generated"), run="judged", lvae=lvae, limit=4, pictures=0, actors=1
+    )  # fmt: skip
+    evaluate_scenes.evaluate(config)
+    return smoke / "evaluations/judged"
+
+
+def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
+    from jobs.given_scenes import pipeline_directory
+    from jobs.publish_model import Config, publish
+    from pipelines.generate import load_pipeline
+
+    output, reference = publish(Config(name="tiny", evaluation=str(evaluated)))
+    entry = Path(output)
+    assert reference == "models:/tiny/1" and entry == smoke / "zoo/tiny"
+    assert json.loads((entry / CHECKSUMS).read_text()) == checksums(entry)
+    card, scores = (entry / "README.md").read_text(), json.loads((evaluated / "metrics.json").read_text())
+    assert f"| {scores['generation']['random_frechet']['value']:.3g}"[:8] in card
+    assert "| steps done | 8 |" in card and "learning_rate 0.001" in card and "options" in card
+    assert str(smoke) not in card  # no path of this machine
+    for picture in ("samples.png", "failures.png"):
+        assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
+    run_id = json.loads((entry / "mlflow.json").read_text())["run_id"]
+    trained = {name: value.tolist() for name, value in load_pipeline(output).dit.state_dict().items()}
+    for name in ("tiny", reference, run_id):
+        again = load_pipeline(pipeline_directory(name)).dit.state_dict()
+        assert {name: value.tolist() for name, value in again.items()} == trained
+    assert publish(Config(name="tiny", evaluation=str(evaluated)))[1] == "models:/tiny/2"
+
+
+def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_path):
+    from jobs.publish_model import Config, publish
+
+    with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
+        publish(Config(name="none", evaluation=str(tmp_path)))
+    about, scores = (json.loads((evaluated / f"{name}.json").read_text()) for name in ("evaluation", "metrics"))
+    other = about | {"sampling": about["sampling"] | {"weights": "aa-bb"}}
+    for spoilt, less, message in (
+        (other, {}, r"of other weights \(aa-bb\)"),
+        (about | {"sampling": None}, {}, "of other weights"),
+        (about, {"reconstruction"}, "no scores of reconstruction"),
+    ):
+        (tmp_path / "evaluation.json").write_text(json.dumps(spoilt))
+        (tmp_path / "metrics.json").write_text(json.dumps({k: v for k, v in scores.items() if k not in less}))
+        with pytest.raises(ValueError, match=message):
+            publish(Config(name="none", evaluation=str(tmp_path)))
+    assert not (smoke / "zoo/none").exists()
+
+
+def test_weights_that_nobody_trained_here_are_not_published(smoke, evaluated, monkeypatch, tmp_path):
+    from jobs.publish_model import Config, publish
+
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
+    with pytest.raises(ValueError, match="made these weights"):
+        publish(Config(name="none", evaluation=str(evaluated)))
+
+
+def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
+    from jobs.given_scenes import pipeline_directory
+
+    for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
+        with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
+            pipeline_directory(name)
+
+
+def test_released_weights_are_what_their_checksums_say():
+    for name in released():
+        assert json.loads((WEIGHTS / name / CHECKSUMS).read_text()) == checksums(pipeline_path(name))
