@@ -102,6 +102,18 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
                 Figure(len(made), "generated scenes", f"{config.sampling_steps} denoising steps each"),
             ],
         ),
+        *(
+            [
+                scene_pictures(
+                    "Scenes of the released model",
+                    "Weights that come with the package, trained for longer than a demo lasts (models/weights/town).",
+                    one_per_label(list(read_scenes(home("released"), "generated-samples")), SHOWN),
+                    "generated",
+                )
+            ]
+            if config.num_released
+            else []
+        ),
         scene_pictures(
             "Real scenes",
             "Held-out scenes of the town, 64 x 64 m, seen from above and from the side. The car stands at the bottom edge, looking up.",
@@ -110,7 +122,7 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
         ),
         scene_pictures(
             "Generated scenes",
-            "Sampled by the diffusion transformer for the vegetation label under each picture.",
+            "Sampled by the diffusion transformer that was trained just now, for the vegetation label under each picture.",
             one_per_label(made, SHOWN),
             "generated",
         ),

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""The main job on the built-in town, start to finish: preprocess -> train LVAE -> encode -> train DiT -> sample ->
-outpaint once -> evaluate -> report.html. No data, no GPU, no network.
+"""The main job on the built-in town, start to finish: scenes of the released model, then preprocess -> train LVAE ->
+encode -> train DiT -> sample -> outpaint once -> evaluate -> report.html. No data, no GPU, no network.
 
     jobs/run_demo.py                        15 minutes on two cores, everything under runs/demo
     jobs/run_demo.py --lvae-steps 20000 --dit-steps 50000 --output DIR       longer is better
@@ -18,6 +18,7 @@ from typing import Any
 
 from jobs.command import absolute, run, start_ray
 
+RELEASED = "town"
 CHECKPOINTS = 8  # per training run: each also validates and draws
 
 
@@ -34,8 +35,10 @@ class Config:
     dit_steps: int = 1700
     dit_batch_size: int = 8
     """Many small steps show something sooner than few large ones."""
+    num_released: int = 12
+    """Scenes to generate with the released model, before anything is trained; 0 for none."""
     num_scenes: int = 48
-    """Scenes to generate."""
+    """Scenes to generate with the model that was trained."""
     sampling_steps: int = 100
     """Denoising steps (the paper: 250)."""
     outpaint_steps: int = 50
@@ -70,6 +73,32 @@ class Stages:
         return result
 
 
+def show_released(config: Config) -> None:
+    """Scenes of the weights that come with the package, and a picture of them to look at while the rest trains."""
+    from jobs import sample_scenes
+    from jobs.command import home
+    from pipelines import storage
+    from pipelines.scenes.render import contact_sheet, picture_3d, png
+    from pipelines.scenes.tables import read_scenes
+
+    sample_scenes.sample(
+        sample_scenes.Config(
+            model=RELEASED,
+            output=home("released"),
+            num_scenes=config.num_released,
+            seed=config.seed,
+            sampler="dpm++",
+            steps=20,
+            glb=1,
+        )
+    )
+    scenes = read_scenes(home("released"), "generated-samples")
+    sheet = contact_sheet([picture_3d(scene, 480, 360) for scene in scenes], columns=4)
+    path = home("released.png")
+    storage.write_whole(path, lambda stream: stream.write(png(sheet)))
+    print(f"pictures: {os.path.relpath(path)}; now to train such a model")
+
+
 def main(config: Config) -> None:
     output = absolute(config.output)
     os.environ["PRITTI_HOME"] = output
@@ -91,8 +120,10 @@ def main(config: Config) -> None:
         home("models", f"lvae-{config.preset}"),
         home("models", f"pritti-{config.preset}"),
     )
-    stages = Stages(home("stages.json"), total=8)
+    stages = Stages(home("stages.json"), total=9 if config.num_released else 8)
     start_ray(training=True)
+    if config.num_released:
+        stages.run("sample scenes of the released model", lambda: show_released(config))
     stages.run(
         "preprocess the town",
         lambda: preprocess_scenes.main(

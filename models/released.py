@@ -32,11 +32,7 @@ def pipeline_path(model: str | os.PathLike) -> str:
 
 
 def checksums(directory: str | os.PathLike) -> dict[str, str]:
-    """SHA-256 of every file of a pipeline that is loaded, by its path in the directory."""
+    """SHA-256 of every file that is loaded from a pipeline's directory, by its path there."""
     root = Path(directory)
-    files = sorted(path for path in root.rglob("*") if path.suffix in (".safetensors", ".json"))
-    return {
-        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in files
-        if path.name != CHECKSUMS
-    }
+    files = [root / INDEX, *sorted(path for path in root.glob("*/*") if path.suffix in (".safetensors", ".json"))]
+    return {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

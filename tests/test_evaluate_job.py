@@ -34,7 +34,7 @@ def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
     data = str(smoke / "datasets/smoke")
     test = chosen_scenes(Selection(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([bev_picture(scene)]) for scene in test), SAMPLES)
-    options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3)}
+    options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3), "actors": 1}
     as_tables = evaluate(
         Config(generated=data, generated_split="test", balance=False, output=str(tmp_path / "tables"), **options)
     )["generation"]

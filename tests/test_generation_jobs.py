@@ -116,7 +116,8 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     assert np.allclose(middle.height_m, small.height_m, atol=0.006)
     assert (tmp_path / "glb/outpainted").is_dir()
 
-    looked = SeamsConfig(generated=str(tmp_path), real=str(smoke / "datasets/smoke"), output=str(tmp_path / "seams"))
+    real = str(smoke / "datasets/smoke")
+    looked = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), actors=1)
     seams = evaluate_seams(looked)
     assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
     query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
@@ -132,10 +133,11 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
 
     scores = evaluate(
         Config(
-            real=str(smoke / "datasets/smoke"),
+            real=real,
             generated=str(samples),
             lvae=str(smoke / "models/lvae-smoke"),
             pictures=0,
+            actors=1,
             output=str(tmp_path),
         )
     )

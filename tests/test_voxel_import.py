@@ -182,7 +182,7 @@ def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(scene_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
-    scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores")))
+    scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores"), actors=1))
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
     assert generation["random_frechet"]["value"] < 1e-4  # the very same pictures
