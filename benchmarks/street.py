@@ -1,0 +1,81 @@
+"""Street views of 704 x 188 pixels: ours against embree on the same triangles.
+
+python benchmarks/street.py
+
+Dense towns of about 250 primitives, cameras along their roads. Embree casts a ray per pixel at the whole mesh, ellipsoids as
+facets, as one would write it first; building its tree counts once a scene, as our triangles do. Ours also says what normal
+each pixel has, and meets ellipsoids exactly. CPU seconds of one thread; target 250 ms a frame.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import trimesh
+import tyro
+from common import DENSE_SEEDS, interleaved, ratios, spread, where
+
+from models.scene import Scene
+from pipelines.scenes.mesh import scene_triangles
+from pipelines.scenes.palette import EMPTY
+from pipelines.scenes.render import png
+from pipelines.scenes.roads import drive, road_network
+from pipelines.scenes.street import Lens, StreetCamera, StreetRenderer, shaded
+from pipelines.sources.town import town_drive
+from pipelines.streets import StreetRequest, cameras_along, depth_image
+
+ROUNDS = 5
+FRAMES = 8  # of a scene
+
+
+def cast(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
+    """Class ids (h, w) by embree."""
+    soup = scene_triangles(scene)
+    mesh = trimesh.Trimesh(soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False)  # fmt: skip
+    pictures = []
+    for camera in cameras:
+        lens = camera.lens
+        u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
+        local = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(u.shape)], axis=-1)
+        rays = (local @ camera.camera_from_scene).reshape(-1, 3)
+        triangle = mesh.ray.intersects_first(np.broadcast_to(camera.position_m, rays.shape), rays)
+        pictures.append(np.where(triangle >= 0, soup.class_id[triangle], EMPTY).reshape(u.shape))
+    return pictures
+
+
+def look(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
+    renderer = StreetRenderer(scene)
+    return [renderer.view(camera).class_id for camera in cameras]
+
+
+def write(scene: Scene, cameras: list[StreetCamera]) -> None:
+    """All images that jobs/render_streets.py writes, as PNG files in memory."""
+    renderer = StreetRenderer(scene)
+    for camera in cameras:
+        view = renderer.view(camera)
+        for image in (view.semantic, view.class_id, view.instance(), depth_image(view), shaded(view)):
+            png(image)
+
+
+def main() -> None:
+    print(where())
+    request, chosen = StreetRequest("", "", 1.0, 1.55, 0.0, Lens().resized(704, 188), 0.25, FRAMES), []
+    for seed in DENSE_SEEDS:
+        scene = town_drive(seed).scene(20)
+        cameras = cameras_along(drive(road_network(scene)), request)
+        chosen += [(scene, cameras)] if cameras else []
+    frames = sum(len(cameras) for _, cameras in chosen)
+    print(f"{len(chosen)} scenes of {np.mean([len(scene) for scene, _ in chosen]):.0f} primitives, {frames} frames of {request.lens.width} x {request.lens.height}")  # fmt: skip
+    same = [a == b for scene, cameras in chosen for a, b in zip(cast(scene, cameras), look(scene, cameras), strict=True)]  # fmt: skip
+    ways = {"embree": cast, "ours": look, "ours, shaded and written": write}
+    seconds = interleaved({name: lambda _, way=way: [way(*one) for one in chosen] for name, way in ways.items()}, ROUNDS)  # fmt: skip
+    for name, values in seconds.items():
+        print(f"{name}: {spread([1e3 * value / frames for value in values], 1, 0)} ms a frame")
+    print(f"embree / ours: {ratios(seconds['embree'], seconds['ours'])}; {100 * np.mean(same):.2f} % of pixels of one class (facets differ from ellipsoids at their rims)")  # fmt: skip
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
