@@ -7,17 +7,17 @@ read by anyone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 import torch
 
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
+from pipelines.actors import fan_out
 from pipelines.dataset import Dataset
 from pipelines.metrics import distributions, inception, statistics, validity
 from pipelines.metrics.adm_npz import pictures_in_npz
@@ -193,7 +193,7 @@ def describe(
     missing = [number for number in range(len(parts)) if not storage.exists(part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
-    for row in fan_out(missing, actor, arguments, num_actors):
+    for row in fan_out(missing, actor, arguments, num_actors, num_cpus=READER_CPUS):
         if on_scenes:
             on_scenes(row["scenes"])
     return read_parts(directory, len(parts))
@@ -210,21 +210,6 @@ def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> 
         for index, scene in zip(wanted, shard.scenes([rows[i - starts[number]] for i in wanted]), strict=True):
             scenes[index] = scene
     return [scenes[index] for index in indices]
-
-
-def fan_out(numbers: list[int], actor: type, arguments: tuple, num_actors: int) -> Iterator[dict]:
-    """Rows that actors return for the numbers {"id": number}, as they come; nothing is started for none."""
-    if numbers:
-        yield from (
-            ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
-            .map(
-                actor,
-                fn_constructor_args=arguments,
-                compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(numbers))),
-                num_cpus=READER_CPUS,
-            )
-            .iter_rows()
-        )
 
 
 def digest(looks: Looks) -> dict:

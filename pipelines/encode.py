@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pyarrow as pa
-import ray.data
 import torch
 
 from models.lvae import LayoutVAE
 from models.tensors import layout_batch
 from pipelines import storage
+from pipelines.actors import fan_out
 from pipelines.dataset import Dataset
 from pipelines.scenes.tables import Shard, find_shards, latents_schema
 
@@ -34,11 +34,6 @@ def load_lvae(directory: str) -> LayoutVAE:
         return LayoutVAE.from_pretrained(directory, low_cpu_mem_usage=False).eval().requires_grad_(False)
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(f"{directory}: no layout VAE here ({error}); run jobs/train_lvae.py first") from error
-
-
-def gpus_per_actor() -> int:
-    """1 where the cluster has GPUs (the driver's machine need not have one), else 0."""
-    return int(ray.cluster_resources().get("GPU", 0) > 0)
 
 
 class Encoder:
@@ -107,14 +102,8 @@ def encode_latents(
     storage.clean_temporaries(storage.join(output, "latents"))
 
     shards = find_shards(dataset.root, source=dataset.source)
-    graph = ray.data.range(len(shards), override_num_blocks=len(shards)).map(
-        Encoder,
-        fn_constructor_args=(lvae, output, shards, batch_size),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(shards))),
-        num_gpus=gpus_per_actor(),
-    )
     total, square, cells, counts = 0.0, 0.0, 0, {}
-    for row in graph.iter_rows():
+    for row in fan_out(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
         counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
         if row["split"] == "train":
             total, square = total + row["sum"], square + row["square"]

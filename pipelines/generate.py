@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 
-import ray.data
 import torch
 from diffusers.utils.logging import disable_progress_bar
 
@@ -16,8 +16,9 @@ from models.pipeline import PrITTIPipeline
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
+from pipelines.actors import fan_out
 from pipelines.claims import claim
-from pipelines.encode import gpus_per_actor, weights_digest
+from pipelines.encode import weights_digest
 from pipelines.scenes.tables import Shard
 
 
@@ -103,19 +104,18 @@ class Sampler:
         request, started = self.request, time.perf_counter()
         shard = request.shards()[row["id"]]
         indices = request.indices(shard)
-        if not shard.is_written():
-            scenes = []
-            for start in range(0, len(indices), self.batch_size):
-                chosen = indices[start : start + self.batch_size]
-                scenes += self.pipeline.generate(
-                    labels=[request.labels[i % len(request.labels)] for i in chosen],
-                    seed=request.seed,
-                    indices=chosen,
-                    num_inference_steps=request.num_inference_steps,
-                    guidance_scale=request.guidance_scale,
-                    run=request.run,
-                )
-            shard.write(scenes)
+        scenes = []
+        for start in range(0, len(indices), self.batch_size):
+            chosen = indices[start : start + self.batch_size]
+            scenes += self.pipeline.generate(
+                labels=[request.labels[i % len(request.labels)] for i in chosen],
+                seed=request.seed,
+                indices=chosen,
+                num_inference_steps=request.num_inference_steps,
+                guidance_scale=request.guidance_scale,
+                run=request.run,
+            )
+        shard.write(scenes)
         return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
 
 
@@ -133,14 +133,11 @@ def sample_scenes(
         for table in ("scenes", "primitives", "rasters"):
             storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])
     shards = request.shards()
-    graph = ray.data.range(len(shards), override_num_blocks=len(shards)).map(
-        Sampler,
-        fn_constructor_args=(request, batch_size),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(shards))),
-        num_gpus=gpus_per_actor(),
-    )
+    missing = [shard.number for shard in shards if not shard.is_written()]
+    written = [shard for shard in shards if shard.number not in missing]
+    rows = ({"id": shard.number, "scenes": len(request.indices(shard)), "seconds": 0.0} for shard in written)
     total = 0
-    for row in graph.iter_rows():
+    for row in chain(rows, fan_out(missing, Sampler, (request, batch_size), num_actors)):
         total += row["scenes"]
         if on_shard:
             on_shard(row)

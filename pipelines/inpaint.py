@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-import ray.data
 
 from models.inpaint import Contents, composited, half_plane_region, object_region, polygon_region, whole_cells
 from models.labels import require_labels
 from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene, merge
 from pipelines import storage
-from pipelines.encode import gpus_per_actor
+from pipelines.actors import fan_out
 from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
 from pipelines.metrics.reconstruction import pair_sums
 from pipelines.report import Picture, Pictures, Table, report_html
@@ -166,14 +165,8 @@ def inpaint_scenes(
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
     claim_run(request, pipeline, [storage.join(request.output, "drift", request.run)], input=asdict(selection))
-    graph = ray.data.range(len(chosen), override_num_blocks=len(chosen)).map(
-        Inpainter,
-        fn_constructor_args=(request, chosen),
-        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chosen))),
-        num_gpus=gpus_per_actor(),
-    )
     drifts = []
-    for row in graph.iter_rows():
+    for row in fan_out(range(len(chosen)), Inpainter, (request, chosen), num_actors):
         drifts += row["drift"]
         if on_scene:
             on_scene()

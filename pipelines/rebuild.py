@@ -19,9 +19,10 @@ from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
 from pipelines import storage
+from pipelines.actors import gpus_per_actor
 from pipelines.dataset import Dataset
 from pipelines.describe import READER_CPUS, label_fidelity
-from pipelines.encode import gpus_per_actor, load_lvae
+from pipelines.encode import load_lvae
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
     MEMORY,

@@ -7,13 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import ray.data
 import torch
 from PIL import Image
 
 from pipelines import storage
+from pipelines.actors import fan_out
 from pipelines.claims import changed_option
-from pipelines.encode import gpus_per_actor
 from pipelines.scenes.palette import CLASS_COLORS, EMPTY
 from pipelines.scenes.render import contact_sheet, png
 from pipelines.streets import ON_SHEET, moving_picture
@@ -86,13 +85,13 @@ class Painter:
 
 
 class StreetPainter:
-    """Actor. Row in: the directory of a drive. Row out: that, and its number of frames. Paints what is not painted yet."""
+    """Actor. Row in: number of a drive. Row out: its number of frames. Paints what is not painted yet."""
 
-    def __init__(self, request: PhotoRequest) -> None:
-        self.painter = Painter(request)
+    def __init__(self, request: PhotoRequest, directories: Sequence[str]) -> None:
+        self.painter, self.directories = Painter(request), directories
 
     def __call__(self, row: dict) -> dict:
-        directory, frames = row["directory"], []
+        directory, frames = self.directories[row["id"]], []
         for name in frame_names(directory):
             path = storage.join(directory, "photo", name)
             if not storage.exists(path):
@@ -108,7 +107,7 @@ class StreetPainter:
             "photos.webp": moving_picture(frames),
         }.items():
             storage.write_whole(storage.join(directory, name), lambda stream, content=content: stream.write(content))
-        return {"directory": directory, "frames": len(frames)}
+        return {"frames": len(frames)}
 
 
 def frame_names(directory: str) -> list[str]:
@@ -135,14 +134,8 @@ def paint_streets(
         if said := changed_option(record, asdict(request)):
             raise ValueError(f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it anew")
         storage.write_json(asdict(request), record)
-    graph = ray.data.from_items([{"directory": d} for d in directories], override_num_blocks=len(directories)).map(
-        StreetPainter,
-        fn_constructor_args=(request,),
-        compute=ray.data.ActorPoolStrategy(size=min(actors, len(directories))),
-        num_gpus=gpus_per_actor(),
-    )
     total = 0
-    for row in graph.iter_rows():
+    for row in fan_out(range(len(directories)), StreetPainter, (request, directories), actors):
         total += row["frames"]
         if on_drive:
             on_drive()
