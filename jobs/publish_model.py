@@ -43,8 +43,8 @@ class Config:
     """Also make it a version of a model in MLflow."""
 
 
-def publish(config: Config) -> tuple[str, str]:
-    """Write the entry; its directory, and models:/NAME/VERSION or ""."""
+def publish(config: Config) -> list[str]:
+    """Write the entry; what --model takes for it: its directory, and if registered models:/NAME/VERSION and the run."""
     import tempfile
 
     from jobs.ray_training import publish_directory
@@ -70,6 +70,7 @@ def publish(config: Config) -> tuple[str, str]:
     kind = pipeline.dit.config.label
     with tempfile.TemporaryDirectory() as staging:
         pipeline.save_pretrained(staging)
+        forget_paths(staging)
         sums = checksums(staging)
         card = Card(
             config.name,
@@ -91,11 +92,20 @@ def publish(config: Config) -> tuple[str, str]:
             storage.write_whole(f"{staging}/{name}.png", lambda stream, image=image: stream.write(image))
         publish_directory(staging, output)
         if not config.register:
-            return output, ""
-        tracker = Tracker.start(EXPERIMENT, config.name, {"weights": card.version}, storage.join(output, "mlflow.json"))
+            return [output]
+        tracker = Tracker.start(EXPERIMENT, config.name, {"weights": card.version})
         tracker.artifacts(staging, PIPELINE)
         tracker.finish("FINISHED")
-    return output, registered(config.name, tracker.run_id)
+    return [output, registered(config.name, tracker.run_id), tracker.run_id]
+
+
+def forget_paths(directory: str) -> None:
+    """Drop what diffusers keeps of where a model was loaded from: a directory of this machine."""
+    from pipelines import storage
+
+    for path in storage.list_files(directory, ".json"):
+        content = storage.read_json(path)
+        storage.write_json({key: value for key, value in content.items() if key != "_name_or_path"}, path)
 
 
 def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
@@ -175,8 +185,7 @@ def pictures(about: Mapping) -> dict[str, bytes]:
 
 
 def main(config: Config) -> None:
-    output, reference = publish(config)
-    print(f"published: {output}{reference and f', {reference}'}")
+    print("published:", ", ".join(publish(config)))
 
 
 if __name__ == "__main__":

@@ -47,13 +47,13 @@ class Tracker:
         return self._client
 
     @classmethod
-    def start(cls, experiment: str, name: str, parameters: dict, record: str) -> Tracker:
+    def start(cls, experiment: str, name: str, parameters: dict, record: str | None = None) -> Tracker:
         """The MLflow run that the file `record` names, so that a resumed run goes on in it, or a new one.
 
         Called once, in the driver: two processes creating the database at once would break it.
         """
         uri = tracking_uri()
-        if storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
+        if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
             client(uri).update_run(known["run_id"], status="RUNNING")
             return cls(uri, known["run_id"])
         if uri.startswith("sqlite:///"):
@@ -70,7 +70,8 @@ class Tracker:
             api.log_param(run_id, key, value)
         for key in ("command", "commit", "machine", "versions"):
             api.set_tag(run_id, key, getattr(origin, key)())
-        storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
+        if record:
+            storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
         return cls(uri, run_id)
 
     def metrics(self, values: dict[str, float], step: int) -> None:

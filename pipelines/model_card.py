@@ -55,7 +55,7 @@ class Card:
         return "\n".join([*self._head(), *self._training(), *self._scores(), *self._limits(), *self._files()]) + "\n"
 
     def _head(self) -> Iterator[str]:
-        yield "---\nlicense: apache-2.0\nlibrary_name: diffusers\npipeline_tag: unconditional-image-generation"
+        yield "---\nlicense: apache-2.0\nlibrary_name: diffusers"
         yield "tags: [3d, urban-scenes, primitives, layout, diffusion]\n---\n"
         yield f"# PrITTI on Ray: {self.name}\n"
         yield f"Layout VAE and diffusion transformer that generate 3D semantic urban scenes of 64 m x 64 m as primitives on a rasterised ground. Version {self.version}, written by `jobs/publish_model.py`.\n"
