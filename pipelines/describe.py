@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import pyarrow as pa
@@ -17,13 +18,13 @@ import torch
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
-from pipelines.actors import fan_out
 from pipelines.dataset import Dataset
 from pipelines.metrics import distributions, inception, statistics, validity
 from pipelines.metrics.adm_npz import pictures_in_npz
 from pipelines.scenes.render import bev_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
+from pipelines.work import fan_out, numbered, per_row
 
 READER_CPUS = 0.5
 PICTURES_PER_PART = 512
@@ -95,25 +96,29 @@ def label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
     return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle)
 
 
-class Describer:
-    """Actor. Row in: number of a part, a shard with rows. Row out: the number of its scenes. Writes the part's file."""
+def describe_part(
+    number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: Looks, directory: str
+) -> dict:
+    """Ray task. Number of a part, a shard with rows, in; the number of its scenes out. Writes the part's file."""
+    torch.set_num_threads(1)
+    shard, rows = parts[number]
+    scenes = shard.scenes(rows)
+    pictures = np.stack([bev_picture(scene, PICTURE_PX, looks.supersample) for scene in scenes])
+    columns = features(pictures, network_of(looks))
+    if dataset:
+        columns = scene_rows(scenes, dataset) | columns
+    write_part(directory, number, [scene.scene_id for scene in scenes], columns)
+    return {"scenes": len(scenes)}
 
-    def __init__(
-        self, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: Looks, directory: str
-    ) -> None:
-        torch.set_num_threads(1)
-        self.parts, self.dataset, self.looks, self.directory = parts, dataset, looks, directory
-        self.network = inception.load_inception(looks.inception) if looks.inception else None
 
-    def __call__(self, row: dict) -> dict:
-        shard, rows = self.parts[row["id"]]
-        scenes = shard.scenes(rows)
-        pictures = np.stack([bev_picture(scene, PICTURE_PX, self.looks.supersample) for scene in scenes])
-        columns = features(pictures, self.network)
-        if self.dataset:
-            columns = scene_rows(scenes, self.dataset) | columns
-        write_part(self.directory, row["id"], [scene.scene_id for scene in scenes], columns)
-        return {"scenes": len(scenes)}
+def network_of(looks: Looks) -> inception.Inception | None:
+    """Loaded once a process, until the file changes."""
+    return loaded_inception(*storage.fingerprint(looks.inception)) if looks.inception else None
+
+
+@lru_cache(maxsize=1)
+def loaded_inception(path: str, *_: str | int) -> inception.Inception:
+    return inception.load_inception(path)
 
 
 class PictureDescriber:
@@ -125,7 +130,7 @@ class PictureDescriber:
     def __init__(self, path: str, parts: list[range], looks: Looks, directory: str) -> None:
         torch.set_num_threads(1)
         self.path, self.parts, self.directory = path, parts, directory
-        self.network = inception.load_inception(looks.inception) if looks.inception else None
+        self.network = network_of(looks)
         self.batches, self.next_part = iter(()), len(parts)
 
     def __call__(self, row: dict) -> dict:
@@ -181,19 +186,26 @@ def describe(
     if isinstance(side, PictureFile):
         parts = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
         counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint(side.path)], None
-        actor, arguments = PictureDescriber, (side.path, parts, looks, directory)
     else:
         parts = side.shards()
         counts = [len(rows) for _, rows in parts]
         tables = ("scenes", "primitives", "rasters")
         files = [storage.fingerprint(shard.path(table)) for shard, _ in parts for table in tables]
         judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
-        actor, arguments = Describer, (parts, dataset, looks, directory)
     claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | digest(looks))
     missing = [number for number in range(len(parts)) if not storage.exists(part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
-    for row in fan_out(missing, actor, arguments, num_actors, num_cpus=READER_CPUS):
+
+    def describe_scenes(row: dict) -> dict:
+        return describe_part(row["id"], parts, dataset, looks, directory)
+
+    if isinstance(side, PictureFile):
+        arguments = side.path, parts, looks, directory
+        rows = fan_out(missing, PictureDescriber, arguments, num_actors, num_cpus=READER_CPUS)
+    else:
+        rows = per_row(numbered(missing), describe_scenes, READER_CPUS, num_actors).iter_rows() if missing else ()
+    for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])
     return read_parts(directory, len(parts))

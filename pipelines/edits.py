@@ -16,12 +16,12 @@ from models.inpaint import object_region
 from models.scene import Scene
 from pipelines import storage
 from pipelines.claims import claim
-from pipelines.ingest import per_row
 from pipelines.report import Picture, Pictures, Section, Table, report_html
 from pipelines.scenes.edit import Done, Edit, edits_to_json, replayed
 from pipelines.scenes.render import bev_picture, outlined_picture
 from pipelines.scenes.tables import EDITS, TABLES, Shard, rejects_table
 from pipelines.selection import Selection
+from pipelines.work import per_row
 
 PICTURE_PX = 512
 OUTLINE_M = 0.4  # around what an edit changed

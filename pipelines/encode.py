@@ -12,9 +12,9 @@ import torch
 from models.lvae import LayoutVAE
 from models.tensors import layout_batch
 from pipelines import storage
-from pipelines.actors import fan_out
 from pipelines.dataset import Dataset
 from pipelines.scenes.tables import Shard, find_shards, latents_schema
+from pipelines.work import fan_out
 
 
 def weights_digest(model: torch.nn.Module) -> str:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-import ray.data
-
 from models.scene import Scene
 from pipelines import storage
-from pipelines.ingest import per_row
 from pipelines.scenes.mesh import scene_glb, scene_ply
 from pipelines.scenes.opendrive import scene_opendrive
 from pipelines.scenes.tables import Shard, rejects_table
 from pipelines.scenes.voxel_import import scene_voxels_npz
 from pipelines.selection import Selection
+from pipelines.work import numbered, per_row
 
 Format = Literal["glb", "ply", "npz", "xodr"]
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
@@ -59,7 +57,7 @@ def export_scenes(
         return {"scenes": len(rows), "written": written, "rejects": [(r["scene_id"], r["reason"]) for r in rejects]}
 
     counts, refused = dict.fromkeys(formats, 0), {}
-    for row in per_row(ray.data.range(len(parts), override_num_blocks=len(parts)), write).iter_rows():
+    for row in per_row(numbered(range(len(parts))), write).iter_rows():
         for kind in row["written"]:
             counts[kind] += 1
         refused |= {scene_id: reason for scene_id, reason in row["rejects"]}

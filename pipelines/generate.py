@@ -16,10 +16,10 @@ from models.pipeline import PrITTIPipeline
 from models.scene import Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
-from pipelines.actors import fan_out
 from pipelines.claims import claim
 from pipelines.encode import weights_digest
 from pipelines.scenes.tables import Shard
+from pipelines.work import fan_out
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ import ray.data
 
 from pipelines import storage
 from pipelines.cut import joined_tables
-from pipelines.ingest import per_row
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.scenes.axes import Axes
 from pipelines.scenes.mesh_import import scene_from_glb
 from pipelines.scenes.tables import Shard, rejects_table, scene_tables
 from pipelines.scenes.voxel_import import read_voxels, voxel_picture
+from pipelines.work import per_row
 
 MAX_FILES_PER_SHARD = 64
 WANTED_SHARDS = 8

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
 import ray
 import ray.data
-from ray.util.annotations import RayDeprecationWarning
 
 from models.scene import Grid
 from pipelines import storage
@@ -26,20 +24,12 @@ from pipelines.dataset import DESCRIPTION, Statistics, label_scenes, training_st
 from pipelines.plan import Task
 from pipelines.scenes.tables import SCHEMA_VERSION, Shard
 from pipelines.sources.drive import Drive
+from pipelines.work import MAX_RETRIES, per_row
 
 STAGING = ".staging"
-# Of a task whose worker died: a killed worker is replaced, a shard that always kills its worker stops the run.
-MAX_RETRIES = 20
 
 
 # ------------------------------------------------------------------------------------------------------- pass 1
-
-
-def per_row(dataset: ray.data.Dataset, function: Callable[[dict], dict]) -> ray.data.Dataset:
-    """One Ray task per row, tried again when its worker dies."""
-    with warnings.catch_warnings():  # Ray says that 2.64 will take this option in another way; 2.60 has none yet
-        warnings.simplefilter("ignore", RayDeprecationWarning)
-        return dataset.map(function, num_cpus=1, max_retries=MAX_RETRIES)
 
 
 def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:

@@ -12,7 +12,6 @@ from models.labels import require_labels
 from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene, merge
 from pipelines import storage
-from pipelines.actors import fan_out
 from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
 from pipelines.metrics.reconstruction import pair_sums
 from pipelines.report import Picture, Pictures, Table, report_html
@@ -20,6 +19,7 @@ from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.render import outlined_picture
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
+from pipelines.work import fan_out
 
 PICTURE_PX = 512
 PER_ROW = 4  # pictures of a scene: as given, and its first results

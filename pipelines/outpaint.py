@@ -17,11 +17,11 @@ from models.pipeline import Resampling
 from models.scene import Scene
 from models.tensors import new_scene
 from pipelines import storage
-from pipelines.actors import gpus_per_actor
 from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
 from pipelines.scenes.mesh import scene_glb
 from pipelines.scenes.tables import Shard
 from pipelines.selection import Selection
+from pipelines.work import gpus_per_actor
 
 RANKS = {"outward": outward, "colours": colour}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")

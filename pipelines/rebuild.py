@@ -19,7 +19,6 @@ from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
 from pipelines import storage
-from pipelines.actors import gpus_per_actor
 from pipelines.dataset import Dataset
 from pipelines.describe import READER_CPUS, label_fidelity
 from pipelines.encode import load_lvae
@@ -47,6 +46,7 @@ from pipelines.scenes.render import bev_picture, picture_3d
 from pipelines.scenes.tables import Shard
 from pipelines.scenes.voxels import NUM_CLASSES, Outside, VoxelGrid, outside, voxelise
 from pipelines.selection import Selection
+from pipelines.work import gpus_per_actor
 
 Chunk = tuple[Shard, list[int]]  # scenes of one shard, by row
 AP_VARIANTS = {

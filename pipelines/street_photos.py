@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 
 from pipelines import storage
-from pipelines.actors import fan_out
 from pipelines.claims import changed_option
 from pipelines.scenes.palette import CLASS_COLORS, EMPTY
 from pipelines.scenes.render import contact_sheet, png
 from pipelines.streets import ON_SHEET, moving_picture
+from pipelines.work import fan_out
 
 SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view has nothing
 MULTIPLE_PX = 8  # of the sides of pictures that the network takes

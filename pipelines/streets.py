@@ -7,18 +7,17 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import ray.data
 from PIL import Image
 
 from models.scene import Scene
 from pipelines import storage
 from pipelines.claims import changed_option
-from pipelines.ingest import per_row
 from pipelines.scenes.palette import CLASS_ID
 from pipelines.scenes.render import contact_sheet, png
 from pipelines.scenes.roads import drive, road_network
 from pipelines.scenes.street import Lens, StreetCamera, StreetRenderer, StreetView, shaded
 from pipelines.selection import Selection
+from pipelines.work import numbered, per_row
 
 DEPTH_PER_M = 256  # of the 16 bits of a depth image, as in KITTI; 0 where nothing is or beyond 255 m
 FRAMES_PER_SECOND = 10
@@ -125,7 +124,7 @@ def render_streets(
         return {"scene_id": scene.scene_id, "frames": count}
 
     frames = {}
-    for row in per_row(ray.data.range(len(chosen), override_num_blocks=len(chosen)), write).iter_rows():
+    for row in per_row(numbered(range(len(chosen))), write).iter_rows():
         frames[row["scene_id"]] = row["frames"]
         if on_scene:
             on_scene()

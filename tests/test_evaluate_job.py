@@ -74,7 +74,7 @@ def test_a_killed_worker_changes_nothing(smoke, tmp_path):
     def kill(scenes: int) -> None:
         for process in psutil.Process().children(recursive=True) if scenes and not killed else ():
             with suppress(psutil.Error, IndexError):
-                if "Describer" in process.cmdline()[0]:
+                if "describe_scenes" in process.cmdline()[0]:
                     process.kill()
                     killed.append(process.pid)
 

@@ -1,0 +1,57 @@
+"""README's picture, from the released weights: scenes by label, one of them outpainted, and a drive through it.
+
+python docs/hero.py            writes docs/hero.png; a minute on two cores
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from models import PrITTIPipeline
+from models.pipeline import Resampling
+from models.scene import Scene
+from pipelines.scenes.render import picture_3d, png
+from pipelines.scenes.roads import drive, road_network
+from pipelines.scenes.street import Lens, StreetRenderer, shaded
+from pipelines.streets import StreetRequest, cameras_along
+
+GAP, WIDTH, HEIGHT, FRAME = 12, 480, 360, 154  # pixels: between pictures, of a scene, height of a street view
+SEED = 0
+FRAMES = 3
+
+
+def street_views(scene: Scene) -> list[np.ndarray]:
+    """Views along the road through a scene, evenly spread."""
+    lens = Lens().resized(WIDTH, FRAME)
+    request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
+    cameras = cameras_along(drive(road_network(scene)), request)
+    renderer = StreetRenderer(scene)
+    return [shaded(renderer.view(cameras[k])) for k in np.linspace(0, 0.8 * len(cameras), FRAMES).astype(int)]
+
+
+def stacked(pictures: list[np.ndarray], axis: int) -> np.ndarray:
+    """Pictures beside (axis 1) or below each other (axis 0), with white between."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    white = np.full(shape, 255, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (picture, white)][:-1], axis)
+
+
+def main() -> None:
+    pipeline = PrITTIPipeline.from_pretrained("town")
+    pipeline.set_progress_bar_config(desc="outpaint")
+    made = {}
+    for label in ("low", "medium", "high"):
+        pipeline.use_sampler("dpm++")
+        made[label] = pipeline.generate([label], seed=SEED, num_inference_steps=20)[0]
+    larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, resampling=Resampling(50, 5, 5))
+    above = stacked([picture_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
+    views = stacked(street_views(larger), 0)
+    below = stacked([picture_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
+    Path(__file__).with_name("hero.png").write_bytes(png(stacked([above, below], 0)))
+
+
+if __name__ == "__main__":
+    main()
