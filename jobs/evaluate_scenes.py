@@ -37,8 +37,8 @@ class Config:
     real_split: str = "train"
     """Split that generated scenes are compared with; the paper takes the training split."""
     generated: str = ""
-    """Dataset directory of the generated scenes (default with neither --lvae nor this: $PRITTI_HOME/generated), or an
-    .npz of pictures, as ADM's; of those, the first --samples."""
+    """Dataset directory of the generated scenes (default: $PRITTI_HOME/generated, and with --lvae none unless --run names
+    one), or an .npz of pictures, as ADM's; of those, the first --samples."""
     generated_split: str = ""
     """Only this split of them (default: whatever is there); --generated may be any dataset directory."""
     run: str = ""
@@ -89,7 +89,8 @@ def evaluate(config: Config) -> dict:
     dataset = None
     if config.lvae or not config.real.endswith(".npz"):
         dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
-    wanted = config.generated or ("" if config.lvae else home("generated"))
+    named = config.run or config.generated_source or not config.lvae
+    wanted = config.generated or (home("generated") if named else "")
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
     from pipelines import storage
 

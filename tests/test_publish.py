@@ -16,7 +16,7 @@ def evaluated(smoke) -> Path:
     sample_scenes.sample(sample_scenes.Config(num_scenes=6, run="judged", sampler="dpm++", steps=2))
     real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
     config = evaluate_scenes.Config(
-        real=real, real_split="test", generated=str(smoke / "generated"), run="judged", lvae=lvae, limit=4, pictures=0, actors=1
+        real=real, real_split="test", run="judged", lvae=lvae, limit=4, pictures=0, actors=1
     )  # fmt: skip
     evaluate_scenes.evaluate(config)
     return smoke / "evaluations/judged"
