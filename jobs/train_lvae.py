@@ -44,6 +44,9 @@ class Config:
     learning_rate: float | None = None
     kl_weight: float | None = None
     """Of the KL divergence, summed over the latent; the paper's 1e-6 unless the preset says otherwise."""
+    latent_noise: float | None = None
+    """Spread of the noise on latents that decoders learn to bear, in deviations of each channel (default: as the preset
+    says; the paper: none)."""
     accumulate: int = 1
     """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
     precision: str = "auto"
@@ -110,6 +113,9 @@ def prepare(config: Config) -> TrainingRun:
     kl_weight = row.kl_weight if config.kl_weight is None else config.kl_weight
     if kl_weight < 0:
         raise ValueError(f"--kl-weight is {kl_weight}, expected 0 or more")
+    latent_noise = row.latent_noise if config.latent_noise is None else config.latent_noise
+    if latent_noise < 0:
+        raise ValueError(f"--latent-noise is {latent_noise}, expected 0 or more")
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
@@ -119,6 +125,7 @@ def prepare(config: Config) -> TrainingRun:
         preset=config.preset,
         batch_size=batch_size,
         kl_weight=kl_weight,
+        latent_noise=latent_noise,
         layout=spec.fingerprint(),
         dataset=root,
     ) | ({"augmentation": asdict(augment)} if config.flip or config.jitter else {})
@@ -134,6 +141,7 @@ def prepare(config: Config) -> TrainingRun:
             spec.to_dict(),
             settings,
             kl_weight,
+            latent_noise,
             execution,
             sample_layouts(shards, counts, spec),
         ),
@@ -169,7 +177,17 @@ def sample_layouts(shards: list, counts: list[int], spec) -> dict:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def build(architecture: dict, layout: dict, settings, kl_weight: float, execution, sample: dict, device, wrap):
+def build(
+    architecture: dict,
+    layout: dict,
+    settings,
+    kl_weight: float,
+    latent_noise: float,
+    execution,
+    sample: dict,
+    device,
+    wrap,
+):
     """The Trainer of stage 1, with the same initial weights on every worker."""
     import torch
 
@@ -181,7 +199,7 @@ def build(architecture: dict, layout: dict, settings, kl_weight: float, executio
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
     model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
-    return lvae_trainer(model, settings, kl_weight, device, wrap, execution)
+    return lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)
 
 
 def main(config: Config) -> None:

@@ -217,7 +217,19 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         features = latent.new_zeros(len(latent), 0, FEATURES)
         return features, features[..., 0], (0,) * len(self.spec.slots), MatchWeights()
 
-    def forward(self, batch: LayoutBatch, noise: Float[Tensor, "batch c2 h w"]) -> tuple[LayoutOutput, Posterior]:
-        """Reconstruction from a sampled latent, and the posterior it was sampled from."""
+    def forward(
+        self,
+        batch: LayoutBatch,
+        noise: Float[Tensor, "batch c2 h w"],
+        corruption: Float[Tensor, "batch c2 h w"] | None = None,
+    ) -> tuple[LayoutOutput, Posterior]:
+        """Reconstruction from a sampled latent, and the posterior it was sampled from.
+
+        `corruption` is more noise on the latent, in units of each channel's deviation over a scene's cells: decoders
+        learn to bear what a diffusion model's latents are off. Not in the paper; Zheng et al. 2025 (RAE) train so.
+        """
         posterior = self.encode(batch)
-        return self.decode(posterior.sample(noise)), posterior
+        latent = posterior.sample(noise)
+        if corruption is not None:
+            latent = latent + corruption * posterior.mean.detach().std(dim=(2, 3), keepdim=True)
+        return self.decode(latent), posterior

@@ -95,13 +95,25 @@ def stacked_noise(generators: list[torch.Generator], shape: tuple[int, ...], dev
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 
-def layout_loss(spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float) -> LossFunction:
+def stacked_corruption(
+    generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
+) -> Tensor:
+    """(len(generators), *shape) normal numbers, each sample's as large as |N(0, spread^2)| says."""
+    drawn = [torch.randn(shape, generator=g) * torch.randn((), generator=g).abs() * spread for g in generators]
+    return torch.stack(drawn).to(device)
+
+
+def layout_loss(
+    spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
+) -> LossFunction:
     """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
 
     def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
         device = arrays["real"].device
         batch = LayoutBatch.from_compact(arrays)
-        output, posterior = model(batch, stacked_noise(generators, latent_shape, device))
+        noise = stacked_noise(generators, latent_shape, device)
+        corruption = stacked_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
+        output, posterior = model(batch, noise, corruption)
         output, posterior = output.float(), posterior.float()
         parts = lvae_loss(output, posterior, batch, spec, kl_weight).items()
         return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
@@ -286,10 +298,11 @@ def lvae_trainer(
     device: torch.device,
     wrap: Wrap = lambda m: m,
     execution: Execution | None = None,
+    latent_noise: float = 0.0,
 ) -> Trainer:
     execution = execution or Execution()
     model = model.to(device)
-    loss = layout_loss(model.spec, model.latent_shape, kl_weight)
+    loss = layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise)
     return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
 
 

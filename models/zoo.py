@@ -33,11 +33,12 @@ class LVAEPreset:
     grad_clip: float | None = None
     ema_decay: float | None = None
     kl_weight: float = 1e-6  # of the sum over the latent
+    latent_noise: float = 0.0  # spread of the noise that decoders learn to bear; not in the paper
 
     def architecture(self) -> dict:
         """Keyword arguments of `LayoutVAE` apart from the layout."""
         training = ("source", "raster_px", "batch_size", "steps", "learning_rate", "final_learning_rate")
-        training += ("weight_decay", "warmup_steps", "grad_clip", "ema_decay", "kl_weight")
+        training += ("weight_decay", "warmup_steps", "grad_clip", "ema_decay", "kl_weight", "latent_noise")
         return {name: value for name, value in vars(self).items() if name not in training}
 
 

@@ -18,7 +18,7 @@ from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupa
 from models.lvae import LayoutVAE, Posterior
 from models.matching import MatchWeights, match
 from models.tensors import compact_layout, layout_batch
-from models.training import Execution, Optimisation, Trainer, lvae_trainer
+from models.training import Execution, Optimisation, Trainer, lvae_trainer, stacked_corruption
 from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
 
 
@@ -338,6 +338,25 @@ def test_the_lvaes_step_is_the_same_in_halves_and_in_bf16(execution):
     plain, other = losses.values()
     assert np.isclose(other[0], plain[0], rtol=1e-2 if execution.precision == "bf16" else 1e-5)
     assert plain[-1] < 0.9 * plain[0] and np.isclose(other[-1], plain[-1], rtol=0.1)
+
+
+def test_noise_on_latents_is_a_samples_own_and_as_large_as_it_says():
+    generators = [torch.Generator().manual_seed(k) for k in range(400)]
+    drawn = stacked_corruption(generators, (4, 8, 8), 0.2, torch.device("cpu"))
+    alone = stacked_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
+    assert torch.equal(drawn[7], alone[0])
+    sizes = drawn.std(dim=(1, 2, 3))
+    assert np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02  # |N(0, 0.2)|
+    lvae, spec = small_lvae(decoder="cells", shortcut=True), small_spec()
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    noise = torch.zeros(2, *lvae.latent_shape)
+    with torch.no_grad():
+        plain, posterior = lvae(batch, noise)
+        for size in (0.0, 0.5):
+            noisy, _ = lvae(batch, noise, torch.full_like(noise, size))
+            moved = posterior.mean + size * posterior.mean.std(dim=(2, 3), keepdim=True)
+            assert torch.allclose(noisy.height, lvae.decode(moved).height, atol=1e-5)
+            assert torch.equal(noisy.height, plain.height) == (size == 0)
 
 
 def test_dit_is_conditioned_and_starts_at_zero():
