@@ -127,7 +127,7 @@ def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
 
 def training_of(experiment: str, stage: str, model: torch.nn.Module) -> Training:
     """The training of a model's weights, from MLflow. Raises ValueError if no run there has them."""
-    from jobs.tracking import Tracker, client, tracking_uri
+    from jobs.tracking import Tracker, client, shown, tracking_uri
     from pipelines.encode import weights_digest
     from pipelines.model_card import Training
 
@@ -137,7 +137,7 @@ def training_of(experiment: str, stage: str, model: torch.nn.Module) -> Training
     runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
     if not runs:
         raise ValueError(
-            f"no MLflow run of {experiment} in {uri} made these weights ({digest}); set MLFLOW_TRACKING_URI"
+            f"no MLflow run of {experiment} in {shown(uri)} made these weights ({digest}); set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
     return Training(

@@ -137,17 +137,18 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
-    tag_weights(run.tracker, trainer)
+    model = trainer.averaged()
+    tag_weights(run.tracker, model, trainer.steps_done)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
-        trainer.averaged().save_pretrained(os.path.join(directory, "model"))
+        model.save_pretrained(os.path.join(directory, "model"))
         ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
 
 
-def tag_weights(tracker: Tracker, trainer: Trainer) -> None:
+def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
     """Say in MLflow which weights a run has made so far: jobs/publish_model.py finds the run by them."""
-    tracker.tag("weights", weights_digest(trainer.averaged()))
-    tracker.tag("steps", str(trainer.steps_done))
+    tracker.tag("weights", weights_digest(model))
+    tracker.tag("steps", str(steps))
 
 
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:

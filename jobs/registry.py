@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from jobs.command import home
-from jobs.tracking import client, tracking_uri
+from jobs.tracking import client, shown, tracking_uri
 
 EXPERIMENT = "pritti-zoo"
 PIPELINE = "pipeline"  # artifact directory of a publishing run
@@ -46,6 +46,6 @@ def downloaded(reference: str) -> str:
             api.download_artifacts(run_id, PIPELINE, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(
-            f"{reference}: no published pipeline in {tracking_uri()} ({error}); jobs/publish_model.py makes them"
+            f"{reference}: no published pipeline in {shown(tracking_uri())} ({shown(str(error))}); jobs/publish_model.py makes them"
         ) from error
     return os.path.join(directory, PIPELINE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
@@ -16,6 +17,11 @@ METRICS_PER_CALL = 1000  # MLflow's limit
 def tracking_uri() -> str:
     """$MLFLOW_TRACKING_URI, or an sqlite file under $PRITTI_HOME."""
     return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home('mlflow.db')}"
+
+
+def shown(uri: str) -> str:
+    """A tracking URI for messages: without the user and password that it may hold."""
+    return re.sub(r"//[^/@]*@", "//", uri)
 
 
 def client(uri: str):

@@ -100,8 +100,9 @@ def smoke(tmp_path_factory, cluster) -> Path:
         trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(as_tensors(batch), range(run.stream.batch_size))
-        jobs.ray_training.tag_weights(run.tracker, trainer)
-        trainer.averaged().save_pretrained(output)
+        model = trainer.averaged()
+        jobs.ray_training.tag_weights(run.tracker, model, trainer.steps_done)
+        model.save_pretrained(output)
         run.tracker.finish("FINISHED")
         return output
 

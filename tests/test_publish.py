@@ -73,6 +73,13 @@ def test_weights_that_nobody_trained_here_are_not_published(smoke, evaluated, mo
         publish(Config(name="none", evaluation=str(evaluated)))
 
 
+def test_a_password_in_the_tracking_uri_is_not_shown():
+    from jobs.tracking import shown
+
+    assert shown("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
+    assert shown("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
+
+
 def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
     from jobs.given_scenes import pipeline_directory
 
