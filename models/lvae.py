@@ -231,5 +231,5 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         posterior = self.encode(batch)
         latent = posterior.sample(noise)
         if corruption is not None:
-            latent = latent + corruption * posterior.mean.detach().std(dim=(2, 3), keepdim=True)
+            latent = latent + corruption * posterior.mean.std(dim=(2, 3), keepdim=True)
         return self.decode(latent), posterior
