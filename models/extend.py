@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -95,33 +95,59 @@ def region_blocks(pipeline: PrITTIPipeline, scene: Scene, region: np.ndarray) ->
     return parts
 
 
-def inpainted(
+@dataclass(frozen=True)
+class Step:
+    """A block made anew in several variants of a scene: `made` what decoders said, `canvases` the scenes with it in them.
+
+    `known`, `made` and `region` (rows, cols; whole cells) are the block's own; `canvases` are as large as the scene.
+    """
+
+    known: list[Scene]
+    made: list[Scene]
+    region: np.ndarray
+    canvases: list[Scene]
+
+
+def inpainting(
     pipeline: PrITTIPipeline,
     scene: Scene,
     region: np.ndarray,
     label: str,
     contents: Contents = "both",
     seed: int = 0,
+    indices: Sequence[int] = (0,),
     resampling: Resampling | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
-) -> Scene:
-    """A scene of any size made anew inside a region (rows, cols) of its pixels, in whole cells; the rest stays bit for bit.
+) -> Iterator[Step]:
+    """A scene of any size made anew, once per index, inside a region (rows, cols) of its pixels; the last step has all of it.
 
     `PrITTIPipeline.inpaint` on a scene of the model's size; on a larger one block by block, each knowing what is there.
-    Raises ValueError as `require_blocks`.
+    Regions grow to whole cells, the rest stays bit for bit. Raises ValueError as `require_blocks`.
     """
-    canvas, level_m = scene, height_near(scene, 0.0, 0.0)
+    canvases, level_m = [scene] * len(indices), height_near(scene, 0.0, 0.0)
     for number, (window, part) in enumerate(region_blocks(pipeline, scene, region)):
-        known, offset_m = in_block(canvas, window, pipeline.spec.grid, level_m)
+        blocks = [in_block(canvas, window, pipeline.spec.grid, level_m) for canvas in canvases]
+        known = [block for block, _ in blocks]
         made = pipeline.inpaint(
-            [known], [part], [label], contents, seed, [number], resampling, guidance_scale,
+            known,
+            [part] * len(known),
+            [label] * len(known),
+            contents,
+            seed,
+            [(index, number) if number else index for index in indices],
+            resampling,
+            guidance_scale,
             callback_on_step_end=callback_on_step_end,
-        )[0]  # fmt: skip
+            composite=False,
+        )
         inside = np.zeros_like(region)
         inside[scene.grid.shared(window)[0]] = part
-        canvas = composited(canvas, made.moved(*offset_m).cropped(scene.grid), inside, contents)
-    return canvas
+        canvases = [
+            composited(canvas, one.moved(*offset_m).cropped(scene.grid), inside, contents)
+            for canvas, one, (_, offset_m) in zip(canvases, made, blocks, strict=True)
+        ]
+        yield Step(known, made, part, canvases)
 
 
 def extended(

@@ -18,6 +18,7 @@ from models.diffusion import (
     OUTPAINT,
     Denoiser,
     Diffusion,
+    Key,
     Known,
     OnStep,
     SceneNoise,

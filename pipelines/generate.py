@@ -81,6 +81,12 @@ def on_model_grid(scene: Scene, spec: LayoutSpec) -> Scene:
     return replace(scene, ground_classes=spec.ground_classes, grid=spec.grid, height_m=height, occupied=occupied)
 
 
+def at_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
+    """The scene with the model's ground classes and resolution; one larger than the model's that has both stays whole."""
+    same = scene.grid.resolution_m == spec.grid.resolution_m and scene.ground_classes == spec.ground_classes
+    return scene if same else on_model_grid(scene, spec)
+
+
 def label_of(scene: Scene, kind: str) -> str:
     """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
     names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}

@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from models.inpaint import Contents, composited, half_plane_region, object_region, polygon_region, whole_cells
+from models.extend import inpainting, region_blocks
+from models.inpaint import Contents, half_plane_region, object_region, polygon_region
 from models.labels import require_labels
 from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene, merge
 from pipelines import storage
-from pipelines.generate import Request, claim_run, label_of, load_pipeline, on_model_grid
+from pipelines.generate import Request, at_model_resolution, claim_run, label_of, load_pipeline
 from pipelines.metrics.reconstruction import pair_sums
 from pipelines.report import Picture, Pictures, Table, report_html
 from pipelines.scenes.mesh import scene_glb
@@ -103,27 +104,40 @@ def drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]
 def inpaint_one(
     pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
 ) -> tuple[list[Scene], list[dict[str, float]]]:
-    """All variants of scene `number` of a run, and the drift of each raw decode."""
-    scene = on_model_grid(scene, pipeline.spec)
-    region, count = request.where.region(scene), request.variants
-    raw = pipeline.inpaint(
-        [scene] * count,
-        [region] * count,
-        [request.label or label_of(scene, pipeline.dit.config.label)] * count,
-        request.contents,
-        request.seed,
-        range(number * count, (number + 1) * count),
-        request.resampling,
-        request.guidance_scale,
-        composite=False,
+    """All variants of scene `number` of a run, and the drift of each raw decode of a block."""
+    scene, count = at_model_resolution(scene, pipeline.spec), request.variants
+    steps = list(
+        inpainting(
+            pipeline,
+            scene,
+            request.where.region(scene),
+            request.label or label_of(scene, pipeline.dit.config.label),
+            request.contents,
+            request.seed,
+            range(number * count, (number + 1) * count),
+            request.resampling,
+            request.guidance_scale,
+        )
     )
-    new = whole_cells(region, scene.grid, pipeline.lvae.latent_shape[-1])
-    made = []
-    for k, one in enumerate(raw):
-        name = f"{request.source}-{request.seed}-{number:07d}-{k}"
-        one = composited(scene, one, new, request.contents)
-        made.append(replace(one, scene_id=name, source=request.source, split="generated", frame=number))
-    return made, [drift(scene, one, new) for one in raw]
+    made = [
+        replace(
+            canvas,
+            scene_id=f"{request.source}-{request.seed}-{number:07d}-{k}",
+            source=request.source,
+            split="generated",
+            frame=number,
+        )
+        for k, canvas in enumerate(steps[-1].canvases)
+    ]
+    return made, [drift(*pair, step.region) for step in steps for pair in zip(step.known, step.made, strict=True)]
+
+
+def made_anew(pipeline: PrITTIPipeline, scene: Scene, where: Where) -> np.ndarray:
+    """(rows, cols) pixels of a scene's region, grown to whole cells."""
+    region = where.region(scene)
+    for window, part in region_blocks(pipeline, scene, region):
+        region[scene.grid.shared(window)[0]] |= part
+    return region
 
 
 class Inpainter:
@@ -161,7 +175,7 @@ def inpaint_scenes(
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
-    request.where.region(on_model_grid(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
+    request.where.region(at_model_resolution(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
     claim_run(request, pipeline, [storage.join(request.output, "drift", request.run)], input=asdict(selection))
@@ -173,8 +187,8 @@ def inpaint_scenes(
     scores = drift_scores(drifts)
     shown = []
     for number, (source, position) in enumerate(chosen[:pictures]):
-        given = on_model_grid(source.scenes([position])[0], pipeline.spec)
-        new = whole_cells(request.where.region(given), given.grid, pipeline.lvae.latent_shape[-1])
+        given = at_model_resolution(source.scenes([position])[0], pipeline.spec)
+        new = made_anew(pipeline, given, request.where)
         made = request.shard(number).scenes()[: PER_ROW - 1]
         shown.append(Picture(given.scene_id, outlined_picture(given, new, PICTURE_PX), "given"))
         shown += [Picture(scene.scene_id, outlined_picture(scene, new, PICTURE_PX), "made anew") for scene in made]

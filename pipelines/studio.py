@@ -21,13 +21,13 @@ from urllib.parse import urlsplit
 from fastapi import FastAPI, HTTPException, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.extend import Side, extended, inpainted, region_blocks
+from models.extend import Side, extended, inpainting, region_blocks
 from models.inpaint import Contents, polygon_region
 from models.labels import LABELS, require_labels
 from models.pipeline import PrITTIPipeline, Resampling
 from models.scene import Scene
 from pipelines.gallery import Catalogue
-from pipelines.generate import label_of, load_pipeline, on_model_grid
+from pipelines.generate import at_model_resolution, label_of, load_pipeline
 from pipelines.report import data_uri
 from pipelines.scenes.edit import edits_from_json, edits_to_json, replayed
 from pipelines.scenes.mesh import scene_glb
@@ -227,14 +227,8 @@ class Studio:
 
         self.start(desk, f"generate {label}, seed {asked.seed}", asked.steps, make)
 
-    def at_resolution(self, scene: Scene) -> Scene:
-        """The scene at the model's resolution; one of any size that is made of the model's blocks stays as it is."""
-        spec = self.pipeline.spec
-        same = scene.grid.resolution_m == spec.grid.resolution_m and scene.ground_classes == spec.ground_classes
-        return scene if same else on_model_grid(scene, spec)
-
     def inpaint(self, desk: Desk, asked: Inpaint) -> None:
-        scene = self.at_resolution(desk.require())
+        scene = at_model_resolution(desk.require(), self.pipeline.spec)
         region = polygon_region(scene.grid, asked.polygon_m)
         if not region.any():
             raise ValueError("the region holds no pixel of the scene; draw a larger one")
@@ -242,21 +236,23 @@ class Studio:
         blocks = len(region_blocks(self.pipeline, scene, region))
 
         def make(work: Work) -> Scene:
-            return inpainted(
+            *_, last = inpainting(
                 self.pipeline,
                 scene,
                 region,
                 label,
                 asked.contents,
                 asked.seed,
-                resampling,
+                resampling=resampling,
                 callback_on_step_end=work.step,
             )
+            return last.canvases[0]
 
         self.start(desk, f"inpaint {asked.contents}", blocks * resampling.evaluations, make)
 
     def extend(self, desk: Desk, asked: Extend) -> None:
-        scene, small = self.at_resolution(desk.require()), self.pipeline.spec.grid
+        small = self.pipeline.spec.grid
+        scene = at_model_resolution(desk.require(), self.pipeline.spec)
         rows, cols = scene.grid.rows, scene.grid.cols
         if max(rows, cols) * small.resolution_m >= MAX_SIDE_M:
             raise ValueError(f"the scene is {MAX_SIDE_M:.0f} m long already; the studio stops there")

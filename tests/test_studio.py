@@ -14,7 +14,7 @@ from browser import faults, start_browser, wait_for
 from PIL import Image
 from scenes import random_scene, small_spec, tiny_pipeline
 
-from models.extend import extended, grown, inpainted, region_blocks, windows
+from models.extend import extended, grown, inpainting, region_blocks, windows
 from models.inpaint import polygon_region
 from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Scene
@@ -77,20 +77,23 @@ def test_a_region_of_a_larger_scene_is_made_anew_and_nothing_else(contents):
         inside[count > 0] = True
         assert len(parts) >= least and count.max() == 1 and (inside | ~region).all()
         calls = []
-        new = inpainted(
-            pipeline, scene, region, "low", contents, resampling=quick,
+        *_, last = inpainting(
+            pipeline, scene, region, "low", contents, indices=(0, 7), resampling=quick,
             callback_on_step_end=lambda _, number, __, kept, calls=calls: calls.append(number) or kept,
         )  # fmt: skip
+        new, other = last.canvases
         assert len(calls) == len(parts) * quick.evaluations
         changed = (new.height_m != scene.height_m) | (new.occupied != scene.occupied)
         assert not changed[:, ~inside].any() and changed.any() == (contents != "objects")
+        assert (new.height_m != other.height_m).any() == (contents != "objects")
         row, col = scene.grid.pixel(*scene.center_m[:, :2].T)
         kept = scene.center_m[~inside[row, col] | (contents == "ground")]
         assert np.array_equal(new.center_m[: len(kept)], kept)
     # On a scene of the model's own size it is the pipeline's inpainting.
     scene = given_scene(2)
     region = polygon_region(scene.grid, [(20, -10), (40, -10), (40, 10), (20, 10)])
-    one = inpainted(pipeline, scene, region, "low", contents, resampling=quick)
+    *_, last = inpainting(pipeline, scene, region, "low", contents, resampling=quick)
+    one = last.canvases[0]
     assert np.array_equal(
         one.height_m, pipeline.inpaint([scene], [region], ["low"], contents, resampling=quick)[0].height_m
     )
