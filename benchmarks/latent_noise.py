@@ -1,0 +1,78 @@
+"""What a layout VAE's decoders make of latents that are a little off, as a diffusion model's are.
+
+python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
+
+Held-out scenes are encoded, given noise in units of each channel's deviation over the scene, decoded, and scored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+from common import where
+
+from models.lvae import LayoutVAE
+from models.scene import CATEGORIES, Scene
+from models.tensors import layout_batch, scene_from_layout
+from pipelines.dataset import Dataset
+from pipelines.encode import load_lvae
+from pipelines.metrics.validity import LABEL_MEASURES, SLAB_OFFSET_M, label_fidelity, scene_validity, validity_rates
+from pipelines.selection import Selection
+
+
+@dataclass(frozen=True)
+class Config:
+    lvae: tuple[str, ...]
+    """Directories of trained layout VAEs."""
+    dataset: str
+    split: str = "test"
+    limit: int = 64
+    """Scenes, evenly spread."""
+    noise: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
+    """Deviations."""
+    seed: int = 0
+
+
+def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
+    """Scenes from their posterior means with noise of so many deviations; ids and labels stay."""
+    generator = torch.Generator().manual_seed(seed)
+    made = []
+    for scene in scenes:
+        latent = lvae.encode(layout_batch([scene], lvae.spec)).mean
+        deviation = latent.std(dim=(2, 3), keepdim=True)
+        latent = latent + noise * deviation * torch.randn(latent.shape, generator=generator)
+        made.append(scene_from_layout(lvae.decode(latent).layouts()[0], lvae.spec, scene))
+    return made
+
+
+def said(scenes: list[Scene], dataset: Dataset) -> str:
+    """Mean counts of the categories that there are, and how valid scenes are."""
+    slab_offset_m = SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
+    counts = np.mean([scene.counts() for scene in scenes], axis=0)
+    found = validity_rates(np.array([scene_validity(scene, slab_offset_m) for scene in scenes]))
+    fidelity = np.array([label_fidelity(scene, dataset.vegetation, dataset.vehicle) for scene in scenes])
+    found |= {LABEL_MEASURES[0]: validity_rates(fidelity, LABEL_MEASURES)[LABEL_MEASURES[0]]}
+    numbers = [f"{name} {mean:.1f}" for name, mean in zip(CATEGORIES, counts, strict=True) if mean >= 1]
+    return ", ".join(numbers + [f"{name} {value:.3f}" for name, value in found.items() if value is not None])
+
+
+@torch.no_grad()
+def main(config: Config) -> None:
+    dataset = Dataset.open(config.dataset)
+    selection = Selection(dataset.root, dataset.source, config.split, config.limit, "spread")
+    scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
+    if not scenes:
+        raise SystemExit(f"{config.dataset} holds no scenes of split {config.split!r}")
+    print(where(), f"{len(scenes)} scenes")
+    print("as they are:", said(scenes, dataset))
+    for directory in config.lvae:
+        lvae = load_lvae(directory)
+        for noise in config.noise:
+            print(f"{directory}, noise {noise}:", said(decoded(lvae, scenes, noise, config.seed), dataset))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
