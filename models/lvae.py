@@ -226,7 +226,10 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         """Reconstruction from a sampled latent, and the posterior it was sampled from.
 
         `corruption` is more noise on the latent, in units of each channel's deviation over a scene's cells: decoders
-        learn to bear what a diffusion model's latents are off. Not in the paper; Zheng et al. 2025 (RAE) train so.
+        learn to bear what a diffusion model's latents are off.
+
+        Differs from the paper: it has no such noise. Zheng et al. 2025 (RAE) train decoders so; here encoders learn with
+        them, and the strength is drawn anew for each scene (training.stacked_corruption).
         """
         posterior = self.encode(batch)
         latent = posterior.sample(noise)
