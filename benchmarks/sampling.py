@@ -21,9 +21,10 @@ import tyro
 from common import spread, where
 
 from models.dit import DiT
+from models.labels import LABELS
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.pipeline import LABELS, PrITTIPipeline, scheduler
+from models.pipeline import PrITTIPipeline, scheduler
 from models.zoo import DIT_PRESETS, LVAE_PRESETS
 from pipelines.generate import load_pipeline
 from pipelines.scenes.tables import Shard

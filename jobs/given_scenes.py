@@ -95,11 +95,12 @@ def pipeline_directory(model: str) -> str:
     from pipelines import storage
 
     if not model:
-        trained = home("models", "pritti-town")
-        found = storage.list_files(home("models"), INDEX)
-        if not storage.exists(storage.join(trained, INDEX)):
-            trained = found[0].removesuffix(f"/{INDEX}") if len(found) == 1 else pipeline_path("town")
-        return trained
+        found = [path.removesuffix(f"/{INDEX}") for path in storage.list_files(home("models"), INDEX)]
+        if (town := home("models", "pritti-town")) in found:
+            return town
+        if len(found) > 1:
+            raise ValueError(f"no --model, and several were trained here; name one of: {', '.join(sorted(found))}")
+        return found[0] if found else pipeline_path("town")
     for directory in (absolute(model), home("zoo", model)):
         if storage.exists(storage.join(directory, INDEX)):
             return directory

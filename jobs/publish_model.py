@@ -66,6 +66,12 @@ def publish(config: Config) -> list[str]:
         training_of("pritti-lvae", "Layout VAE", pipeline.lvae),
         training_of("pritti-dit", "Diffusion transformer", pipeline.dit),
     ]
+    for training in trainings:
+        if training.options["dataset"] != about["real"]:
+            raise ValueError(
+                f"--evaluation {directory} is against {about['real']}, but the {training.stage} was trained on "
+                f"{training.options['dataset']}; run jobs/evaluate_scenes.py with that as --real"
+            )
     output = absolute(config.output) if config.output else home("zoo", config.name)
     kind = pipeline.dit.config.label
     with tempfile.TemporaryDirectory() as staging:
@@ -80,6 +86,7 @@ def publish(config: Config) -> list[str]:
             trainings,
             storage.read_json(storage.join(about["real"], "dataset.json")),
             about["sampling"],
+            about["real_split"],
             scores,
             sums,
         )
@@ -122,6 +129,8 @@ def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
     judged = (about["sampling"] or {}).get("weights"), about["lvae_weights"]
     if judged != ("-".join(weights), weights[0]):
         raise ValueError(f"--evaluation {directory} is of other weights ({judged[0]}); {advice}")
+    if "num_inference_steps" not in (about["sampling"] or {}):
+        raise ValueError(f"--evaluation {directory} is not of scenes that jobs/sample_scenes.py made; {advice}")
     return about, scores
 
 

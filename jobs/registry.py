@@ -28,11 +28,16 @@ def registered(name: str, run_id: str) -> str:
 def downloaded(reference: str) -> str:
     """The directory with the pipeline that models:/NAME/VERSION or the id of a publishing run means.
 
-    Copied to $PRITTI_HOME/registry once. Raises ValueError for what MLflow does not know, or that holds no pipeline.
+    Copied to $PRITTI_HOME/registry once, whole or not at all. Raises ValueError for what MLflow does not know, or for
+    files that are not those that were published.
     """
+    import json
+    import tempfile
+    from pathlib import Path
+
     from mlflow.exceptions import MlflowException
 
-    from models.released import INDEX
+    from models.released import CHECKSUMS, INDEX, checksums
 
     api = client(tracking_uri())
     try:
@@ -41,11 +46,17 @@ def downloaded(reference: str) -> str:
             name, _, version = reference.removeprefix("models:/").rpartition("/")
             run_id = api.get_model_version(name, version).run_id
         directory = os.path.join(home("registry"), run_id)
-        if not os.path.exists(os.path.join(directory, PIPELINE, INDEX)):
-            os.makedirs(directory, exist_ok=True)
-            api.download_artifacts(run_id, PIPELINE, directory)
+        if os.path.exists(os.path.join(directory, INDEX)):
+            return directory
+        os.makedirs(home("registry"), exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=home("registry")) as staging:
+            whole = api.download_artifacts(run_id, PIPELINE, staging)
+            if checksums(whole) != json.loads(Path(whole, CHECKSUMS).read_text()):
+                raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS}; publish it again")
+            if not os.path.exists(directory):  # or another process was quicker
+                os.rename(whole, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(
             f"{reference}: no published pipeline in {shown(tracking_uri())} ({shown(str(error))}); jobs/publish_model.py makes them"
         ) from error
-    return os.path.join(directory, PIPELINE)
+    return directory

@@ -54,6 +54,7 @@ def sweep_samplers(config: Config) -> list[dict]:
         raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
     from rich.progress import Progress
 
+    from models.diffusion import Diffusion
     from models.labels import LABELS
     from models.pipeline import SAMPLERS
     from pipelines import storage
@@ -69,6 +70,8 @@ def sweep_samplers(config: Config) -> list[dict]:
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
+    for steps in config.steps:
+        Diffusion().visited(steps)  # a number that cannot be had is said before hours of the others
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     output = absolute(config.output) if config.output else home("evaluations", "samplers")
     real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
@@ -95,12 +98,12 @@ def sweep_samplers(config: Config) -> list[dict]:
                 num_inference_steps=steps,
                 guidance_scale=config.guidance,
                 sampler=sampler,
-                shard_scenes=max(1, config.num_scenes // (4 * config.actors)),
+                shard_scenes=max(1, config.num_scenes // 8),  # whatever the actors: another number of them goes on
             )
-            seconds = timed_sampling(config, request, bar)
+            seconds_per_scene = timed_sampling(config, request, bar)
             made = described(Selection(output, request.source, None, count, "spread"), request.run)
             scores = compare(truth, made, dataset.spec.ground_classes)
-            rows.append(sampler_row(sampler, steps, seconds / config.num_scenes, scores))
+            rows.append(sampler_row(sampler, steps, seconds_per_scene, scores))
             scenes = read_scenes(output, request.source, limit=config.pictures) if config.pictures else ()
             pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
     how = [
@@ -111,8 +114,8 @@ def sweep_samplers(config: Config) -> list[dict]:
     return rows
 
 
-def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> float:
-    """Generate what is missing; seconds of actors that all shards took when they were made."""
+def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> float | None:
+    """Generate what is missing; an actor's seconds a scene, over the shards whose time was seen; None of none."""
     from pipelines import storage
     from pipelines.generate import sample_scenes
 
@@ -122,11 +125,14 @@ def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> flo
 
     def advance(row: dict) -> None:
         bar.advance(shown, row["scenes"])
-        times.setdefault(str(row["id"]), row["seconds"])
-        storage.write_json(times, record)
+        if row["seconds"]:  # not of a shard that an interrupted run left
+            times[str(row["id"])] = [row["seconds"], row["scenes"]]
+            storage.write_json(times, record)
 
     sample_scenes(request, config.actors, config.batch_size, advance)
-    return sum(times.values())
+    return (
+        sum(seconds for seconds, _ in times.values()) / sum(scenes for _, scenes in times.values()) if times else None
+    )
 
 
 def publish(output: str, rows: list[dict], pictures: list[Picture], columns: int, how: list[str]) -> None:

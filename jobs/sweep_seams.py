@@ -49,6 +49,8 @@ def sweep_seams(config: Config) -> list[dict]:
     from pipelines.seams import Lines, measure, with_lines
     from pipelines.selection import Selection
 
+    for setting in config.settings:
+        Resampling(*setting).transitions()  # numbers that cannot be had are said before hours of the others
     output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
     selection = config.selection()
     count = sum(len(rows) for _, rows in selection.shards())

@@ -123,8 +123,10 @@ def inpainting(
     """A scene of any size made anew, once per index, inside a region (rows, cols) of its pixels; the last step has all of it.
 
     `PrITTIPipeline.inpaint` on a scene of the model's size; on a larger one block by block, each knowing what is there.
-    Regions grow to whole cells, the rest stays bit for bit. Raises ValueError as `require_blocks`.
+    Regions grow to whole cells, the rest stays bit for bit. Raises ValueError for an empty one, and as `require_blocks`.
     """
+    if not region.any():
+        raise ValueError(f"{scene}: the region holds no pixel of it")
     canvases, level_m = [scene] * len(indices), height_near(scene, 0.0, 0.0)
     for number, (window, part) in enumerate(region_blocks(pipeline, scene, region)):
         blocks = [in_block(canvas, window, pipeline.spec.grid, level_m) for canvas in canvases]

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.scene import Grid, Scene, merge, yaw_rotation
+from models.outpaint import doubles
+from models.scene import Grid, Scene, joined, merge, yaw_rotation
 
 Contents = Literal["both", "ground", "objects"]  # what to make anew inside a region
 
@@ -96,10 +97,12 @@ def composited(scene: Scene, made: Scene, region: np.ndarray, contents: Contents
     """The scene with what was made anew inside a region of whole cells; all else from the scene, bit for bit.
 
     Pixels by place, primitives by the pixel under their centre. Decoders see the whole latent: what they say outside the
-    region differs a little from the scene although the latent there does not.
+    region differs a little from the scene although the latent there does not. A known object near the border may so be
+    decoded a little inside it: it is not put there again.
     """
     nothing = np.zeros_like(region)
     ground, objects = (nothing if contents == other else region for other in ("objects", "ground"))
     of_ground = merge([scene, made], [~ground, ground], scene)
-    of_objects = merge([scene, made], [~objects, objects], scene)
-    return replace(of_objects, height_m=of_ground.height_m, occupied=of_ground.occupied)
+    kept, new = merge([scene], [~objects], scene), merge([made], [objects], scene)
+    both = joined([kept, new.select(~doubles(new, kept))])
+    return replace(scene, height_m=of_ground.height_m, occupied=of_ground.occupied, **both)

@@ -213,6 +213,10 @@ class PrITTIPipeline(DiffusionPipeline):
                     self._denoiser(walk.timesteps, label, guidance_scale), walk, noise, label, on_step=on_step
                 )
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
+            if self.scheduler.timesteps.is_floating_point():
+                raise ValueError(
+                    f"{type(self.scheduler).__name__} has timesteps between whole ones: DPM-Solver++ and DDIM have not"
+                )
             model = self._denoiser(self.scheduler.timesteps, label, guidance_scale)
             return solve(model, self.scheduler, noise, label, on_step)
 

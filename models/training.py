@@ -193,11 +193,11 @@ class Trainer:
         for first in range(0, len(positions), size):
             part = slice(first, first + size)
             share = len(positions[part]) / len(positions)
-            losses = self._losses({k: v[part] for k, v in arrays.items()}, positions[part])
-            if losses is None:
-                raise NotFinite(self.steps_done, self._to_blame(arrays, positions))
             more = first + size < len(positions)
             with self.wrapped.no_sync() if more and hasattr(self.wrapped, "no_sync") else nullcontext():
+                losses = self._losses({k: v[part] for k, v in arrays.items()}, positions[part])
+                if losses is None:
+                    raise NotFinite(self.steps_done, self._to_blame(arrays, positions))
                 (share * losses["loss"]).backward()
             for name, value in losses.items():
                 totals[name] = totals.get(name, 0) + share * value.detach()

@@ -13,7 +13,7 @@ from diffusers.utils.logging import disable_progress_bar
 from models.labels import LABELS, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
-from models.scene import Scene
+from models.scene import Grid, Scene
 from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.claims import claim
@@ -72,19 +72,25 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
     """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
     options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
+    del options["model"]  # the same weights in another directory are the same model
     claim(options.pop("output"), request.source, request.run, options, parts)
 
 
-def on_model_grid(scene: Scene, spec: LayoutSpec) -> Scene:
-    """The scene with the model's ground classes and resolution."""
-    height, occupied = ground_on_grid(scene, spec.ground_classes, spec.grid)
-    return replace(scene, ground_classes=spec.ground_classes, grid=spec.grid, height_m=height, occupied=occupied)
+def on_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
+    """The scene with the model's ground classes, on the model's grid or another that covers the same ground."""
+    grid = grid or spec.grid
+    height, occupied = ground_on_grid(scene, spec.ground_classes, grid)
+    return replace(scene, ground_classes=spec.ground_classes, grid=grid, height_m=height, occupied=occupied)
 
 
 def at_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
-    """The scene with the model's ground classes and resolution; one larger than the model's that has both stays whole."""
-    same = scene.grid.resolution_m == spec.grid.resolution_m and scene.ground_classes == spec.ground_classes
-    return scene if same else on_model_grid(scene, spec)
+    """The scene with the model's ground classes and resolution, over all the ground that it covers.
+
+    Raises ValueError for a resolution that does not divide by the model's, nor the other way about.
+    """
+    own, wanted_m = scene.grid, spec.grid.resolution_m
+    sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
+    return on_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
 
 
 def label_of(scene: Scene, kind: str) -> str:

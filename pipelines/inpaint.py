@@ -106,19 +106,19 @@ def inpaint_one(
 ) -> tuple[list[Scene], list[dict[str, float]]]:
     """All variants of scene `number` of a run, and the drift of each raw decode of a block."""
     scene, count = at_model_resolution(scene, pipeline.spec), request.variants
-    steps = list(
-        inpainting(
-            pipeline,
-            scene,
-            request.where.region(scene),
-            request.label or label_of(scene, pipeline.dit.config.label),
-            request.contents,
-            request.seed,
-            range(number * count, (number + 1) * count),
-            request.resampling,
-            request.guidance_scale,
-        )
-    )
+    drifts: list[dict[str, float]] = []
+    for step in inpainting(
+        pipeline,
+        scene,
+        request.where.region(scene),
+        request.label or label_of(scene, pipeline.dit.config.label),
+        request.contents,
+        request.seed,
+        range(number * count, (number + 1) * count),
+        request.resampling,
+        request.guidance_scale,
+    ):
+        drifts += [drift(known, raw, step.region) for known, raw in zip(step.known, step.made, strict=True)]
     made = [
         replace(
             canvas,
@@ -127,9 +127,9 @@ def inpaint_one(
             split="generated",
             frame=number,
         )
-        for k, canvas in enumerate(steps[-1].canvases)
+        for k, canvas in enumerate(step.canvases)
     ]
-    return made, [drift(*pair, step.region) for step in steps for pair in zip(step.known, step.made, strict=True)]
+    return made, drifts
 
 
 def made_anew(pipeline: PrITTIPipeline, scene: Scene, where: Where) -> np.ndarray:

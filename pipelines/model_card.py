@@ -48,6 +48,7 @@ class Card:
     trainings: Sequence[Training]
     dataset: Mapping
     sampling: Mapping
+    real_split: str  # what generated scenes were scored against
     scores: Mapping
     checksums: Mapping[str, str]
 
@@ -62,13 +63,13 @@ class Card:
         yield "```python\nfrom models import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
         yield f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, num_inference_steps=20)\n```\n'
-        yield f"![The first scenes, not chosen](samples.png)\n\n*Scenes 0 to 31 of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}.*\n"
+        yield f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}.*\n"
         yield f"Conditioned on: {self.label} ({', '.join(self.labels)}).\n"
 
     def _training(self) -> Iterator[str]:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
-        yield f"## Data\n\n{self.dataset['source']}, {scenes}; no scene of the test split was trained on. Options of `jobs/preprocess_scenes.py`:\n"
-        yield f"```json\n{json.dumps(self.dataset['options'])}\n```\n"
+        yield f"## Data\n\n{self.dataset['source']}, {scenes}. Trained on the train split; scored against the {self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
+        yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training, curves in zip(self.trainings, ("curves-lvae.svg", "curves-dit.svg"), strict=True):
             yield f"## Training: {training.stage}\n\n![Losses by step]({curves})\n"
             yield from table(("", ""), training.rows())
@@ -76,12 +77,12 @@ class Card:
     def _scores(self) -> Iterator[str]:
         generation = self.scores["generation"]
         sides = generation["scenes"]
-        yield f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones, and the layout VAE's reconstructions of {self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` has every figure; docs/evaluation.md says what each is.\n"
+        yield f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones of split {self.real_split}, and the layout VAE's reconstructions of {self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` has every figure; docs/evaluation.md says what each is.\n"
         yield from table(("score", "value"), ((name, written(value)) for name, value in headlines(self.scores)))
 
     def _limits(self) -> Iterator[str]:
         validity = self.scores["generation"]["validity"]
-        yield "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*The scenes with most faults.*\n"
+        yield "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*Those with most faults among the first scenes that were scored.*\n"
         rows = [
             (VALIDITY[k], *(written(v[side]) or "–" for side in ("generated", "real"))) for k, v in validity.items()
         ]

@@ -39,11 +39,20 @@ def commit() -> str:
 
 
 def command() -> str:
-    """What was typed, with $PRITTI_HOME for the directory it stands for."""
-    program = os.path.relpath(sys.argv[0], ROOT) if sys.argv[0].startswith(str(ROOT)) else sys.argv[0]
-    typed = shlex.join([program, *sys.argv[1:]])
-    home = os.environ.get("PRITTI_HOME")
-    return typed.replace(home, "$PRITTI_HOME") if home else typed
+    """What was typed; of paths under $PRITTI_HOME or this checkout what comes after, of other absolute ones the last part."""
+    roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
+
+    def public(word: str) -> str:
+        option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        path = Path(value)
+        if not path.is_absolute():
+            return word
+        for root, name in roots:
+            if path.is_relative_to(root):
+                return option + equals + os.path.normpath(Path(name, path.relative_to(root)))
+        return option + equals + f".../{path.name}"
+
+    return " ".join(word if "$PRITTI_HOME" in word else shlex.quote(word) for word in map(public, sys.argv))
 
 
 def versions() -> str:

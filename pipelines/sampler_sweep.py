@@ -21,8 +21,8 @@ MEASURES = {
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
 
 
-def sampler_row(sampler: str, steps: int, seconds_per_scene: float, scores: Mapping) -> dict:
-    """One row: each measure with the ends of its interval, None where it has no value; seconds of an actor."""
+def sampler_row(sampler: str, steps: int, seconds_per_scene: float | None, scores: Mapping) -> dict:
+    """One row: each measure with the ends of its interval, None where it has no value; an actor's seconds, None if none were seen."""
     count = scores["scenes"]["generated"]
     row = {"sampler": sampler, "steps": steps, "scenes": count, "seconds_per_scene": seconds_per_scene}
     for name, (place, _) in MEASURES.items():
@@ -56,7 +56,8 @@ def sampler_table(rows: Sequence[Mapping]) -> Table:
             for name in MEASURES
         )
         good = "–" if row is reference else "yes" if as_good_as(row, reference) else "no"
-        cells.append((row["sampler"], row["steps"], f"{row['seconds_per_scene']:.2f}", *scores, good))
+        seconds = "–" if row["seconds_per_scene"] is None else f"{row['seconds_per_scene']:.2f}"
+        cells.append((row["sampler"], row["steps"], seconds, *scores, good))
     names = [words for _, words in MEASURES.values()]
     alike = f"as {reference['sampler']} of {reference['steps']}"
     note = (

@@ -238,3 +238,14 @@ def test_compositing_nothing_changes_nothing():
     assert same(composited(scene, other, everything, "both"), other)
     both = composited(composited(scene, other, everything, "ground"), other, everything, "objects")
     assert same(both, other)
+
+
+def test_an_object_that_is_decoded_across_the_border_is_not_there_twice():
+    scene = random_scene(0, n=1, grid=SPEC.grid)
+    region = half_plane_region(SPEC.grid, (1, 0), 32.0)
+    scene = replace(scene, center_m=np.array([[31.95, 0, 0]], np.float32))
+    again = replace(scene, center_m=np.array([[32.05, 0, 0]], np.float32))
+    far = replace(scene, center_m=np.array([[50, 0, 0]], np.float32))
+    for contents in ("both", "objects"):
+        assert np.array_equal(composited(scene, again, region, contents).center_m, scene.center_m)
+        assert len(composited(scene, far, region, contents)) == 2

@@ -42,7 +42,15 @@ def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
     for name in ("tiny", reference, run_id):
         again = load_pipeline(pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
-    assert publish(Config(name="tiny", evaluation=str(evaluated)))[1] == "models:/tiny/2"
+    kept = smoke / "registry" / run_id
+    assert json.loads((kept / CHECKSUMS).read_text()) == checksums(kept) and len(list(kept.parent.iterdir())) == 1
+    second = publish(Config(name="tiny", evaluation=str(evaluated)))
+    assert second[1] == "models:/tiny/2"
+    (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
+    damaged.write_text(damaged.read_text() + " ")
+    with pytest.raises(ValueError, match=r"models:/tiny/2: its files are not those of its checksums.json"):
+        pipeline_directory(second[1])
+    assert not (smoke / "registry" / second[2]).exists()
     assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
 
 
@@ -53,9 +61,16 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
         publish(Config(name="none", evaluation=str(tmp_path)))
     about, scores = (json.loads((evaluated / f"{name}.json").read_text()) for name in ("evaluation", "metrics"))
     other = about | {"sampling": about["sampling"] | {"weights": "aa-bb"}}
+    inpainted = about | {"sampling": {"weights": about["sampling"]["weights"]}}
     for spoilt, less, message in (
         (other, {}, r"of other weights \(aa-bb\)"),
         (about | {"sampling": None}, {}, "of other weights"),
+        (inpainted, {}, "not of scenes that jobs/sample_scenes.py made"),
+        (
+            about | {"real": "/data/town"},
+            {},
+            r"against /data/town, but the Layout VAE was trained on .*; run .* --real",
+        ),
         (about, {"reconstruction"}, "no scores of reconstruction"),
     ):
         (tmp_path / "evaluation.json").write_text(json.dumps(spoilt))
@@ -86,6 +101,31 @@ def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
         with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
             pipeline_directory(name)
+
+
+def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_path, monkeypatch):
+    from jobs.given_scenes import pipeline_directory
+
+    monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
+    assert pipeline_directory("") == pipeline_path("town")
+    for name, expected in (("demo", "pritti-demo"), ("smoke", None), ("town", "pritti-town")):
+        directory = tmp_path / f"models/pritti-{name}"
+        directory.mkdir(parents=True)
+        (directory / "model_index.json").write_text("{}")
+        if expected:
+            assert pipeline_directory("") == str(tmp_path / "models" / expected)
+            continue
+        with pytest.raises(ValueError, match=r"several were trained here; name one of: .*pritti-demo, .*pritti-smoke"):
+            pipeline_directory("")
+
+
+def test_a_command_is_told_without_paths_of_this_machine(monkeypatch):
+    from pipelines import origin
+
+    monkeypatch.setenv("PRITTI_HOME", "/data")
+    typed = ["jobs/train_dit.py", "demo", "--dataset", "/data/sets/town", "--output=/data2/a b", "--name", "x y"]
+    monkeypatch.setattr(origin.sys, "argv", [str(origin.ROOT / typed[0]), *typed[1:]])
+    assert origin.command() == "jobs/train_dit.py demo --dataset $PRITTI_HOME/sets/town '--output=.../a b' --name 'x y'"
 
 
 def test_released_weights_are_what_their_checksums_say():
