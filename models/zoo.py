@@ -52,7 +52,7 @@ LVAE_PRESETS = {
     "demo":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   256, 8,     5_000,
                            decoder="cells", attention=False, shortcut=True, latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, 32, (32,),               8,     8,   128,  2,     4,    256,   256, 8,     2_000,
-                           decoder="cells", attention=False, shortcut=True, kl_weight=1e-7, latent_noise=0.3, **QUICK),
+                           decoder="cells", attention=False, shortcut=True, kl_weight=1e-7, **QUICK),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
