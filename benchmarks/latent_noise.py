@@ -19,7 +19,7 @@ from models.scene import CATEGORIES, Scene
 from models.tensors import layout_batch, scene_from_layout
 from pipelines.dataset import Dataset
 from pipelines.encode import load_lvae
-from pipelines.metrics.validity import LABEL_MEASURES, SLAB_OFFSET_M, label_fidelity, scene_validity, validity_rates
+from pipelines.metrics.validity import LABEL_MEASURES, label_fidelity, scene_validity, slab_offset_m, validity_rates
 from pipelines.selection import Selection
 
 
@@ -50,9 +50,9 @@ def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> li
 
 def said(scenes: list[Scene], dataset: Dataset) -> str:
     """Mean counts of the categories that there are, and how valid scenes are."""
-    slab_offset_m = SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
+    offset_m = slab_offset_m(dataset.spec.surface)
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
-    found = validity_rates(np.array([scene_validity(scene, slab_offset_m) for scene in scenes]))
+    found = validity_rates(np.array([scene_validity(scene, offset_m) for scene in scenes]))
     fidelity = np.array([label_fidelity(scene, dataset.vegetation, dataset.vehicle) for scene in scenes])
     found |= {LABEL_MEASURES[0]: validity_rates(fidelity, LABEL_MEASURES)[LABEL_MEASURES[0]]}
     numbers = [f"{name} {mean:.1f}" for name, mean in zip(CATEGORIES, counts, strict=True) if mean >= 1]

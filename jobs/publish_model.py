@@ -178,13 +178,13 @@ def pictures(about: Mapping) -> dict[str, bytes]:
     import numpy as np
 
     from pipelines.dataset import Dataset
-    from pipelines.metrics.validity import SLAB_OFFSET_M, scene_validity
+    from pipelines.metrics.validity import scene_validity, slab_offset_m
     from pipelines.scenes.render import bev_picture, contact_sheet, png
     from pipelines.scenes.tables import read_scenes
 
-    slab_offset_m = SLAB_OFFSET_M if Dataset.open(about["real"]).spec.surface == "top" else 0.0
+    offset_m = slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
-    faults = np.array([scene_validity(scene, slab_offset_m)[:-1, 0].sum() for scene in scenes])
+    faults = np.array([scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])
     worst = [scenes[k] for k in np.argsort(-faults, kind="stable")[:FAILURES]]
     sides = {"samples": (scenes[:SHOWN], 8), "failures": (worst, FAILURES)}
     return {

@@ -130,9 +130,10 @@ def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> flo
             storage.write_json(times, record)
 
     sample_scenes(request, config.actors, config.batch_size, advance)
-    return (
-        sum(seconds for seconds, _ in times.values()) / sum(scenes for _, scenes in times.values()) if times else None
-    )
+    if not times:
+        return None
+    seconds, scenes = map(sum, zip(*times.values(), strict=True))
+    return seconds / scenes
 
 
 def publish(output: str, rows: list[dict], pictures: list[Picture], columns: int, how: list[str]) -> None:

@@ -76,7 +76,7 @@ def features(pictures: np.ndarray, network: inception.Inception | None) -> dict[
 
 def scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
     """Statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes, over the dataset's ground classes."""
-    slab_offset_m = validity.SLAB_OFFSET_M if dataset.spec.surface == "top" else 0.0
+    slab_offset_m = validity.slab_offset_m(dataset.spec.surface)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
     for scene in scenes:
         classes = dataset.spec.ground_classes

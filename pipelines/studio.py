@@ -236,7 +236,7 @@ class Studio:
         blocks = len(region_blocks(self.pipeline, scene, region))
 
         def make(work: Work) -> Scene:
-            *_, last = inpainting(
+            for step in inpainting(
                 self.pipeline,
                 scene,
                 region,
@@ -245,8 +245,9 @@ class Studio:
                 asked.seed,
                 resampling=resampling,
                 callback_on_step_end=work.step,
-            )
-            return last.canvases[0]
+            ):
+                canvas = step.canvases[0]
+            return canvas
 
         self.start(desk, f"inpaint {asked.contents}", blocks * resampling.evaluations, make)
 

@@ -42,6 +42,11 @@ ROAD_CLASSES = ("road", "crossing")
 DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 
+def slab_offset_m(surface: str) -> float:
+    """How far a dataset's ground heights lie above what objects stand on, by its LayoutSpec's `surface`."""
+    return SLAB_OFFSET_M if surface == "top" else 0.0
+
+
 def faults(scene: Scene, slab_offset_m: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """For each of MEASURES but the last: which primitives (n,) bool are at fault, and among which it is looked for.
 
