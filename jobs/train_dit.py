@@ -4,6 +4,7 @@
     jobs/train_dit.py                       the town preset on $PRITTI_HOME/datasets/town
     jobs/train_dit.py smoke                 seconds; makes its own data, LVAE and latents
     jobs/train_dit.py kitti360-xl --dataset DIR --label joint --workers 8
+    jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      more steps for released weights
 
 Run it again with the same options to resume. Losses and sampled scenes go to MLflow ($MLFLOW_TRACKING_URI, default
 an sqlite file under $PRITTI_HOME).
@@ -19,6 +20,8 @@ import tyro
 from jobs.command import absolute, home, run
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from jobs.ray_training import TrainingRun
 
 
@@ -40,10 +43,16 @@ class Config:
     """Where the trained pipeline goes (default: $PRITTI_HOME/models/pritti-<name or preset>)."""
     workers: int = 1
     """Ray Train workers; with GPUs, one each."""
+    start_from: str = ""
+    """Begin with the weights of this trained pipeline (a directory, name, models:/NAME/VERSION or MLflow run), not random ones."""
     steps: int | None = None
     batch_size: int | None = None
     """Global batch size over all workers."""
     learning_rate: float | None = None
+    final_learning_rate: float | None = None
+    """Let the rate fall to this by the last step, as a cosine (default: constant, as in the paper)."""
+    warmup_steps: int | None = None
+    """Steps in which the rate rises from zero."""
     prediction: Literal["noise", "velocity"] | None = None
     """What the network puts out (default: as the preset says; the paper: noise)."""
     normalise_latents: bool | None = None
@@ -111,6 +120,8 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         ),
         steps=config.steps,
         learning_rate=config.learning_rate,
+        final_learning_rate=config.final_learning_rate,
+        warmup_steps=config.warmup_steps,
     )
     if config.prediction is not None:
         row = replace(row, prediction=config.prediction)
@@ -126,6 +137,8 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         "shift": latents["channel_mean"] if row.normalise_latents else None,
         "scale": latents["channel_std"] if row.normalise_latents else None,
     }
+    start = starting_weights(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
+    architecture |= start.normalisation if start else {}
     execution = Execution(config.accumulate, config.precision, config.compile)
     batch_size = row.batch_size if config.batch_size is None else config.batch_size
     shards = find_shards(root, source=dataset.source, split="train")
@@ -140,13 +153,14 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         normalise_latents=row.normalise_latents,
         lvae=latents["lvae_digest"],
         dataset=root,
+        **({"start_from": start.digest} if start else {}),
     )
     record = claim(name, home("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     training = TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, architecture, settings, execution, row.label_dropout),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LatentReader(latents_root, config.label),
         settings=settings,
@@ -170,7 +184,38 @@ def train(config: Config) -> str:
     return complete_pipeline(lvae, output)
 
 
-def build(architecture: dict, settings, execution, label_dropout: float, device, wrap):
+@dataclass(frozen=True)
+class Start:
+    """Trained weights that a run begins with."""
+
+    digest: str
+    normalisation: dict  # of latents, as these weights know them
+    state: dict[str, Tensor]
+
+
+def starting_weights(model: str, lvae_digest: str, architecture: dict) -> Start:
+    """The transformer of a trained pipeline. Raises ValueError if it knows other latents or is built otherwise."""
+    from jobs.given_scenes import pipeline_directory
+    from pipelines.encode import weights_digest
+    from pipelines.generate import load_pipeline
+
+    pipeline = load_pipeline(pipeline_directory(model))
+    if weights_digest(pipeline.lvae) != lvae_digest:
+        raise ValueError(
+            f"--start-from {model}: its transformer knows the latents of another layout VAE; "
+            f"encode with its own first: jobs/encode_latents.py --lvae {model}/lvae"
+        )
+    built = pipeline.dit.config
+    for key in ("patch", "depth", "width", "heads", "prediction", "label"):
+        if built[key] != architecture[key]:
+            raise ValueError(
+                f"--start-from {model}: its {key} is {built[key]}, this run's {architecture[key]}; choose them alike"
+            )
+    normalisation = {"shift": built["shift"], "scale": built["scale"]}
+    return Start(weights_digest(pipeline.dit), normalisation, pipeline.dit.state_dict())
+
+
+def build(architecture: dict, settings, execution, label_dropout: float, start: Start | None, device, wrap):
     """The Trainer of stage 2, with the same initial weights on every worker."""
     import torch
 
@@ -178,7 +223,10 @@ def build(architecture: dict, settings, execution, label_dropout: float, device,
     from models.training import dit_trainer
 
     torch.manual_seed(settings.seed)
-    return dit_trainer(DiT(**architecture), settings, label_dropout, device, wrap, execution)
+    model = DiT(**architecture)
+    if start:
+        model.load_state_dict(start.state)
+    return dit_trainer(model, settings, label_dropout, device, wrap, execution)
 
 
 def complete_pipeline(lvae: str, output: str) -> str:
