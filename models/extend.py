@@ -9,8 +9,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from models.diffusion import OUTPAINT, Known
+from models.duplicates import doubles
 from models.inpaint import Contents, composited, latent_mask, whole_cells
-from models.outpaint import Lattice, doubles, height_near
+from models.outpaint import Lattice, height_near
 from models.pipeline import PrITTIPipeline, Resampling, StepCallback
 from models.scene import Grid, Scene, merge
 from models.tensors import new_scene

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.outpaint import doubles
+from models.duplicates import doubles
 from models.scene import Grid, Scene, joined, merge, yaw_rotation
 
 Contents = Literal["both", "ground", "objects"]  # what to make anew inside a region

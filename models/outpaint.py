@@ -20,14 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.iou3d import boxes_of, iou3d_matrix
+from models.duplicates import doubles
 from models.layout import LayoutSpec
 from models.scene import Grid, Scene, joined, merge
 
 Place = tuple[int, int]  # (i, j) of a block: steps ahead, steps left
 Encode = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid -> latents (b, c, h, w)
-
-DOUBLE_IOU3D = 0.3  # a new object that overlaps a known one of its category by more is the same object again
 
 
 def outward(place: Place) -> int:
@@ -232,12 +230,3 @@ class World:
             objects.append(part.select(grid.contains(part.center_m[:, 0], part.center_m[:, 1])))
         classes = self.spec.ground_classes
         return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **joined(objects))
-
-
-def doubles(made: Scene, known: Scene) -> np.ndarray:
-    """(n,) objects of `made` that overlap one of `known`, of their category, by more than DOUBLE_IOU3D (boxes)."""
-    if not len(made) or not len(known):
-        return np.zeros(len(made), bool)
-    same = made.category[:, None] == known.category[None]
-    iou = iou3d_matrix(boxes_of(made), boxes_of(known), same)
-    return (np.where(same, iou, 0) > DOUBLE_IOU3D).any(axis=1)

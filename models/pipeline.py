@@ -28,6 +28,7 @@ from models.diffusion import (
     solve,
 )
 from models.dit import DiT
+from models.duplicates import repeated
 from models.inpaint import Contents, composited, latent_mask, whole_cells
 from models.labels import label_index
 from models.layout import LayoutSpec
@@ -139,14 +140,18 @@ class PrITTIPipeline(DiffusionPipeline):
     ) -> list[Scene]:
         """Scenes from latents; ids and labels from `identities`. Latents are decoded one by one.
 
-        One at a time on purpose: the scene is then the same to the last bit whatever stood beside it.
+        One at a time on purpose: the scene is then the same to the last bit whatever stood beside it. Where every cell
+        decodes by itself, two of them may claim one object: the surer stays (duplicates.repeated).
         """
         shift, scale = self._moments()
         layouts = [self.lvae.decode(latent[None] * scale + shift).layouts()[0] for latent in latents]
-        return [
+        scenes = [
             scene_from_layout(layout, self.spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
         ]
+        if self.lvae.config.decoder != "cells":
+            return scenes
+        return [scene.select(~repeated(scene)) for scene in scenes]
 
     def identity(self, run: str, seed: int, index: int, label: str) -> Scene:
         """The empty Scene number `index` of a run, carrying the labels it is asked for."""

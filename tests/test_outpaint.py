@@ -11,7 +11,7 @@ from test_pipeline import QUICK, SPEC, pipeline, same  # noqa: F401 (a fixture)
 
 from models.city import City
 from models.layout import LayoutSpec
-from models.outpaint import Block, Lattice, World, colour, doubles, height_near, outward
+from models.outpaint import Block, Lattice, World, colour, height_near, outward
 from models.scene import KITTI_GROUND_CLASSES, Grid
 from models.tensors import new_scene
 
@@ -151,11 +151,6 @@ def test_blocks_of_the_truth_make_the_truth_in_one_datum(truth, overlap, rank):
 
 
 def test_an_object_known_already_is_not_made_again(truth):
-    scene = random_scene(0, n=10, grid=SMALL)
-    near = replace(scene, center_m=scene.center_m + np.float32(0.01))
-    assert doubles(near, scene).all() and not doubles(near, scene.select(slice(0, 0))).any()
-    other = replace(near, category=(near.category + 1) % 11)
-    assert not doubles(other, scene).any()
     lattice = Lattice.of(8, 0.5)
     world = World(lattice, TRUTH_SPEC, cell_occupancy)
     middle = seen(truth, (0, 0))

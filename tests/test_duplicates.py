@@ -1,0 +1,52 @@
+"""One object is there once: of two that are nearly in the same place the surer stays, and neighbours stay both."""
+
+from dataclasses import replace
+
+import numpy as np
+from scenes import random_scene
+
+from models.duplicates import doubles, repeated
+from models.scene import CATEGORY_INDEX, Grid
+
+SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
+
+
+def row_of_boxes(shift_m, existence, category="construction_small"):
+    """Upright boxes 4 m long, 1 m wide and high, one behind another along x, `shift_m` from the first."""
+    n = len(shift_m)
+    center = np.stack([20 + np.asarray(shift_m, np.float32), np.zeros(n), np.ones(n)], axis=1).astype(np.float32)
+    return replace(
+        random_scene(0, n=n, grid=SMALL),
+        center_m=center,
+        rotation=np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)),
+        size_m=np.tile(np.float32([4, 1, 1]), (n, 1)),
+        category=np.full(n, CATEGORY_INDEX[category], np.int8),
+        existence=np.asarray(existence, np.float32),
+    )
+
+
+def test_an_object_known_already_is_a_double():
+    scene = random_scene(0, n=10, grid=SMALL)
+    near = replace(scene, center_m=scene.center_m + np.float32(0.01))
+    assert doubles(near, scene).all() and not doubles(near, scene.select(slice(0, 0))).any()
+    assert not doubles(replace(near, category=(near.category + 1) % 11), scene).any()
+
+
+def test_of_two_in_one_place_the_surer_stays():
+    assert repeated(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
+    assert repeated(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [False, True]  # the first of two as sure
+    assert repeated(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [False, False]  # 1 / 7: a fence goes on
+
+
+def test_what_is_dropped_drops_nothing():
+    # The middle one overlaps both others by 1 / 3, they overlap each other by nothing.
+    assert repeated(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
+    assert repeated(row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
+
+
+def test_plants_and_other_categories_may_overlap():
+    assert not repeated(row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
+    pair = row_of_boxes([0, 1], [0.6, 0.9])
+    mixed = replace(pair, category=np.array([pair.category[0], CATEGORY_INDEX["pole"]], np.int8))
+    assert not repeated(mixed).any()
+    assert repeated(pair.select(slice(0, 0))).shape == (0,)
