@@ -5,8 +5,9 @@
     jobs/evaluate_scenes.py --real-split test --run judged --lvae DIR/lvae
     jobs/publish_model.py --name town --evaluation $PRITTI_HOME/evaluations/judged
 
-The card is written from the MLflow runs that trained these weights and from the evaluation of scenes that they generated;
-without either, or with those of other weights, nothing is published. Afterwards jobs take it as --model NAME, its
+The card is written from the MLflow runs that trained these weights (for published weights that the training began with,
+from what their entry says) and from the evaluation of scenes that they generated; without either, or with those of other
+weights, nothing is published. Afterwards jobs take it as --model NAME, its
 directory, models:/NAME/VERSION, or the id of its MLflow run.
 """
 
@@ -51,7 +52,7 @@ def publish(config: Config) -> list[str]:
     from jobs.registry import EXPERIMENT, PIPELINE, registered
     from jobs.tracking import Tracker
     from models.labels import LABELS
-    from models.released import CHECKSUMS, checksums
+    from models.released import CHECKSUMS, TRAINING, checksums
     from pipelines import storage
     from pipelines.chart import standalone_svg
     from pipelines.encode import weights_digest
@@ -62,16 +63,14 @@ def publish(config: Config) -> list[str]:
     weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
     directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
     about, scores = evaluation_of(directory, weights)
-    trainings = [
-        training_of("pritti-lvae", "Layout VAE", pipeline.lvae),
-        training_of("pritti-dit", "Diffusion transformer", pipeline.dit),
+    facts = storage.read_json(storage.join(about["real"], "dataset.json"))
+    stages = [
+        history("pritti-lvae", "Layout VAE", pipeline.lvae),
+        history("pritti-dit", "Diffusion transformer", pipeline.dit),
     ]
-    for training in trainings:
-        if training.options["dataset"] != about["real"]:
-            raise ValueError(
-                f"--evaluation {directory} is against {about['real']}, but the {training.stage} was trained on "
-                f"{training.options['dataset']}; run jobs/evaluate_scenes.py with that as --real"
-            )
+    for *_, last in stages:
+        require_data(last, about["real"], facts, directory)
+    trainings = [training for stage in stages for training in stage]
     output = absolute(config.output) if config.output else home("zoo", config.name)
     kind = pipeline.dit.config.label
     with tempfile.TemporaryDirectory() as staging:
@@ -84,7 +83,7 @@ def publish(config: Config) -> list[str]:
             kind,
             LABELS[kind],
             trainings,
-            storage.read_json(storage.join(about["real"], "dataset.json")),
+            facts,
             about["sampling"],
             about["real_split"],
             scores,
@@ -93,8 +92,9 @@ def publish(config: Config) -> list[str]:
         storage.write_text(card.markdown(), f"{staging}/README.md")
         storage.write_json(sums, f"{staging}/{CHECKSUMS}")
         storage.write_json(scores, f"{staging}/metrics.json")
-        for training, name in zip(trainings, ("lvae", "dit"), strict=True):
-            storage.write_text(standalone_svg(training.chart()), f"{staging}/curves-{name}.svg")
+        storage.write_json([training.record(facts["options"]) for training in trainings], f"{staging}/{TRAINING}")
+        for training in trainings:
+            storage.write_text(standalone_svg(training.chart()), f"{staging}/{training.picture}")
         for name, image in pictures(about).items():
             storage.write_whole(f"{staging}/{name}.png", lambda stream, image=image: stream.write(image))
         publish_directory(staging, output)
@@ -134,30 +134,74 @@ def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
     return about, scores
 
 
-def training_of(experiment: str, stage: str, model: torch.nn.Module) -> Training:
-    """The training of a model's weights, from MLflow. Raises ValueError if no run there has them."""
-    from jobs.tracking import Tracker, client, shown, tracking_uri
+def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Training]:
+    """The runs that made a model's weights, the first one first: a run may have begun with another one's.
+
+    Raises ValueError if neither MLflow nor a published entry tells of one of them.
+    """
+    from dataclasses import replace
+
     from pipelines.encode import weights_digest
+
+    parameters = sum(value.numel() for value in model.parameters())
+    runs = [training_of(experiment, stage, weights_digest(model), parameters)]
+    while start := runs[0].options.get("start_from"):
+        runs.insert(0, training_of(experiment, stage, start, parameters))
+    name = experiment.removeprefix("pritti-")
+    later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
+    return [replace(runs[0], name=name), *later]
+
+
+def training_of(experiment: str, stage: str, digest: str, parameters: int) -> Training:
+    """The run that made the weights of a digest. Raises ValueError if nothing tells of it."""
+    from jobs.tracking import Tracker, client, shown, tracking_uri
     from pipelines.model_card import Training
 
-    uri, digest = tracking_uri(), weights_digest(model)
+    uri = tracking_uri()
     api = client(uri)
     known = api.get_experiment_by_name(experiment)
     runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
     if not runs:
+        if record := recorded(digest):
+            return Training(**record | {"stage": stage})
         raise ValueError(
             f"no MLflow run of {experiment} in {shown(uri)} made these weights ({digest}); set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
     return Training(
+        experiment.removeprefix("pritti-"),
         stage,
-        sum(value.numel() for value in model.parameters()),
+        digest,
+        parameters,
         int(found.data.tags["steps"]),
         hours_of_steps(tracker, int(found.data.params["batch_size"])),
         {name: value for name, value in found.data.params.items() if name != "architecture"},
         {name: found.data.tags.get(name, "not recorded") for name in ("command", "commit", "machine", "versions")},
         {words: axes(tracker.history(name)) for name, words in CURVES.items()},
     )
+
+
+def recorded(digest: str) -> dict | None:
+    """What a published entry of this machine, or of the package, says of the run that made these weights."""
+    from models.released import TRAINING, WEIGHTS
+    from pipelines import storage
+
+    for zoo in (str(WEIGHTS), home("zoo")):
+        for path in storage.list_files(zoo, TRAINING):
+            for record in storage.read_json(path):
+                if record["weights"] == digest:
+                    return record
+    return None
+
+
+def require_data(training: Training, real: str, facts: Mapping, evaluation: str) -> None:
+    """Raises ValueError where an evaluation is against other data than a training's."""
+    same = training.data == facts["options"] if training.data else training.options["dataset"] == real
+    if not same:
+        raise ValueError(
+            f"--evaluation {evaluation} is against {real}, but the {training.stage} was trained on "
+            f"{training.data or training.options['dataset']}; run jobs/evaluate_scenes.py with that as --real"
+        )
 
 
 def axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float]]:

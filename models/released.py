@@ -9,6 +9,7 @@ from pathlib import Path
 WEIGHTS = Path(__file__).parent / "weights"
 INDEX = "model_index.json"  # makes a directory a pipeline's
 CHECKSUMS = "checksums.json"
+TRAINING = "training.json"  # what the card says of training, for those who go on from these weights
 
 
 def released() -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from pipelines.chart import Chart
 from pipelines.evaluation_report import VALIDITY, headlines, written
@@ -16,15 +16,27 @@ Points = tuple[Sequence[float], Sequence[float]]
 
 @dataclass(frozen=True)
 class Training:
-    """One stage's training, as its MLflow run tells it."""
+    """One run of training, as MLflow or the training.json of a published entry tells it."""
 
+    name: str  # lvae, dit; dit-2 where a second run began with the first one's weights
     stage: str
+    weights: str  # digest of what it made
     parameters: int  # numbers in the network
     steps: int
     hours: float  # of training steps, without start-up and validation
     options: Mapping[str, str]
     origin: Mapping[str, str]  # command, commit, machine, versions
     curves: Mapping[str, Points]
+    data: Mapping | None = None  # options of the dataset, as its dataset.json has them
+
+    @property
+    def picture(self) -> str:
+        return f"curves-{self.name}.svg"
+
+    def record(self, data: Mapping) -> dict:
+        """What training.json keeps: nothing of the machine's paths, but what the dataset was."""
+        known = {key: value for key, value in self.options.items() if key not in HIDDEN}
+        return asdict(self) | {"options": known, "data": self.data or dict(data)}
 
     def chart(self) -> Chart:
         return Chart(f"{self.stage}: losses", self.curves, "training step", "loss", log_y=True)
@@ -70,8 +82,8 @@ class Card:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
         yield f"## Data\n\n{self.dataset['source']}, {scenes}. Trained on the train split; scored against the {self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
-        for training, curves in zip(self.trainings, ("curves-lvae.svg", "curves-dit.svg"), strict=True):
-            yield f"## Training: {training.stage}\n\n![Losses by step]({curves})\n"
+        for training in self.trainings:
+            yield f"## Training: {training.stage}\n\n![Losses by step]({training.picture})\n"
             yield from table(("", ""), training.rows())
 
     def _scores(self) -> Iterator[str]:

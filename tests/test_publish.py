@@ -61,15 +61,18 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
         publish(Config(name="none", evaluation=str(tmp_path)))
     about, scores = (json.loads((evaluated / f"{name}.json").read_text()) for name in ("evaluation", "metrics"))
     other = about | {"sampling": about["sampling"] | {"weights": "aa-bb"}}
+    elsewhere = tmp_path / "town"
+    elsewhere.mkdir()
+    (elsewhere / "dataset.json").write_text((Path(about["real"]) / "dataset.json").read_text())
     inpainted = about | {"sampling": {"weights": about["sampling"]["weights"]}}
     for spoilt, less, message in (
         (other, {}, r"of other weights \(aa-bb\)"),
         (about | {"sampling": None}, {}, "of other weights"),
         (inpainted, {}, "not of scenes that jobs/sample_scenes.py made"),
         (
-            about | {"real": "/data/town"},
+            about | {"real": str(elsewhere)},
             {},
-            r"against /data/town, but the Layout VAE was trained on .*; run .* --real",
+            r"against .*/town, but the Layout VAE was trained on .*; run .* --real",
         ),
         (about, {"reconstruction"}, "no scores of reconstruction"),
     ):
@@ -80,12 +83,54 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
     assert not (smoke / "zoo/none").exists()
 
 
-def test_weights_that_nobody_trained_here_are_not_published(smoke, evaluated, monkeypatch, tmp_path):
+def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monkeypatch, tmp_path):
     from jobs.publish_model import Config, publish
 
+    first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
+    monkeypatch.setattr("jobs.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"), evaluation=str(evaluated), output=str(tmp_path / "second"), register=False
+    )  # fmt: skip
     with pytest.raises(ValueError, match="made these weights"):
-        publish(Config(name="none", evaluation=str(evaluated)))
+        publish(config)
+    (tmp_path / "zoo").mkdir()
+    first.rename(tmp_path / "zoo/first")  # an entry whose MLflow is not at hand: its training.json tells
+    publish(config)
+    cards = [tmp_path / place / "README.md" for place in ("zoo/first", "second")]
+    assert cards[0].read_text() == cards[1].read_text()
+
+
+def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke):
+    import torch
+
+    from jobs.publish_model import history
+    from jobs.ray_training import as_tensors, tag_weights
+    from jobs.train_dit import Config, prepare
+    from pipelines.encode import weights_digest
+    from pipelines.feed import batches
+    from pipelines.generate import load_pipeline
+
+    start = str(smoke / "models/pritti-smoke")
+    options = {"final_learning_rate": 1e-5, "warmup_steps": 1, "steps": 2}
+    run, _ = prepare(Config(preset="smoke", name="more", start_from=start, **options))
+    trainer = run.build(torch.device("cpu"), lambda model: model)
+    first = load_pipeline(start).dit
+    assert weights_digest(trainer.model) == weights_digest(first) == run.identity["start_from"]
+    assert [run.settings.at(step)[0] for step in (0, 1)] == [pytest.approx(1e-3), pytest.approx(1e-5)]
+    for batch in batches(run.stream, run.reader, 0, run.settings.steps):
+        trainer.step(as_tensors(batch), range(run.stream.batch_size))
+    tag_weights(run.tracker, trainer.averaged(), trainer.steps_done)
+    told = history("pritti-dit", "Transformer", trainer.averaged())
+    assert [(run.name, run.stage, run.steps) for run in told] == [
+        ("dit", "Transformer", 8),
+        ("dit-2", "Transformer, run 2", 2),
+    ]
+    assert told[1].options["start_from"] == told[0].weights == weights_digest(first)
+    with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
+        prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
+    with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
+        prepare(Config(preset="smoke", name="other", start_from="town"))
 
 
 def test_a_password_in_the_tracking_uri_is_not_shown():
