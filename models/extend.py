@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from models.borders import continued
 from models.diffusion import OUTPAINT, Known
 from models.duplicates import doubles
 from models.inpaint import Contents, composited, latent_mask, whole_cells
@@ -195,7 +196,7 @@ def extended(
             OUTPAINT,
         )
         block = pipeline.decode(latent, [empty])[0]
-        new = merge([block], [unknown], block)
+        new = merge([continued(block, known, unknown)], [unknown], block)
         new = new.select(~doubles(new, known)).moved(*offset_m)
         before = made.copy()
         made[here] = True

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from models.borders import continued
 from models.duplicates import doubles
 from models.scene import Grid, Scene, joined, merge, yaw_rotation
 
@@ -94,7 +95,8 @@ def latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], cont
 
 
 def composited(scene: Scene, made: Scene, region: np.ndarray, contents: Contents) -> Scene:
-    """The scene with what was made anew inside a region of whole cells; all else from the scene, bit for bit.
+    """The scene with what was made anew inside a region of whole cells; all else from the scene, bit for bit. New ground
+    is bent near the border to go on from the given (borders.py).
 
     Pixels by place, primitives by the pixel under their centre. Decoders see the whole latent: what they say outside the
     region differs a little from the scene although the latent there does not. A known object near the border may so be
@@ -102,6 +104,7 @@ def composited(scene: Scene, made: Scene, region: np.ndarray, contents: Contents
     """
     nothing = np.zeros_like(region)
     ground, objects = (nothing if contents == other else region for other in ("objects", "ground"))
+    made = continued(made, scene, ground)
     of_ground = merge([scene, made], [~ground, ground], scene)
     kept, new = merge([scene], [~objects], scene), merge([made], [objects], scene)
     both = joined([kept, new.select(~doubles(new, kept))])

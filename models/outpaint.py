@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from models.borders import continued
 from models.duplicates import doubles
 from models.layout import LayoutSpec
 from models.scene import Grid, Scene, joined, merge
@@ -197,7 +198,7 @@ class World:
 
     def block(self, task: Task, latent: Tensor, made: Scene) -> Block:
         """A block from what its task's latent became: the new part, without objects that are known already."""
-        own = merge([made], [task.new_pixels], made)
+        own = merge([continued(made, task.known, task.new_pixels)], [task.new_pixels], made)
         own = own.select(~doubles(own, task.known))
         seen = task.known.occupied.any(axis=0)[~task.new_pixels]
         return Block(own, latent, task.datum_m, float(seen.mean()) if task.knows else 1.0)

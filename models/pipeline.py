@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -80,11 +81,18 @@ def scheduler() -> DDPMScheduler:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps."""
+    """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps; default: the paper's."""
 
     num_steps: int = NUM_INFERENCE_STEPS
     jump_length: int = JUMP_LENGTH
     resamplings: int = RESAMPLINGS
+    known_guidance: float = (
+        0.0  # how strongly what is made is drawn to what is known (diffusion.explaining); 0: the paper
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.known_guidance < math.inf:
+            raise ValueError(f"known_guidance is {self.known_guidance}, expected 0 (none) or more; 1 is its weight")
 
     def transitions(self) -> list[tuple[int, int]]:
         return repaint_transitions(self.num_steps, self.jump_length, self.resamplings)
@@ -267,7 +275,7 @@ class PrITTIPipeline(DiffusionPipeline):
         label = self.label_tensor(labels)
         model = self._denoiser(walk.timesteps, label, guidance_scale)
         with self._watched(resampling.evaluations, callback_on_step_end) as on_step:
-            return sample(model, walk, noise, label, transitions, known, on_step)
+            return sample(model, walk, noise, label, transitions, known, on_step, resampling.known_guidance)
 
     def inpaint(
         self,
@@ -334,7 +342,7 @@ class PrITTIPipeline(DiffusionPipeline):
         known = Known(torch.stack([task.latent for task in tasks]), torch.stack([task.unknown for task in tasks]))
         resampling = resampling or Resampling()
         if not any(task.knows for task in tasks):  # nothing to harmonise with
-            resampling = replace(resampling, resamplings=1)
+            resampling = replace(resampling, resamplings=1, known_guidance=0.0)
         latents = self.complete(
             known,
             [label if isinstance(label, str) else label[place] for place in places],

@@ -281,3 +281,26 @@ def test_learning_rate_is_one_cycle_without_warm_up():
         assert np.isclose(rate, reference.get_last_lr()[0], rtol=1e-5)
         optimiser.step()
         reference.step()
+
+
+def test_guidance_by_what_is_known_follows_a_line_that_pasting_loses():
+    """Data on the line z_1 = z_0, with its exact denoiser: what is made must meet what is known."""
+    walk, covariance = Walk(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
+
+    def denoise(latent, timestep, label):
+        a = Diffusion().alpha_bar[int(timestep[0])]
+        posterior = a**0.5 * covariance @ torch.linalg.inv(a * covariance + (1 - a) * torch.eye(2, dtype=torch.float64))
+        clean = (latent.double().flatten(1) @ posterior.T).view_as(latent)
+        return ((latent - a**0.5 * clean) / (1 - a) ** 0.5).to(latent.dtype)
+
+    count = 64
+    given = torch.linspace(-2, 2, count)[:, None, None, None].expand(count, 2, 1, 1).clone()
+    mask = torch.tensor([0.0, 1.0])[None, :, None, None].expand_as(given)
+    label = torch.zeros(count, dtype=torch.long)
+    missed = {}
+    for weight in (0.0, 1.0):
+        noise = SceneNoise(0, range(count), (2, 1, 1), "cpu")
+        made = sample(denoise, walk, noise, label, None, Known(given, mask), known_guidance=weight)
+        assert torch.equal(made[:, 0], given[:, 0])
+        missed[weight] = (made[:, 1] - given[:, 1]).abs().mean().item()
+    assert missed[1.0] < 0.5 * missed[0.0], missed

@@ -10,6 +10,7 @@ from diffusers import DPMSolverMultistepScheduler
 from scenes import random_scene, small_spec, tiny_pipeline
 from test_diffusion import SHAPE
 
+from models.borders import continued
 from models.diffusion import Diffusion, SceneNoise, Walk, sample, solve
 from models.dit import DiT
 from models.inpaint import cells_of, composited, half_plane_region, latent_mask, object_region, polygon_region
@@ -184,13 +185,15 @@ def test_inpainting_keeps_the_rest(pipeline, contents):
     (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK)
     (raw,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK, composite=False)
     new_ground, new_objects = (contents in ("both", what) for what in ("ground", "objects"))
+    bent = continued(raw, scene, region)
     for name in ("height_m", "occupied"):
-        got, kept, new = (getattr(s, name) for s in (made, scene, raw))
+        got, kept, new = (getattr(s, name) for s in (made, scene, bent))
         assert np.array_equal(got[:, ~region], kept[:, ~region])
         assert np.array_equal(got[:, region], (new if new_ground else kept)[:, region])
     centers = {tuple(c) for c in made.center_m.tolist()}
     behind = {tuple(c) for c in scene.center_m.tolist() if c[0] < 32}
-    ahead = {tuple(c) for c in (raw if new_objects else scene).center_m.tolist() if c[0] >= 32}
+    lifted = bent if new_ground else raw
+    ahead = {tuple(c) for c in (lifted if new_objects else scene).center_m.tolist() if c[0] >= 32}
     assert behind and centers == behind | ahead
 
 

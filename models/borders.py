@@ -1,0 +1,85 @@
+"""Ground that goes on: what was made beside known ground is bent, near the border, to meet it.
+
+A new part is decoded together with what is known, so the decoder draws both sides as one; but the known side is kept as
+it was given, and where the two drawings of it differ, by a pixel of kerb or a centimetre of height, the border would show.
+What the drawings differ by at the border is therefore added to the new side, less and less with distance. Differs from the
+paper, which pastes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from models.scene import Scene
+
+REACH_M = 8.0  # how far from the border the new ground is bent
+LIMIT_M = 2.0  # classes' edges are moved by no more
+
+
+def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
+    """`made` with its pixels `new` (rows, cols) bent to meet those of `known`, both scenes of one grid; objects stand as
+    high above the ground as before. Other pixels are as they were.
+
+    Per class: its signed distance from the class's edge and its height take up the difference at the nearest known pixel.
+    """
+    if new.all() or not new.any():
+        return made
+    resolution_m = made.grid.resolution_m
+    window = _around(new, math.ceil(REACH_M / resolution_m))
+    new = new[window]
+    given = ~new
+    limit = LIMIT_M / resolution_m
+    distance, nearest = _nearest(given)
+    share = _falling(distance * resolution_m)
+    occupied, height_m = made.occupied.copy(), made.height_m.copy()
+    for c in range(len(made.ground_classes)):
+        was, is_made, was_m, is_made_m = (
+            of[c][window] for of in (known.occupied, made.occupied, known.height_m, made.height_m)
+        )
+        was = was & given
+        if not was.any() and not is_made.any():
+            continue
+        differs = _edge_distance(was, given, limit) - _edge_distance(is_made, given, limit)
+        inside = _edge_distance(is_made, np.ones_like(new), limit) + share * differs[nearest] > 0
+        # The class's height everywhere: that of its nearest pixel, of the known ones if none was made.
+        away, place = _nearest(was) if was.any() else (np.full(new.shape, np.inf), nearest)
+        level_m = is_made_m[_nearest(is_made)[1]] if is_made.any() else was_m[place]
+        risen_m = level_m + _falling(away * resolution_m) * (was_m - level_m)[place]
+        occupied[c][window] = np.where(new, inside, is_made)
+        height_m[c][window] = np.where(new, np.where(inside, risen_m, 0), is_made_m)
+    bent = replace(made, occupied=occupied, height_m=height_m)
+    (before_m, class_before), (after_m, class_after) = made.ground_under(), bent.ground_under()
+    center_m = made.center_m.copy()
+    center_m[:, 2] += np.where((class_before >= 0) & (class_after == class_before), after_m - before_m, 0)
+    return replace(bent, center_m=center_m)
+
+
+def _around(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """The rectangle of a mask that is not empty, with a margin."""
+    spans = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return tuple(slice(max(0, span[0] - margin), span[-1] + 1 + margin) for span in spans)
+
+
+def _nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Distance in pixels to the nearest pixel of a mask that is not empty, and which one that is."""
+    distance, (row, col) = distance_transform_edt(~mask, return_indices=True)
+    return distance, (row, col)
+
+
+def _falling(distance_m: np.ndarray) -> np.ndarray:
+    """1 at the border, 0 from REACH_M on, smooth."""
+    left = np.clip(1 - distance_m / REACH_M, 0, 1)
+    return left * left * (3 - 2 * left)
+
+
+def _edge_distance(mask: np.ndarray, domain: np.ndarray, limit: float) -> np.ndarray:
+    """Signed distance in pixels from the edge of a mask inside a domain, positive in the mask, within +-limit."""
+    inside, outside = (
+        np.minimum(_nearest(side)[0] - 0.5, limit) if side.any() else np.full(mask.shape, limit)
+        for side in (mask & domain, ~mask & domain)
+    )
+    return np.where(mask, outside, -inside)
