@@ -42,9 +42,7 @@ class Config:
     sampling_steps: int = 100
     """Denoising steps (the paper: 250)."""
     outpaint_steps: int = 50
-    """Denoising steps of outpainting (the paper: 250)."""
-    resamplings: int = 2
-    """Resamplings of outpainting (the paper: 10)."""
+    """Denoising steps of outpainting, guided by what is known (the paper: 250, ten times over)."""
     actors: int = 2
     """Models at work at once when encoding, sampling and evaluating."""
     seed: int = 0
@@ -182,7 +180,8 @@ def main(config: Config) -> None:
                 limit=1,
                 seed=config.seed,
                 steps=config.outpaint_steps,
-                resamplings=config.resamplings,
+                resamplings=1,
+                known_guidance=1.0,
             )
         ),
     )

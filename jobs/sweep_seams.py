@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""What does outpainting need? The same scenes extended with many and few steps, roll-backs and resamplings; their seams.
+"""What does outpainting need? The same scenes extended with many and few steps and resamplings, and guided; their seams.
 
     jobs/sweep_seams.py --limit 50                                          50 generated scenes, 200 seams a setting
-    jobs/sweep_seams.py --limit 50 --settings 250 10 10 50 5 5 50 1 1       steps, jump length and resamplings, in threes
+    jobs/sweep_seams.py --limit 50 --settings 250 10 10 0 50 1 1 1          steps, jump length, resamplings and
+                                                                            guidance by what is known, in fours
 
-The paper's is 250 10 10: 2,410 network evaluations a block. Writes the scenes (source=generated-<steps>-<J>-<R>),
+The paper's is 250 10 10 0: 2,410 network evaluations a block. Writes the scenes (source=generated-<the four numbers>),
 sweep.json, sweep.parquet and sweep.html. Run it again with the same options to go on after an interruption.
 """
 
@@ -19,8 +20,10 @@ from jobs.given_scenes import GivenScenes, pipeline_directory
 
 @dataclass(frozen=True)
 class Config(GivenScenes):
-    settings: tuple[tuple[int, int, int], ...] = ((250, 10, 10), (250, 5, 5), (250, 1, 1), (50, 10, 10), (50, 5, 5), (50, 1, 1))  # fmt: skip
-    """Steps, jump length and resamplings, in threes."""
+    settings: tuple[tuple[int, int, int, float], ...] = (
+        (250, 10, 10, 0), (250, 5, 5, 0), (250, 1, 1, 0), (50, 10, 10, 0), (50, 5, 5, 0), (50, 1, 1, 0), (50, 1, 1, 1)
+    )  # fmt: skip
+    """Steps, jump length, resamplings and known guidance, in fours."""
     overlap: float = 0.5
     """Of neighbouring blocks."""
     mode: Literal["reencode", "copy"] = "reencode"
@@ -35,7 +38,7 @@ def sweep_seams(config: Config) -> list[dict]:
     """Outpaint, measure, write and return a row per setting."""
     model = pipeline_directory(config.model)
     if not config.settings:
-        raise ValueError("no --settings: expected steps, jump length and resamplings, in threes")
+        raise ValueError("no --settings: expected steps, jump length, resamplings and known guidance, in fours")
     import pyarrow as pa
     from rich.progress import Progress
 
@@ -58,7 +61,7 @@ def sweep_seams(config: Config) -> list[dict]:
     start_ray()
     with Progress() as bar:
         for setting in config.settings:
-            name = "-".join(map(str, setting))
+            name = "-".join(f"{value:g}" for value in setting)
             request = OutpaintRequest(
                 model=model,
                 output=output,

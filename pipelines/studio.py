@@ -131,11 +131,12 @@ class Generate(Sampling):
 
 
 class Repaint(Sampling):
-    jump_length: int = Field(5, ge=1, le=100)
-    resamplings: int = Field(2, ge=1, le=20)
+    jump_length: int = Field(1, ge=1, le=100)
+    resamplings: int = Field(1, ge=1, le=20)
+    known_guidance: float = Field(1.0, ge=0, le=10)
 
     def resampling(self) -> Resampling:
-        return Resampling(self.steps, self.jump_length, self.resamplings)
+        return Resampling(self.steps, self.jump_length, self.resamplings, self.known_guidance)
 
 
 class Inpaint(Repaint):

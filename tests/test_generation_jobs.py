@@ -124,12 +124,19 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
     assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
 
-    (row,) = sweep_seams(
-        SweepConfig(model, str(samples), "generated-samples", settings=((4, 2, 2),), output=str(tmp_path / "sweep"))
+    row, guided = sweep_seams(
+        SweepConfig(
+            model,
+            str(samples),
+            "generated-samples",
+            settings=((4, 2, 2, 0.0), (4, 1, 1, 1.0)),
+            output=str(tmp_path / "sweep"),
+        )
     )
     assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
-    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,)]
-    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 1
+    assert guided["evaluations"] == 4 and guided["known_guidance"] == 1
+    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)]
+    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 2
 
     scores = evaluate(
         Config(
