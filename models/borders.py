@@ -58,6 +58,17 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
     return replace(bent, center_m=center_m)
 
 
+def spread(known: Scene, unknown: np.ndarray) -> Scene:
+    """A scene to encode: its pixels `unknown` (rows, cols) bear the ground of the nearest known one.
+
+    An encoder looks a little beyond a cell; left empty, what is merely not known yet would be an edge to it.
+    """
+    if unknown.all() or not unknown.any():
+        return known
+    row, col = _nearest(~unknown)[1]
+    return replace(known, occupied=known.occupied[:, row, col], height_m=known.height_m[:, row, col])
+
+
 def _around(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
     """The rectangle of a mask that is not empty, with a margin."""
     spans = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from models.borders import continued
+from models.borders import continued, spread
 from models.diffusion import OUTPAINT, Known
 from models.duplicates import doubles
 from models.inpaint import Contents, composited, latent_mask, whole_cells
@@ -183,7 +183,7 @@ def extended(
         here = grid.shared(window)[0]
         unknown = ~made[here]
         known, offset_m = in_block(canvas, window, small, level_m)
-        latent = pipeline.encode([known])
+        latent = pipeline.encode([spread(known, unknown)])
         mask = latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
         latent = pipeline.complete(
             Known(latent, mask),

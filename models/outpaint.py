@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.borders import continued
+from models.borders import continued, spread
 from models.duplicates import doubles
 from models.layout import LayoutSpec
 from models.scene import Grid, Scene, joined, merge
@@ -184,10 +184,11 @@ class World:
         grid = self.spec.grid
         scenes = [self.seen_from(place, other, block) for other, block, _ in parts]
         known = merge(scenes, [grid.enlarged(cells) for *_, cells in parts], empty) if parts else empty
-        unknown = torch.from_numpy(self.lattice.owned(place))
+        own = self.lattice.owned(place)
+        unknown = torch.from_numpy(own)
         datum = height_near(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
         known = known.moved(0, 0, -datum)
-        latent = self.encode([known])[0]
+        latent = self.encode([spread(known, grid.enlarged(own))])[0]
         if mode == "copy":
             latent = torch.zeros_like(latent)
             for other, block, cells in parts:

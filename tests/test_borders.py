@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
-from models.borders import REACH_M, continued
+from models.borders import REACH_M, continued, spread
 from models.scene import KITTI_GROUND_CLASSES, Grid
 
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)
@@ -78,3 +78,11 @@ def test_objects_keep_their_height_above_the_ground():
     above_m = [scene.center_m[:, 2] - scene.ground_under()[0] for scene in (made, bent)]
     assert np.allclose(*above_m, atol=1e-6)
     assert (bent.center_m[:6, 2] < 0.75).all() and np.array_equal(bent.center_m[6:], made.center_m[6:])
+
+
+def test_what_is_not_known_yet_is_no_edge():
+    known = street(20, 0.0)
+    half = replace(known, occupied=known.occupied & ~NEW, height_m=np.where(NEW, 0, known.height_m).astype(np.float32))
+    for scene in (spread(half, NEW), spread(known, np.zeros_like(NEW))):
+        assert np.array_equal(scene.occupied, known.occupied) and np.array_equal(scene.height_m, known.height_m)
+    assert spread(half, np.ones_like(NEW)) is half
