@@ -199,11 +199,12 @@ def starting_weights(model: str, lvae_digest: str, architecture: dict) -> Start:
     from pipelines.encode import weights_digest
     from pipelines.generate import load_pipeline
 
-    pipeline = load_pipeline(pipeline_directory(model))
+    directory = pipeline_directory(model)
+    pipeline = load_pipeline(directory)
     if weights_digest(pipeline.lvae) != lvae_digest:
         raise ValueError(
             f"--start-from {model}: its transformer knows the latents of another layout VAE; "
-            f"encode with its own first: jobs/encode_latents.py --lvae {model}/lvae"
+            f"encode with its own first: jobs/encode_latents.py --lvae {directory}/lvae"
         )
     built = pipeline.dit.config
     for key in ("patch", "depth", "width", "heads", "prediction", "label"):

@@ -81,14 +81,15 @@ def scheduler() -> DDPMScheduler:
 
 @dataclass(frozen=True)
 class Resampling:
-    """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps; default: the paper's."""
+    """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps; default: the paper's.
+
+    `known_guidance`: how strongly what is made is drawn to what is known (diffusion.explaining); 0 is not at all.
+    """
 
     num_steps: int = NUM_INFERENCE_STEPS
     jump_length: int = JUMP_LENGTH
     resamplings: int = RESAMPLINGS
-    known_guidance: float = (
-        0.0  # how strongly what is made is drawn to what is known (diffusion.explaining); 0: the paper
-    )
+    known_guidance: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.known_guidance < math.inf:
