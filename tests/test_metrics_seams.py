@@ -123,5 +123,5 @@ def test_a_row_of_the_sweep_says_what_a_setting_costs_and_shows():
     row = seam_row(Resampling(), 200, ratios)
     assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
     (cells,) = seam_table([row]).rows
-    assert cells[:5] == (250, 10, 10, 2410, 200) and cells[6] == "1.20 (1.00 to 1.50)" and cells[7] is None
+    assert cells[:6] == (250, 10, 10, 0.0, 2410, 200) and cells[7] == "1.20 (1.00 to 1.50)" and cells[8] is None
     assert "2410" in seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")
