@@ -1,4 +1,4 @@
-"""Ground that goes on: what was made beside known ground is bent, near the border, to meet it.
+"""What was made beside known ground goes on from it: near the border its ground is bent to meet the known.
 
 A new part is decoded together with what is known, so the decoder draws both sides as one; but the known side is kept as
 it was given, and where the two drawings of it differ, by a pixel of kerb or a centimetre of height, the border would show.
@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from models.scene import Scene
+from models.duplicates import doubles
+from models.scene import Scene, merge
 
 REACH_M = 8.0  # how far from the border the new ground is bent
 LIMIT_M = 2.0  # classes' edges are moved by no more
@@ -56,6 +57,12 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
     center_m = made.center_m.copy()
     center_m[:, 2] += np.where((class_before >= 0) & (class_after == class_before), after_m - before_m, 0)
     return replace(bent, center_m=center_m)
+
+
+def new_part(made: Scene, known: Scene, new: np.ndarray) -> Scene:
+    """What was made in the pixels `new`, fit to be put beside `known`: its ground meets it, no object of it comes again."""
+    part = merge([continued(made, known, new)], [new], made)
+    return part.select(~doubles(part, known))
 
 
 def spread(known: Scene, unknown: np.ndarray) -> Scene:

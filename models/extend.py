@@ -8,9 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from models.borders import continued, spread
+from models.borders import new_part, spread
 from models.diffusion import OUTPAINT, Known
-from models.duplicates import doubles
 from models.inpaint import Contents, composited, latent_mask, whole_cells
 from models.outpaint import Lattice, height_near
 from models.pipeline import PrITTIPipeline, Resampling, StepCallback
@@ -196,8 +195,7 @@ def extended(
             OUTPAINT,
         )
         block = pipeline.decode(latent, [empty])[0]
-        new = merge([continued(block, known, unknown)], [unknown], block)
-        new = new.select(~doubles(new, known)).moved(*offset_m)
+        new = new_part(block, known, unknown).moved(*offset_m)
         before = made.copy()
         made[here] = True
         canvas = merge([canvas, new.cropped(grid)], [before, made & ~before], canvas)

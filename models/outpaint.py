@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.borders import continued, spread
-from models.duplicates import doubles
+from models.borders import new_part, spread
 from models.layout import LayoutSpec
 from models.scene import Grid, Scene, joined, merge
 
@@ -199,8 +198,7 @@ class World:
 
     def block(self, task: Task, latent: Tensor, made: Scene) -> Block:
         """A block from what its task's latent became: the new part, without objects that are known already."""
-        own = merge([continued(made, task.known, task.new_pixels)], [task.new_pixels], made)
-        own = own.select(~doubles(own, task.known))
+        own = new_part(made, task.known, task.new_pixels)
         seen = task.known.occupied.any(axis=0)[~task.new_pixels]
         return Block(own, latent, task.datum_m, float(seen.mean()) if task.knows else 1.0)
 
