@@ -10,6 +10,9 @@ export MLFLOW_DISABLE_TELEMETRY ?= true
 # Threads that wait for each other give their core away: spinning ones slow torch fivefold beside a busy process.
 export OMP_WAIT_POLICY ?= PASSIVE
 
+# Each of Ray's processes imports the same modules: without their bytecode each compiles them anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test lint clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
