@@ -31,7 +31,7 @@ class Config:
     """Labels, in turn over the scenes (default: all that the model knows, balanced)."""
     seed: int = 0
     """Scene i depends on the seed, i and its label alone."""
-    sampler: Literal["ddpm", "ddim", "dpm++"] = "ddpm"
+    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "ddpm"
     """The paper's, DDIM, or DPM-Solver++, which needs the fewest steps."""
     steps: int = 250
     """Denoising steps; the paper takes 250."""

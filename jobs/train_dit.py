@@ -57,6 +57,8 @@ class Config:
     """What the network puts out (default: as the preset says; the paper: noise)."""
     normalise_latents: bool | None = None
     """Give each channel of the latents mean 0 and deviation 1 (default: as the preset says; the paper: no)."""
+    timesteps: Literal["even", "middle"] = "even"
+    """Noise levels to train on: all alike (the paper), or more often the middle ones, where it is decided what stands where."""
     accumulate: int = 1
     """Cut each worker's batch into this many parts, one after another, where it does not fit memory."""
     precision: str = "auto"
@@ -154,13 +156,14 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         lvae=latents["lvae_digest"],
         dataset=root,
         **({"start_from": start.digest} if start else {}),
+        **({"timesteps": config.timesteps} if config.timesteps != "even" else {}),
     )
     record = claim(name, home("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     training = TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, architecture, settings, execution, row.label_dropout, start),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start, config.timesteps),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LatentReader(latents_root, config.label),
         settings=settings,
@@ -216,7 +219,9 @@ def starting_weights(model: str, lvae_digest: str, architecture: dict) -> Start:
     return Start(weights_digest(pipeline.dit), normalisation, pipeline.dit.state_dict())
 
 
-def build(architecture: dict, settings, execution, label_dropout: float, start: Start | None, device, wrap):
+def build(
+    architecture: dict, settings, execution, label_dropout: float, start: Start | None, timesteps: str, device, wrap
+):
     """The Trainer of stage 2, with the same initial weights on every worker."""
     import torch
 
@@ -227,7 +232,7 @@ def build(architecture: dict, settings, execution, label_dropout: float, start: 
     model = DiT(**architecture)
     if start:
         model.load_state_dict(start.state)
-    return dit_trainer(model, settings, label_dropout, device, wrap, execution)
+    return dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
 
 
 def complete_pipeline(lvae: str, output: str) -> str:

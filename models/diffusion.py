@@ -212,14 +212,16 @@ def solve(
     label: Int[Tensor, b],
     on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
-    """Clean latents by one of diffusers' schedulers that draw no noise of their own, as DDIM and DPM-Solver++.
+    """Clean latents by one of diffusers' schedulers that take noise from outside or none, as DPM-Solver++ and DDIM.
 
     Takes the steps that `solver.set_timesteps` has set.
     """
     latent = noise.draw() * solver.init_noise_sigma
+    stochastic = str(solver.config.get("algorithm_type")).startswith("sde-")
     for number, timestep in enumerate(solver.timesteps):
         predicted = model(solver.scale_model_input(latent, timestep), timestep.expand(len(label)), label)
-        latent = solver.step(predicted, timestep, latent).prev_sample
+        drawn = {"variance_noise": noise.draw()} if stochastic else {}
+        latent = solver.step(predicted, timestep, latent, **drawn).prev_sample
         if on_step:
             latent = on_step(number, int(timestep), latent)
     return latent

@@ -13,10 +13,12 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from diffusers import ModelMixin
+from jaxtyping import Float, Int
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -121,7 +123,22 @@ def layout_loss(
     return loss
 
 
-def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunction:
+Timesteps = Literal["even", "middle"]
+MIDDLE = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half of the timesteps lie between 196 and 552
+
+
+def drawn_timestep(uniform: Float[Tensor, b], density: Timesteps, num_timesteps: int) -> Int[Tensor, b]:
+    """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
+
+    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these. Logit-normal, as in
+    SD3 (Esser et al., 2024).
+    """
+    if density == "middle":
+        uniform = torch.sigmoid(MIDDLE[0] + MIDDLE[1] * torch.special.ndtri(uniform))
+    return (uniform * num_timesteps).long().clamp(max=num_timesteps - 1)
+
+
+def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float, timesteps: Timesteps = "even") -> LossFunction:
     """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
 
     Latents are sampled anew from the cached posterior; one label-dropout mask per sample.
@@ -137,7 +154,7 @@ def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float) -> LossFunc
         latent = (latent - shift.to(device)) / scale.to(device)
         noise = stacked_noise(generators, shape, device)
         uniform = torch.stack([torch.rand(2, generator=generator) for generator in generators]).to(device)
-        timestep = (uniform[:, 0] * diffusion.num_timesteps).long()
+        timestep = drawn_timestep(uniform[:, 0], timesteps, diffusion.num_timesteps)
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
@@ -171,7 +188,7 @@ class Trainer:
             for value in sorted(set(share.values()))
         ]
         self.optimiser = torch.optim.AdamW(
-            groups, settings.learning_rate, settings.betas, weight_decay=settings.weight_decay
+            groups, settings.learning_rate, settings.betas, weight_decay=settings.weight_decay, fused=True
         )
         self.ema = {n: p.detach().clone() for n, p in self.parameters.items()} if settings.ema_decay else None
         self.steps_done = 0
@@ -281,7 +298,7 @@ class Trainer:
                 self.ema[name].copy_(value)
             else:
                 key, name = name.split(".", 1)
-                optimiser[name][key] = value.cpu() if key == "step" else value
+                optimiser[name][key] = value
         self.model.load_state_dict(model)
         for name, parameter in self.parameters.items():
             self.optimiser.state[parameter] = optimiser[name]
@@ -313,10 +330,11 @@ def dit_trainer(
     device: torch.device,
     wrap: Wrap = lambda m: m,
     execution: Execution | None = None,
+    timesteps: Timesteps = "even",
 ) -> Trainer:
     execution = execution or Execution()
     model = model.to(device)
-    loss = noise_loss(model, Diffusion(), label_dropout)
+    loss = noise_loss(model, Diffusion(), label_dropout, timesteps)
     return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
 
 

@@ -127,7 +127,7 @@ class Sampling(Asked):
 
 
 class Generate(Sampling):
-    sampler: Literal["ddpm", "ddim", "dpm++"] = "dpm++"
+    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "dpm++"
 
 
 class Repaint(Sampling):

@@ -43,7 +43,7 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "off"), [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02)]
+    ("name", "steps", "off"), [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)]
 )
 def test_samplers_draw_from_a_gaussian_whose_noise_is_known(name, steps, off):
     """Of data N(mean, std^2), the best prediction of the noise is known; what is drawn must have that mean and std."""
