@@ -63,6 +63,8 @@ def publish(config: Config) -> list[str]:
     weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
     directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
     about, scores = evaluation_of(directory, weights)
+    if about["sampling"]["sampler"] != "ddpm":  # the entry samples as it was judged
+        pipeline.register_to_config(noise_scaling=about["sampling"].get("noise_scaling", 1.0))
     facts = storage.read_json(storage.join(about["real"], "dataset.json"))
     stages = [
         history("pritti-lvae", "Layout VAE", pipeline.lvae),

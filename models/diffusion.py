@@ -137,6 +137,17 @@ def guided(model: Denoiser, null_label: int, scale: float) -> Denoiser:
     return predict
 
 
+def rescaled(model: Denoiser, noise_scaling: float) -> Denoiser:
+    """The noise that a model predicts, divided by a number near 1; at 1 the model itself.
+
+    Epsilon scaling (Ning et al., ICLR 2024): along a run a network meets its own errors, which it takes for noise; a little less
+    of what it predicts is taken away. Keeps in what is drawn the deviation that the data have.
+    """
+    if noise_scaling == 1.0:
+        return model
+    return lambda latent, timestep, label: model(latent, timestep, label) / noise_scaling
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """What must stay: clean latents and a mask, 1 = generate, 0 = keep (paper, Eqs. "z_known" ff.)."""

@@ -25,6 +25,7 @@ from models.diffusion import (
     SceneNoise,
     Walk,
     guided,
+    rescaled,
     sample,
     solve,
 )
@@ -106,11 +107,15 @@ class Resampling:
 
 
 class PrITTIPipeline(DiffusionPipeline):
-    """Generates Scenes. `from_pretrained(directory)` and `save_pretrained(directory)` as in diffusers."""
+    """Generates Scenes. `from_pretrained(directory)` and `save_pretrained(directory)` as in diffusers.
 
-    def __init__(self, lvae: LayoutVAE, dit: DiT, scheduler: SchedulerMixin) -> None:
+    `noise_scaling` is what all samplers but the paper's divide the network's noise by (diffusion.rescaled); not in the paper.
+    """
+
+    def __init__(self, lvae: LayoutVAE, dit: DiT, scheduler: SchedulerMixin, noise_scaling: float = 1.0) -> None:
         super().__init__()
         self.register_modules(lvae=lvae, dit=dit, scheduler=scheduler)
+        self.register_to_config(noise_scaling=noise_scaling)
         self.lvae.eval().requires_grad_(False)
         self.dit.eval().requires_grad_(False)
         if dit.config.layout is not None:
@@ -198,6 +203,14 @@ class PrITTIPipeline(DiffusionPipeline):
         kind, changes = SAMPLERS[name]
         self.scheduler = kind.from_config(self.scheduler.config, **changes)
 
+    def scaling(self, noise_scaling: float | None) -> float:
+        """The number given, or the pipeline's own with its present sampler. Raises ValueError for one that is not near 1."""
+        if noise_scaling is None:
+            return 1.0 if isinstance(self.scheduler, DDPMScheduler) else self.config.noise_scaling
+        if not 0.9 <= noise_scaling <= 1.1:
+            raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or a little more, up to 1.1")
+        return noise_scaling
+
     @contextmanager
     def _watched(self, evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
         """What a sampler calls after each evaluation of the model: moves a progress bar, then calls the user's."""
@@ -217,22 +230,22 @@ class PrITTIPipeline(DiffusionPipeline):
         num_inference_steps: int = NUM_INFERENCE_STEPS,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
+        noise_scaling: float | None = None,
     ) -> Float[Tensor, "b c h w"]:
         """Latents of scenes `indices`; each depends on (seed, its index, its label) only."""
         noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device)
-        label = self.label_tensor(labels)
+        label, noise_scaling = self.label_tensor(labels), self.scaling(noise_scaling)
         with self._watched(num_inference_steps, callback_on_step_end) as on_step:
             if isinstance(self.scheduler, DDPMScheduler):
                 walk = Walk(self.diffusion, num_inference_steps)
-                return sample(
-                    self._denoiser(walk.timesteps, label, guidance_scale), walk, noise, label, on_step=on_step
-                )
+                model = rescaled(self._denoiser(walk.timesteps, label, guidance_scale), noise_scaling)
+                return sample(model, walk, noise, label, on_step=on_step)
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
             if self.scheduler.timesteps.is_floating_point():
                 raise ValueError(
                     f"{type(self.scheduler).__name__} has timesteps between whole ones: DPM-Solver++ and DDIM have not"
                 )
-            model = self._denoiser(self.scheduler.timesteps, label, guidance_scale)
+            model = rescaled(self._denoiser(self.scheduler.timesteps, label, guidance_scale), noise_scaling)
             return solve(model, self.scheduler, noise, label, on_step)
 
     def generate(
@@ -245,15 +258,18 @@ class PrITTIPipeline(DiffusionPipeline):
         run: str = "run",
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: StepCallback | None = None,
+        noise_scaling: float | None = None,
     ) -> list[Scene]:
         """One Scene per label. Scene i depends on (seed, indices[i], its label) only, whatever the batch.
 
         A `generator` draws the seed, one per scene their seeds. `callback_on_step_end(pipeline, step, timestep,
-        {"latents": ...})` returns such a dict, as in diffusers.
+        {"latents": ...})` returns such a dict, as in diffusers. `noise_scaling`: instead of the pipeline's own.
         """
         indices = range(len(labels)) if indices is None else indices
         seeds = seeds_of(generator, seed, len(labels))
-        latents = self.sample_latents(labels, seeds, indices, num_inference_steps, guidance_scale, callback_on_step_end)
+        latents = self.sample_latents(
+            labels, seeds, indices, num_inference_steps, guidance_scale, callback_on_step_end, noise_scaling
+        )
         scenes = zip(seeds, indices, labels, strict=True)
         return self.decode(latents, [self.identity(run, *scene) for scene in scenes])
 

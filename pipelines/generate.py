@@ -48,6 +48,7 @@ class SampleRequest(Request):
     num_inference_steps: int
     guidance_scale: float
     sampler: str = "ddpm"
+    noise_scaling: float | None = None  # None: the model's own
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:
@@ -125,6 +126,7 @@ class Sampler:
                 indices=chosen,
                 num_inference_steps=request.num_inference_steps,
                 guidance_scale=request.guidance_scale,
+                noise_scaling=request.noise_scaling,
                 run=request.run,
             )
         shard.write(scenes)
@@ -140,6 +142,8 @@ def sample_scenes(
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)
+    pipeline.use_sampler(request.sampler)
+    request = replace(request, noise_scaling=pipeline.scaling(request.noise_scaling))
     claim_run(request, pipeline)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):

@@ -11,7 +11,7 @@ from scenes import random_scene, small_spec, tiny_pipeline
 from test_diffusion import SHAPE
 
 from models.borders import continued
-from models.diffusion import Diffusion, SceneNoise, Walk, sample, solve
+from models.diffusion import Diffusion, SceneNoise, Walk, rescaled, sample, solve
 from models.dit import DiT
 from models.inpaint import cells_of, composited, half_plane_region, latent_mask, object_region, polygon_region
 from models.lvae import LayoutVAE
@@ -43,7 +43,8 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "off"), [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)]
+    ("name", "steps", "off"),
+    [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)],
 )
 def test_samplers_draw_from_a_gaussian_whose_noise_is_known(name, steps, off):
     """Of data N(mean, std^2), the best prediction of the noise is known; what is drawn must have that mean and std."""
@@ -90,6 +91,48 @@ def test_a_saved_pipeline_comes_back_with_its_sampler(pipeline, tmp_path):
         pipeline.use_sampler(name)
         pair = [p.generate(["high"], seed=1, num_inference_steps=5)[0] for p in (pipeline, again)]
         assert same(*pair)
+
+
+def test_scaled_noise_is_the_pipelines_own_and_leaves_the_papers_sampler_alone(pipeline, tmp_path):
+
+    def drawn(sampler, of=pipeline, **options):
+        of.use_sampler(sampler)
+        return of.sample_latents(["low", "high"], 3, range(2), 10, **options)
+
+    plain = {name: drawn(name) for name in ("ddpm", "dpm++")}
+    assert torch.equal(drawn("dpm++", noise_scaling=1.0), plain["dpm++"])
+    more = drawn("dpm++", noise_scaling=1.01)
+    assert not torch.allclose(more, plain["dpm++"], rtol=1e-4)
+    pipeline.register_to_config(noise_scaling=1.01)
+    pipeline.save_pretrained(tmp_path)
+    pipeline.register_to_config(noise_scaling=1.0)
+    again = PrITTIPipeline.from_pretrained(tmp_path)
+    again.set_progress_bar_config(disable=True)
+    assert torch.equal(drawn("dpm++", again), more) and torch.equal(drawn("ddpm", again), plain["ddpm"])
+    with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 1 \(none\) or a little more"):
+        drawn("dpm++", noise_scaling=2.0)
+    pipeline.use_sampler("ddpm")
+
+
+def test_scaling_undoes_what_a_model_says_too_much():
+    """Of Gaussian data the noise is known: a model that says 1 % more of it than there is draws too little deviation."""
+    alpha_bar = torch.from_numpy(Diffusion().alpha_bar).float()
+
+    def model(excess):
+        def predict(latent, timestep, label):
+            a = alpha_bar[timestep][:, None, None, None]
+            return excess * (1 - a).sqrt() * latent / (a * 0.25 + 1 - a)
+
+        return predict
+
+    solver, label = sampler_of("dpm++"), torch.zeros(64, dtype=torch.long)
+
+    def deviation(denoiser):
+        solver.set_timesteps(20)
+        return float(solve(denoiser, solver, SceneNoise(0, range(64), SHAPE, "cpu"), label).std())
+
+    assert deviation(model(1.01)) < 0.49
+    assert abs(deviation(rescaled(model(1.01), 1.01)) - deviation(model(1.0))) < 1e-6
 
 
 # ------------------------------------------------------------------------------------------------------ conventions
