@@ -39,7 +39,8 @@ def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
 def main() -> None:
     warnings.filterwarnings("ignore", module="diffusers")
     base = scheduler().config
-    ways = {name: kind.from_config(base, **options) for name, (kind, options) in SAMPLERS.items() if name != "ddpm"}
+    ways = {name: kind.from_config(base, **options) for name, (kind, options) in SAMPLERS.items()}
+    del ways["ddpm"], ways["sde-dpm++"]  # noise on the way
     ways |= {f"DDIM, {way}": DDIMScheduler.from_config(base, timestep_spacing=way) for way in ("trailing", "linspace")}
     dpm = DPMSolverMultistepScheduler
     ways |= {

@@ -3,6 +3,7 @@
 
     jobs/sweep_samplers.py                                             256 town scenes each, 10 to 250 steps
     jobs/sweep_samplers.py --samplers ddpm dpm++ --steps 10 250 --num-scenes 64
+    jobs/sweep_samplers.py --samplers dpm++ --steps 20 --noise-scalings 1 1.005 1.01        which of them a new model wants
 
 Writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and samplers.html.
 Run it again with the same options to go on after an interruption.
@@ -32,6 +33,8 @@ class Config:
     real_split: str = "test"
     samplers: tuple[str, ...] = ("ddpm", "ddim", "dpm++")
     steps: tuple[int, ...] = (10, 20, 50, 100, 250)
+    noise_scalings: tuple[float, ...] = ()
+    """Divide the network's noise by each of these (default: what the model comes with, nothing for ddpm)."""
     num_scenes: int = 256
     """Of each sampler and number of steps; as many real ones."""
     seed: int = 0
@@ -87,23 +90,25 @@ def sweep_samplers(config: Config) -> list[dict]:
             return describe(side, dataset, Looks(), directory, config.actors, lambda n: bar.advance(task, n))
 
         truth = described(real, "real")
-        for sampler, steps in product(config.samplers, config.steps):
+        for sampler, steps, scaling in product(config.samplers, config.steps, config.noise_scalings or (None,)):
             request = SampleRequest(
                 model=model,
                 output=output,
-                run=f"{sampler}-{steps}",
+                run=f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else ""),
                 num_scenes=config.num_scenes,
                 labels=labels,
                 seed=config.seed,
                 num_inference_steps=steps,
                 guidance_scale=config.guidance,
                 sampler=sampler,
+                noise_scaling=scaling,
                 shard_scenes=max(1, config.num_scenes // 8),  # whatever the actors: another number of them goes on
             )
             seconds_per_scene = timed_sampling(config, request, bar)
             made = described(Selection(output, request.source, None, count, "spread"), request.run)
             scores = compare(truth, made, dataset.spec.ground_classes)
-            rows.append(sampler_row(sampler, steps, seconds_per_scene, scores))
+            used = storage.read_json(storage.join(output, f"{request.source}.json"))["noise_scaling"]
+            rows.append(sampler_row(sampler, steps, used, seconds_per_scene, scores))
             scenes = read_scenes(output, request.source, limit=config.pictures) if config.pictures else ()
             pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
     how = [

@@ -48,16 +48,23 @@ def test_no_reference_that_fits_is_an_error():
 # -------------------------------------------------------------------------------------------------------- samplers
 
 
-def row_of(sampler: str, steps: int, frechet: Estimate) -> dict:
+def row_of(sampler: str, steps: int, frechet: Estimate, cars: float = 10.0, scaling: float = 1.0) -> dict:
     validity = {name: {"generated": Estimate(0.5, 0.4, 0.6)} for name in ("road_connectivity", "overlapping")}
+    counts = {"car": (20.0, cars), "tree": (50.0, 45.0), "human": (0.2, 0.0)}
     scores = {
         "scenes": {"real": 6, "generated": 6},
+        "statistics": {
+            f"num_{name}": {
+                side: Estimate(n, n - 1, n + 1) for side, n in zip(("real", "generated"), pair, strict=True)
+            }
+            for name, pair in counts.items()
+        },
         "layout_frechet": frechet,
         "random_frechet": frechet,
         "validity": validity | {"sunken": {"generated": None}},
     }
     scores |= {f"random_{name}_k3": Estimate(0.3, 0.2, 0.4) for name in ("precision", "recall")}
-    return sampler_row(sampler, steps, 2.0, scores)
+    return sampler_row(sampler, steps, scaling, 2.0, scores)
 
 
 def test_few_steps_are_held_against_the_papers_sampler_with_most():
@@ -67,7 +74,18 @@ def test_few_steps_are_held_against_the_papers_sampler_with_most():
     assert near["seconds_per_scene"] == 2 and near["layout_frechet_high"] == 3.2 and near["sunken"] is None
     assert reference_row(rows) is paper and reference_row([near, row_of("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
     assert as_good_as(near, paper) and not as_good_as(far, paper)
+    assert as_good_as(row_of("dpm++", 20, Estimate(0.5, 0.4, 0.6)), paper)  # better is as good
+    assert (near["count_category"], near["count_ratio"], near["count_ratio_low"]) == (
+        "car",
+        0.5,
+        0.45,
+    )  # humans are few
+    more = [row_of("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
+    assert [as_good_as(row, paper) for row in more] == [True, True, False]
     assert [row[-1] for row in sampler_table(rows).rows] == ["no", "–", "yes"]
     (layout, *_), page = sampler_charts(rows), sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
-    assert page.count("<svg") == 4 and "as ddpm of 250" in page
+    assert page.count("<svg") == 4 and "as good as ddpm of 250" in page
+    scaled = row_of("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
+    assert reference_row([*rows, scaled]) is paper  # the paper divides by nothing
+    assert sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
