@@ -5,7 +5,7 @@
     jobs/inpaint_scenes.py --half-plane 1 0 32 --variants 4             everything at least 32 m ahead, four times
     jobs/inpaint_scenes.py --objects 3 17 --contents objects            around primitives 3 and 17; the ground stays
     jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects      new objects on the given ground
-    jobs/inpaint_scenes.py --polygon-m ... --steps 50 --resamplings 1 --known-guidance 1      quick, and joins well
+    jobs/inpaint_scenes.py --polygon-m ... --guided                     quick, and joins well
 
 Regions grow to whole latent cells. Writes the same tables, source=generated-<run>, a GLB of each scene, and <run>.html.
 """

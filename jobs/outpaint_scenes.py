@@ -5,7 +5,7 @@
     jobs/outpaint_scenes.py --extent-m 512 512 --actors 8         half a kilometre by half a kilometre of it
     jobs/outpaint_scenes.py --ahead 9 --behind 0 --left 0 --right 0     on along its street
     jobs/outpaint_scenes.py --input DIR --source town --split test --limit 8 --actors 2
-    jobs/outpaint_scenes.py --steps 50 --resamplings 1 --known-guidance 1     quick, and joins well
+    jobs/outpaint_scenes.py --guided                                          quick, and joins well
 
 Writes the same tables, source=generated-<run>, one scene and one GLB for each scene, and block_tables/ with what is known
 of each block. Blocks are made as soon as those they must know are there, the same ones whatever the number of actors.

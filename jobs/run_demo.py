@@ -180,8 +180,7 @@ def main(config: Config) -> None:
                 limit=1,
                 seed=config.seed,
                 steps=config.outpaint_steps,
-                resamplings=1,
-                known_guidance=1.0,
+                guided=True,
             )
         ),
     )

@@ -2,10 +2,10 @@
 """What does outpainting need? The same scenes extended with many and few steps and resamplings, and guided; their seams.
 
     jobs/sweep_seams.py --limit 50                                          50 generated scenes, 200 seams a setting
-    jobs/sweep_seams.py --limit 50 --settings 250 10 10 0 50 1 1 1          steps, jump length, resamplings and
-                                                                            guidance by what is known, in fours
+    jobs/sweep_seams.py --limit 50 --settings 250 10 10 0 1 50 1 1 1 0      steps, jump length, resamplings, guidance by
+                                                                            what is known and eta, in fives
 
-The paper's is 250 10 10 0: 2,410 network evaluations a block. Writes the scenes (source=generated-<the four numbers>),
+The paper's is 250 10 10 0 1: 2,410 network evaluations a block. Writes the scenes (source=generated-<the five numbers>),
 sweep.json, sweep.parquet and sweep.html. Run it again with the same options to go on after an interruption.
 """
 
@@ -20,10 +20,11 @@ from jobs.given_scenes import GivenScenes, pipeline_directory
 
 @dataclass(frozen=True)
 class Config(GivenScenes):
-    settings: tuple[tuple[int, int, int, float], ...] = (
-        (250, 10, 10, 0), (250, 5, 5, 0), (250, 1, 1, 0), (50, 10, 10, 0), (50, 5, 5, 0), (50, 1, 1, 0), (50, 1, 1, 1)
+    settings: tuple[tuple[int, int, int, float, float], ...] = (
+        (250, 10, 10, 0, 1), (250, 5, 5, 0, 1), (250, 1, 1, 0, 1), (50, 10, 10, 0, 1), (50, 5, 5, 0, 1), (50, 1, 1, 0, 1),
+        (50, 1, 1, 1, 1), (50, 1, 1, 1, 0),
     )  # fmt: skip
-    """Steps, jump length, resamplings and known guidance, in fours."""
+    """Steps, jump length, resamplings, known guidance and eta (1: steps with DDPM's noise, 0: without), in fives."""
     overlap: float = 0.5
     """Of neighbouring blocks."""
     mode: Literal["reencode", "copy"] = "reencode"
@@ -38,7 +39,7 @@ def sweep_seams(config: Config) -> list[dict]:
     """Outpaint, measure, write and return a row per setting."""
     model = pipeline_directory(config.model)
     if not config.settings:
-        raise ValueError("no --settings: expected steps, jump length, resamplings and known guidance, in fours")
+        raise ValueError("no --settings: expected steps, jump length, resamplings and known guidance and eta, in fives")
     import pyarrow as pa
     from rich.progress import Progress
 
@@ -48,7 +49,7 @@ def sweep_seams(config: Config) -> list[dict]:
     from pipelines.outpaint import OutpaintRequest, outpaint_scenes
     from pipelines.report import Picture
     from pipelines.scenes.tables import read_scenes
-    from pipelines.seam_sweep import seam_row, seam_sweep_html
+    from pipelines.seam_sweep import objects_per_ha, seam_row, seam_sweep_html
     from pipelines.seams import Lines, measure, with_lines
     from pipelines.selection import Selection
 
@@ -77,7 +78,9 @@ def sweep_seams(config: Config) -> list[dict]:
             done = bar.add_task(f"{name}, blocks", total=8 * count)
             outpaint_scenes(request, selection, config.actors, lambda blocks, task=done: bar.advance(task, blocks))
             measured = measure(Selection(output, request.source), Lines(), config.actors)
-            rows.append(seam_row(request.resampling, int(measured.seams.sum()), seam_ratios(measured.records)))
+            objects = objects_per_ha(read_scenes(output, request.source))
+            seams = int(measured.seams.sum())
+            rows.append(seam_row(request.resampling, seams, objects, seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
             pictures.append(Picture(first.scene_id, with_lines(first, Lines()), name))
     storage.write_json(rows, storage.join(output, "sweep.json"))

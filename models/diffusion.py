@@ -49,10 +49,13 @@ class Diffusion:
 
 
 class Walk:
-    """The visited timesteps of one sampling run, with every transition between their states."""
+    """The visited timesteps of one sampling run, with every transition between their states.
 
-    def __init__(self, diffusion: Diffusion, num_steps: int) -> None:
-        self.timesteps = diffusion.visited(num_steps)
+    `eta` is DDIM's (Song et al., 2021): how much of the noise of DDPM's steps there is, 1 in the paper, 0 for none.
+    """
+
+    def __init__(self, diffusion: Diffusion, num_steps: int, eta: float = 1.0) -> None:
+        self.timesteps, self.eta = diffusion.visited(num_steps), eta
         self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # [-1] is the clean state
 
     def __len__(self) -> int:
@@ -75,17 +78,15 @@ class Walk:
         return ratio**0.5 * latent + (1 - ratio) ** 0.5 * noise
 
     def down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
-        """p(z_{state-1} | z_state): posterior mean from the predicted noise, posterior variance.
+        """p(z_{state-1} | z_state): with eta 1 mean and variance of the posterior, from the predicted noise.
 
         Written through z_0 so that it holds for spaced timesteps (beta = 1 - alpha_bar_i / alpha_bar_{i-1}).
         """
         a, a_prev = self.alpha_bar[state], self.alpha_bar[state - 1]
-        beta = 1 - a / a_prev
+        variance = self.eta**2 * (1 - a_prev) / (1 - a) * (1 - a / a_prev)
         clean = (latent - (1 - a) ** 0.5 * predicted_noise) / a**0.5
-        mean = a_prev**0.5 * beta / (1 - a) * clean + (a / a_prev) ** 0.5 * (1 - a_prev) / (1 - a) * latent
-        if state == 0:
-            return mean
-        return mean + ((1 - a_prev) / (1 - a) * beta) ** 0.5 * noise
+        mean = a_prev**0.5 * clean + (1 - a_prev - variance) ** 0.5 * predicted_noise
+        return mean if state == 0 else mean + variance**0.5 * noise
 
 
 # What noise is drawn for: the same scene number must not start generation and outpainting from the same noise.
@@ -167,7 +168,7 @@ def sample(
     on_step: OnStep | None = None,
     known_guidance: float = 0.0,
 ) -> Float[Tensor, "b c h w"]:
-    """Clean latents, by DDPM ancestral sampling along `transitions` (plain by default).
+    """Clean latents, by ancestral sampling along `transitions` (plain by default): DDPM's, or the walk's eta of its noise.
 
     Downward, the model denoises; upward, noise is added back (RePaint). With `known`, the known part is noised to
     the state just reached and pasted in after each downward step. Differs from the paper, which prints the level

@@ -85,15 +85,24 @@ def scheduler() -> DDPMScheduler:
 class Resampling:
     """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps; default: the paper's.
 
-    `known_guidance`: how strongly what is made is drawn to what is known (diffusion.explaining); 0 is not at all.
+    `known_guidance`: how strongly what is made is drawn to what is known (diffusion.explaining); 0 is not at all. `eta`: how
+    much noise steps add (diffusion.Walk); of few steps with noise small objects get lost.
     """
 
     num_steps: int = NUM_INFERENCE_STEPS
     jump_length: int = JUMP_LENGTH
     resamplings: int = RESAMPLINGS
     known_guidance: float = 0.0
+    eta: float = 1.0
+
+    @classmethod
+    def guided(cls, num_steps: int = 50) -> Resampling:
+        """Ours: joins better than the paper's and keeps more objects, for a twenty-fourth of the work (BENCHMARKS.md)."""
+        return cls(num_steps, resamplings=1, known_guidance=1.0, eta=0.0)
 
     def __post_init__(self) -> None:
+        if not 0 <= self.eta <= 1:
+            raise ValueError(f"eta is {self.eta}, expected 0 (steps add no noise) to 1 (the paper)")
         if not 0 <= self.known_guidance < math.inf:
             raise ValueError(f"known_guidance is {self.known_guidance}, expected 0 (none) or more; 1 is its weight")
 
@@ -287,11 +296,12 @@ class PrITTIPipeline(DiffusionPipeline):
         purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
         """RePaint: latents that keep `known` bit for bit where its mask is 0 (paper, Sec. 3.3)."""
-        walk = Walk(self.diffusion, resampling.num_steps)
+        walk = Walk(self.diffusion, resampling.num_steps, resampling.eta)
         transitions = resampling.transitions()
         noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
-        model = self._denoiser(walk.timesteps, label, guidance_scale)
+        scaling = 1.0 if resampling.eta == 1 else self.config.noise_scaling
+        model = rescaled(self._denoiser(walk.timesteps, label, guidance_scale), scaling)
         with self._watched(resampling.evaluations, callback_on_step_end) as on_step:
             return sample(model, walk, noise, label, transitions, known, on_step, resampling.known_guidance)
 

@@ -134,9 +134,10 @@ class Repaint(Sampling):
     jump_length: int = Field(1, ge=1, le=100)
     resamplings: int = Field(1, ge=1, le=20)
     known_guidance: float = Field(1.0, ge=0, le=10)
+    eta: float = Field(0.0, ge=0, le=1)
 
     def resampling(self) -> Resampling:
-        return Resampling(self.steps, self.jump_length, self.resamplings, self.known_guidance)
+        return Resampling(self.steps, self.jump_length, self.resamplings, self.known_guidance, self.eta)
 
 
 class Inpaint(Repaint):

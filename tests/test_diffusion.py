@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import RePaintScheduler
+from diffusers import DDIMScheduler, RePaintScheduler
 
 from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
@@ -35,6 +35,17 @@ def test_every_step_is_diffusers_ddpm(steps):
         want = reference.step(predicted, t, latent, generator=torch.Generator().manual_seed(state)).prev_sample
         assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
     assert walk.timesteps[-1] == (996 if steps == 250 else walk.timesteps[-1])
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
+def test_every_step_of_less_noise_is_diffusers_ddim(eta):
+    reference, walk = DDIMScheduler.from_config(scheduler().config), Walk(Diffusion(), 50, eta)
+    reference.set_timesteps(50)
+    latent, predicted, noise = torch.randn(3, 2, *SHAPE)
+    for state, _ in walk.plain()[:-1]:
+        t = int(walk.timesteps[state])
+        want = reference.step(predicted, t, latent, eta=eta, variance_noise=noise if eta else None).prev_sample
+        assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
 
 
 def test_forward_noise_is_diffusers():

@@ -129,12 +129,12 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
             model,
             str(samples),
             "generated-samples",
-            settings=((4, 2, 2, 0.0), (4, 1, 1, 1.0)),
+            settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
             output=str(tmp_path / "sweep"),
         )
     )
     assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
-    assert guided["evaluations"] == 4 and guided["known_guidance"] == 1
+    assert guided["evaluations"] == 4 and guided["known_guidance"] == 1 and guided["objects_per_ha"] > 0
     assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)]
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 2
 

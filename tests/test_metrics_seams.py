@@ -10,7 +10,7 @@ from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Grid
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.seams import MEASURES, footprint_ranges, neighbours, seam_ratios, seam_record
-from pipelines.seam_sweep import seam_row, seam_sweep_html, seam_table
+from pipelines.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
 
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
@@ -120,8 +120,11 @@ def test_a_seam_on_the_edge_is_refused_and_an_empty_scene_judges_nothing():
 
 def test_a_row_of_the_sweep_says_what_a_setting_costs_and_shows():
     ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
-    row = seam_row(Resampling(), 200, ratios)
+    cars = with_cars(speckled(0), [(10, 0), (20, 3)])
+    assert objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice
+    row = seam_row(Resampling(), 200, 12.3, ratios)
     assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
     (cells,) = seam_table([row]).rows
-    assert cells[:6] == (250, 10, 10, 0.0, 2410, 200) and cells[7] == "1.20 (1.00 to 1.50)" and cells[8] is None
+    assert cells[:8] == (250, 10, 10, 0.0, 1.0, 2410, 12, 200)
+    assert cells[9] == "1.20 (1.00 to 1.50)" and cells[10] is None
     assert "2410" in seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")

@@ -11,7 +11,7 @@ from scenes import random_scene, small_spec, tiny_pipeline
 from test_diffusion import SHAPE
 
 from models.borders import continued
-from models.diffusion import Diffusion, SceneNoise, Walk, rescaled, sample, solve
+from models.diffusion import Diffusion, Known, SceneNoise, Walk, rescaled, sample, solve
 from models.dit import DiT
 from models.inpaint import cells_of, composited, half_plane_region, latent_mask, object_region, polygon_region
 from models.lvae import LayoutVAE
@@ -112,6 +112,23 @@ def test_scaled_noise_is_the_pipelines_own_and_leaves_the_papers_sampler_alone(p
     with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 1 \(none\) or a little more"):
         drawn("dpm++", noise_scaling=2.0)
     pipeline.use_sampler("ddpm")
+
+
+def test_guided_resampling_takes_the_pipelines_scaling_and_the_papers_none(pipeline):
+    mask = torch.zeros(1, *pipeline.lvae.latent_shape)
+    mask[..., :4] = 1
+
+    def raw(resampling, scaling):
+        pipeline.register_to_config(noise_scaling=scaling)
+        made = pipeline.complete(Known(torch.ones_like(mask), mask), ["low"], 0, [0], resampling)
+        pipeline.register_to_config(noise_scaling=1.0)
+        return made
+
+    assert torch.equal(raw(QUICK, 1.0), raw(QUICK, 1.01))
+    assert not torch.equal(raw(Resampling.guided(6), 1.0), raw(Resampling.guided(6), 1.01))
+    assert Resampling.guided().evaluations == 50
+    with pytest.raises(ValueError, match="eta is 2, expected 0"):
+        Resampling(eta=2)
 
 
 def test_scaling_undoes_what_a_model_says_too_much():
@@ -251,8 +268,6 @@ def test_given_ground_is_decoded_the_same_to_the_last_bit(pipeline):
 
 
 def test_the_known_latent_comes_back_bit_for_bit(pipeline):
-    from models.diffusion import Known
-
     scene = random_scene(6, n=30, grid=SPEC.grid)
     known = pipeline.encode([scene])
     mask = latent_mask([polygon_region(SPEC.grid, [(10, -20), (50, 0), (30, 25)])], pipeline.lvae.latent_shape, "both")
