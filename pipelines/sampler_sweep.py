@@ -28,9 +28,8 @@ def count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
     """The common category whose mean count is furthest from the real one, and generated over real; None without one."""
     ratios = {}
     for name, sides in statistics.items():
-        real = sides["real"].value
-        if name.startswith("num_") and real >= COMMON:
-            ratios[name.removeprefix("num_")] = Estimate(*(value / real for value in sides["generated"]))
+        if name.startswith("num_") and sides["real"].value >= COMMON:
+            ratios[name.removeprefix("num_")] = Estimate(*(end / sides["real"].value for end in sides["generated"]))
     return max(ratios.items(), key=lambda one: off(one[1].value)) if ratios else None
 
 
