@@ -39,7 +39,7 @@ def sweep_seams(config: Config) -> list[dict]:
     """Outpaint, measure, write and return a row per setting."""
     model = pipeline_directory(config.model)
     if not config.settings:
-        raise ValueError("no --settings: expected steps, jump length, resamplings and known guidance and eta, in fives")
+        raise ValueError("no --settings: expected steps, jump length, resamplings, known guidance and eta, in fives")
     import pyarrow as pa
     from rich.progress import Progress
 
