@@ -3,7 +3,8 @@
 python benchmarks/sampling.py                       the town presets, untrained: the work is the same
 python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
 
-CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50 steps.
+CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50 steps. Memory is the
+process's peak, and what of it Python, torch and the weights are.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import resource
 import tempfile
 import time
 from dataclasses import dataclass
@@ -51,11 +53,16 @@ def untrained(preset: str) -> PrITTIPipeline:
     return pipeline
 
 
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts it in KiB
+
+
 def main(config: Config) -> None:
     pipeline = load_pipeline(config.model) if config.model else untrained(config.preset)
     print(where(), f"latents {pipeline.lvae.latent_shape}")
     known = LABELS[pipeline.dit.config.label]
     labels = [known[k % len(known)] for k in range(config.batch)]
+    loaded_mib = peak_mib()
     seconds: dict[str, list[float]] = {"sampling": [], "decoding": [], "writing": []}
     clock = time.process_time
     for number in range(config.rounds + 1):
@@ -75,6 +82,7 @@ def main(config: Config) -> None:
         print(f"{name}: {spread(found, 1e3, 1)} ms a scene")
     after = [(d + w) / s for s, d, w in zip(*seconds.values(), strict=True)]
     print(f"after sampling / sampling, {config.steps} steps: {spread(after, 100, 1)} %; {len(scenes[0])} primitives")
+    print(f"memory: {peak_mib():.0f} MiB at most, {loaded_mib:.0f} of it before the first scene")
 
 
 if __name__ == "__main__":

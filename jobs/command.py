@@ -68,6 +68,13 @@ def start_ray(training: bool = False) -> None:
         logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
 
+def run_packed(config: dict[str, bytes]) -> None:
+    """What Ray Train calls in its workers. Its controller unpickles it too, and need not import the models for that."""
+    from ray import cloudpickle
+
+    cloudpickle.loads(config["packed"])()
+
+
 def root_cause(error: BaseException) -> BaseException:
     """The exception that user-facing text should come from: Ray wraps a worker's error several times.
 

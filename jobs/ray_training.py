@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import ray.train.torch
 import torch
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 
-from jobs.command import root_cause, start_ray
+from jobs.command import root_cause, run_packed, start_ray
 from jobs.tracking import Tracker
 from models.training import NotFinite, Optimisation, Trainer
 from pipelines import storage
@@ -58,14 +59,13 @@ def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     }
 
 
-def train_worker(config: dict[str, Any]) -> None:
+def train_worker(run: TrainingRun, threads: int) -> None:
     """What every worker runs: batches -> steps, with a log line, a checkpoint and a validation now and then."""
     logging.getLogger("ray.train").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    run: TrainingRun = config["run"]
     context = ray.train.get_context()
     rank, world = context.get_world_rank(), context.get_world_size()
-    torch.set_num_threads(config["threads"])
+    torch.set_num_threads(threads)
     device = ray.train.torch.get_device()
     wrap = ray.train.torch.prepare_model if world > 1 else lambda model: model
     trainer = run.build(device, wrap)
@@ -158,9 +158,10 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     """
     start_ray(training=True)
     scaling = scaling_for(num_workers, run.stream.batch_size)
+    threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
     trainer = ray.train.torch.TorchTrainer(
-        train_worker,
-        train_loop_config={"run": run, "threads": max(1, int(ray.cluster_resources()["CPU"]) // num_workers)},
+        run_packed,
+        train_loop_config={"packed": ray.cloudpickle.dumps(partial(train_worker, run, threads))},
         scaling_config=scaling,
         run_config=RunConfig(
             name=run.name,

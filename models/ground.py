@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from diffusers.models.autoencoders.vae import Decoder, Encoder
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -31,6 +30,8 @@ class GroundEncoder(nn.Module):
         attention: bool,
         shortcut: bool,
     ) -> None:
+        from diffusers.models.autoencoders.vae import Encoder  # imports for a second, which only this needs
+
         super().__init__()
         self.fold = nn.PixelUnshuffle(fold)
         self.net = Encoder(
@@ -68,6 +69,8 @@ class GroundDecoder(nn.Module):
         attention: bool,
         shortcut: bool,
     ) -> None:
+        from diffusers.models.autoencoders.vae import Decoder  # imports for a second, which only this needs
+
         super().__init__()
         self.net = Decoder(
             in_channels=latent_channels,
