@@ -66,7 +66,7 @@ class Config:
     compile: bool = False
     """torch.compile the model: worth its minute on a GPU."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints (default: a twentieth of the run)."""
+    """Steps between checkpoints (default: a twentieth of the run, at least four)."""
     seed: int = 0
 
 
@@ -169,7 +169,7 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         settings=settings,
         identity=identity,
         tracker=tracker,
-        checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
+        checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label),
     )

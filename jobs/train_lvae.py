@@ -54,7 +54,7 @@ class Config:
     compile: bool = False
     """torch.compile the model: worth its minute on a GPU."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints (default: a twentieth of the run)."""
+    """Steps between checkpoints (default: a twentieth of the run, at least four)."""
     flip: bool = False
     """Augmentation: mirror half of the scenes left to right."""
     jitter: bool = False
@@ -150,7 +150,7 @@ def prepare(config: Config) -> TrainingRun:
         settings=settings,
         identity=identity,
         tracker=tracker,
-        checkpoint_every=config.checkpoint_every or max(1, settings.steps // 20),
+        checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
         validate=ReconstructionCheck(root, dataset.source, kl_weight),
     )
