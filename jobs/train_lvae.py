@@ -4,6 +4,7 @@
     jobs/train_lvae.py                      the town preset on $PRITTI_HOME/datasets/town
     jobs/train_lvae.py smoke                seconds; makes its own data
     jobs/train_lvae.py kitti360 --dataset DIR --workers 4
+    jobs/train_lvae.py demo --keep-latents-of town --name lvae-decoder     another object decoder for a trained pipeline
 
 Run it again with the same options to resume. Losses and pictures go to MLflow ($MLFLOW_TRACKING_URI, default an
 sqlite file under $PRITTI_HOME).
@@ -17,10 +18,15 @@ from typing import TYPE_CHECKING
 import tyro
 
 from jobs.command import absolute, home, run
+from jobs.given_scenes import pipeline_directory
 
 if TYPE_CHECKING:
-    from jobs.ray_training import TrainingRun
+    from torch import Tensor
 
+    from jobs.ray_training import TrainingRun
+    from models.layout import LayoutSpec
+
+OF_OBJECT_DECODER = ("decoder", "head_hidden", "least_per_cell")  # parts of an architecture
 START_SCENES, START_SHARDS = 96, 16  # the sample of training scenes that says where outputs start
 
 
@@ -36,6 +42,10 @@ class Config:
     """Name of the run (default: lvae-<preset>). Another name is another run."""
     output: str = ""
     """Where the trained model goes (default: $PRITTI_HOME/models/<name>)."""
+    keep_latents_of: str = ""
+    """A trained pipeline, named as for --model: its encoders and ground decoder stay what they are and only the object
+    decoder is trained, anew. Its transformer knows the latents still: with the new decoder it goes to
+    $PRITTI_HOME/models/pritti-<name>."""
     workers: int = 1
     """Ray Train workers; with GPUs, one each."""
     steps: int | None = None
@@ -129,6 +139,8 @@ def prepare(config: Config) -> TrainingRun:
         layout=spec.fingerprint(),
         dataset=root,
     ) | ({"augmentation": asdict(augment)} if config.flip or config.jitter else {})
+    kept = kept_latents(config.keep_latents_of, row.architecture(), spec) if config.keep_latents_of else None
+    identity |= {"start_from": kept.digest} if kept else {}
     record = claim(name, home("runs"), identity)
     parameters = identity | {"architecture": row.architecture()}
     tracker = Tracker.start("pritti-lvae", name, parameters, record)
@@ -144,6 +156,7 @@ def prepare(config: Config) -> TrainingRun:
             latent_noise,
             execution,
             sample_layouts(shards, counts, spec),
+            kept,
         ),
         stream=Stream(tuple(shards), tuple(counts), batch_size, config.seed),
         reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
@@ -157,11 +170,55 @@ def prepare(config: Config) -> TrainingRun:
 
 
 def train(config: Config) -> str:
-    """Train and return the model's directory."""
+    """Train and return the directory of the model, of the pipeline where one was given."""
     training = prepare(config)
     from jobs.ray_training import fit
 
-    return fit(training, config.workers, absolute(config.output) if config.output else home("models", training.name))
+    output = absolute(config.output) if config.output else home("models", training.name)
+    fit(training, config.workers, output)
+    return renewed_pipeline(config.keep_latents_of, output, training.name) if config.keep_latents_of else output
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The weights of a trained layout VAE whose latents stay."""
+
+    digest: str
+    state: dict[str, Tensor]
+
+
+def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
+    """The layout VAE of a trained pipeline. Raises ValueError if its encoders or its layout are not this run's."""
+    from pipelines.encode import load_lvae, weights_digest
+
+    directory = pipeline_directory(model)
+    lvae = load_lvae(f"{directory}/lvae")
+    if lvae.spec.fingerprint() != spec.fingerprint():
+        raise ValueError(f"--keep-latents-of {model}: it knows another layout than this dataset; choose its own dataset")
+    for key, wanted in architecture.items():
+        built = lvae.config[key]
+        if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
+            raise ValueError(
+                f"--keep-latents-of {model}: its {key} is {built}, this preset's {wanted}; choose its own preset"
+            )
+    return Kept(weights_digest(lvae), lvae.state_dict())
+
+
+def renewed_pipeline(model: str, lvae: str, name: str) -> str:
+    """Put a trained pipeline with another layout VAE, of the same latents, where pipelines are; its directory."""
+    import tempfile
+
+    from jobs.ray_training import publish_directory
+    from pipelines.encode import load_lvae
+    from pipelines.generate import load_pipeline
+
+    pipeline = load_pipeline(pipeline_directory(model))
+    pipeline.register_modules(lvae=load_lvae(lvae))
+    output = home("models", f"pritti-{name}")
+    with tempfile.TemporaryDirectory() as directory:
+        pipeline.save_pretrained(directory)
+        publish_directory(directory, output)
+    return output
 
 
 def sample_layouts(shards: list, counts: list[int], spec) -> dict:
@@ -185,6 +242,7 @@ def build(
     latent_noise: float,
     execution,
     sample: dict,
+    kept: Kept | None,
     device,
     wrap,
 ):
@@ -199,6 +257,8 @@ def build(
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
     model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
+    if kept:
+        model.keep_latents_of(kept.state)
     return lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)
 
 

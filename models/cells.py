@@ -26,14 +26,18 @@ SPARE = 16  # proposals per slot, where MAX_PER_CELL allows them: primitives cro
 class CellDecoder(nn.Module):
     """Object latent -> normalised features in [0, 1] and existence logits of `proposals[k]` primitives per category.
 
-    SPARE times as many proposals as slots where cells allow it, one to MAX_PER_CELL per cell and category. Cells are
-    read one by one, by the same small network: its neighbours know nothing of a primitive that the cell does not.
+    SPARE times as many proposals as slots where cells allow it, `least_per_cell` to MAX_PER_CELL per cell and category:
+    rare things, too, come in groups. Cells are read one by one, by the same small network: its neighbours know nothing
+    of a primitive that the cell does not.
     """
 
-    def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, hidden: int) -> None:
+    def __init__(
+        self, slots: tuple[int, ...], latent_channels: int, latent_size: int, hidden: int, least_per_cell: int = 1
+    ) -> None:
         super().__init__()
         cells = latent_size**2
-        self.per_cell = tuple(min(MAX_PER_CELL, max(1, math.ceil(SPARE * count / cells))) for count in slots)
+        wanted = (max(least_per_cell, math.ceil(SPARE * count / cells)) for count in slots)
+        self.per_cell = tuple(min(MAX_PER_CELL, count) for count in wanted)
         self.proposals = tuple(count * cells for count in self.per_cell)
         self.match_weights = MatchWeights(existence=1.0)
         self.net = nn.Sequential(

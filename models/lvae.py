@@ -74,6 +74,7 @@ INITIAL_LOGVAR = -4.0
 SOLVED_LOGVAR = -8.0  # of a ground that starts solved (ground.py): sigma 0.018
 
 BRANCHES = ("both", "ground", "objects")
+OBJECT_DECODER = "object_decoder."  # how its parameters' names begin
 EMPTY_LOGIT = -6.0  # occupancy where there is no ground branch
 
 
@@ -87,7 +88,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
 
     `layout` is a LayoutSpec as a dict, so that a saved model inverts its own outputs. h = w = raster pixels /
     (fold 2^(len(channels) - 1)). `fold`, `attention` and `shortcut`: ground.py and objects.py. `decoder` is the paper's
-    DETR or `cells`: proposals of each latent cell (cells.py).
+    DETR or `cells`: proposals of each latent cell, `least_per_cell` or more of each category (cells.py).
 
     The paper's ablations: without `split_latent` both decoders read the joint latent; with `branches` ground or
     objects there is that branch alone, its latent has c channels, and the other side of a layout comes out empty.
@@ -111,6 +112,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         shortcut: bool = False,
         split_latent: bool = True,
         branches: str = "both",
+        least_per_cell: int = 1,
     ) -> None:
         super().__init__()
         if branches not in BRANCHES:
@@ -143,7 +145,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
             if decoder == "detr":
                 self.object_decoder = ObjectDecoder(spec.slots, seen, *body, head_hidden)
             elif decoder == "cells":
-                self.object_decoder = CellDecoder(spec.slots, seen, size, head_hidden)
+                self.object_decoder = CellDecoder(spec.slots, seen, size, head_hidden, least_per_cell)
             else:
                 raise ValueError(f"LayoutVAE: decoder is {decoder!r}, expected 'detr' (the paper's) or 'cells'")
             with torch.no_grad():
@@ -164,6 +166,17 @@ class LayoutVAE(ModelMixin, ConfigMixin):
         features = torch.stack([f[r].mean(dim=0) if r.any() else f.new_full((FEATURES,), 0.5) for f, r in groups])
         count = torch.stack([r.sum() / len(r) for _, r in groups])
         self.object_decoder.start_at(logit(features), count)
+
+    def keep_latents_of(self, state: dict[str, Tensor]) -> None:
+        """Take all but the object decoder from the weights of a model of the same encoders; only that decoder trains on.
+
+        What the decoder is trained to read is then what another model, trained on those latents, writes.
+        """
+        mine = {name: value for name, value in self.state_dict().items() if name.startswith(OBJECT_DECODER)}
+        theirs = {name: value for name, value in state.items() if not name.startswith(OBJECT_DECODER)}
+        self.load_state_dict(theirs | mine)
+        for name, parameter in self.named_parameters():
+            parameter.requires_grad_(name.startswith(OBJECT_DECODER))
 
     def learning_rates(self) -> dict[str, float]:
         """Shares of the learning rate, by beginning of a parameter's name: what starts solved must not be shaken."""

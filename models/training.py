@@ -180,7 +180,7 @@ class Trainer:
     ) -> None:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or Execution()
-        self.parameters = dict(model.named_parameters())
+        self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
         rates = getattr(model, "learning_rates", dict)()  # of parts whose rate is not everybody's, by name's beginning
         share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
         groups = [

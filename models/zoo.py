@@ -24,6 +24,7 @@ class LVAEPreset:
     batch_size: int
     steps: int
     decoder: str = "detr"  # the paper's, or "cells"
+    least_per_cell: int = 1  # proposals of cells, per category
     attention: bool = True  # in the middle of the ground networks
     shortcut: bool = False  # ways past the ground networks and the object encoder; not in the paper
     learning_rate: float = 1e-4
@@ -50,15 +51,15 @@ LVAE_PRESETS = {
     "smoke":    LVAEPreset("town",      32,  4,  (8, 16, 16),         4,     1,   32,   1,     2,    64,    32,  4,     8,
                            learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, 16, (32, 64),            8,     4,   128,  2,     4,    256,   256, 8,     5_000,
-                           decoder="cells", attention=False, shortcut=True, latent_noise=0.3, **QUICK),
+                           decoder="cells", least_per_cell=3, attention=False, shortcut=True, latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, 32, (32,),               8,     8,   128,  2,     4,    256,   256, 8,     2_000,
-                           decoder="cells", attention=False, shortcut=True, kl_weight=1e-7, **QUICK),
+                           decoder="cells", least_per_cell=3, attention=False, shortcut=True, kl_weight=1e-7, **QUICK),
     # The paper gives three days on one A100, not a number of steps.
     "kitti360": LVAEPreset("kitti360",  256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     "av2":      LVAEPreset("av2",       256, 32, (64, 128, 256, 512), 32,    1,   512,  6,     8,    1024,  1024, 32,   300_000),
     # The paper's object encoder with the town's ground branch and cells: the same latent from a fraction of the work.
     "kitti360-light": LVAEPreset("kitti360", 256, 32, (32,),          8,     8,   512,  6,     8,    1024,  1024, 32,   300_000,
-                           decoder="cells", attention=False, shortcut=True, **QUICK | {"learning_rate": 1e-3}),
+                           decoder="cells", least_per_cell=3, attention=False, shortcut=True, **QUICK | {"learning_rate": 1e-3}),
 }
 
 

@@ -38,6 +38,15 @@ def test_of_two_in_one_place_the_surer_stays():
     assert repeated(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [False, False]  # 1 / 7: a fence goes on
 
 
+def test_cars_never_share_room_and_houses_share_a_wall():
+    for category, both_stay in (("vehicle_small", False), ("vehicle_big", False), ("construction_big", True)):
+        assert repeated(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [False, not both_stay]  # 1 / 7
+        assert not repeated(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
+        assert repeated(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [False, True]  # 1 / 3
+        near, known = row_of_boxes([3], [0.9], category), row_of_boxes([0], [0.6], category)
+        assert doubles(near, known).tolist() == [not both_stay]
+
+
 def test_what_is_dropped_drops_nothing():
     # The middle one overlaps both others by 1 / 3, they overlap each other by nothing.
     assert repeated(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]

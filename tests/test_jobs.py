@@ -133,6 +133,26 @@ def test_two_workers_train_the_lvae(home):
     assert distance < 1e-2, distance
 
 
+def test_an_object_decoder_is_trained_anew_under_a_trained_transformer(home):
+    from jobs.train_lvae import Config, train
+
+    kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
+    assert train(Config(preset="smoke", name="decoder", keep_latents_of=str(kept))) == str(output)
+    old, new = weights(kept / "lvae"), weights(output / "lvae")
+    changed = {name for name in old if (old[name] != new[name]).any()}
+    assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
+    assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
+    with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
+        train(
+            Config(
+                preset="demo",
+                name="other",
+                dataset=str(home / "datasets/smoke"),
+                keep_latents_of=str(kept),
+            )
+        )
+
+
 def test_an_lvae_of_another_dataset_is_refused(home, tmp_path):
     from jobs.encode_latents import Config, encode
     from jobs.preprocess_scenes import Town, main
