@@ -40,6 +40,9 @@ class Config:
     noise_scaling: float | None = None
     """Divide the network's noise by this: a little above 1 brings back small and rare things that sampling loses (default: what
     the model was published with; 1 with ddpm)."""
+    repair: bool = False
+    """Put what floats or is sunken onto the ground and push apart what overlaps; nothing is taken out (as jobs/edit_scenes.py
+    repair --no-drop)."""
     actors: int = 1
     """Pipelines at work at once; one per GPU."""
     batch_size: int = 8
@@ -75,6 +78,7 @@ def sample(config: Config) -> str:
         guidance_scale=config.guidance,
         sampler=config.sampler,
         noise_scaling=config.noise_scaling,
+        repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )
     start_ray()

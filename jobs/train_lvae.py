@@ -193,14 +193,14 @@ def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
 
     directory = pipeline_directory(model)
     lvae = load_lvae(f"{directory}/lvae")
-    if lvae.spec.fingerprint() != spec.fingerprint():
-        raise ValueError(f"--keep-latents-of {model}: it knows another layout than this dataset; choose its own dataset")
     for key, wanted in architecture.items():
         built = lvae.config[key]
         if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
             raise ValueError(
                 f"--keep-latents-of {model}: its {key} is {built}, this preset's {wanted}; choose its own preset"
             )
+    if lvae.spec.fingerprint() != spec.fingerprint():
+        raise ValueError(f"--keep-latents-of {model}: it knows another layout than this dataset; choose its own dataset")
     return Kept(weights_digest(lvae), lvae.state_dict())
 
 

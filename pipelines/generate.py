@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 
+import numpy as np
 import torch
 from diffusers.utils.logging import disable_progress_bar
 
@@ -18,6 +19,8 @@ from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.claims import claim
 from pipelines.encode import weights_digest
+from pipelines.metrics.validity import slab_offset_m
+from pipelines.scenes.edit import Repair
 from pipelines.scenes.tables import Shard
 from pipelines.work import fan_out
 
@@ -49,6 +52,7 @@ class SampleRequest(Request):
     guidance_scale: float
     sampler: str = "ddpm"
     noise_scaling: float | None = None  # None: the model's own
+    repair: bool = False  # onto the ground and apart, nothing taken out (scenes/edit.py)
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:
@@ -112,6 +116,7 @@ class Sampler:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
+        self.repair = Repair(slab_offset_m=slab_offset_m(self.pipeline.spec.surface), drop=False)
 
     def __call__(self, row: dict) -> dict:
         request, started = self.request, time.perf_counter()
@@ -129,6 +134,8 @@ class Sampler:
                 noise_scaling=request.noise_scaling,
                 run=request.run,
             )
+        if request.repair:
+            scenes = [self.repair.applied(scene, np.ones(len(scene), bool))[0] for scene in scenes]
         shard.write(scenes)
         return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
 

@@ -108,8 +108,9 @@ class _Parting:
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
-        now, then = iou3d_matrix(self.now.take(pair), around), iou3d_matrix(after, around)
-        return bool(((then > GOAL_IOU3D) & (then > now)).any())
+        then = iou3d_matrix(after, around)
+        hit = then > GOAL_IOU3D
+        return bool(hit.any() and (hit & (then > iou3d_matrix(self.now.take(pair), around))).any())
 
 
 def superfluous(scene: Scene, chosen: np.ndarray) -> np.ndarray:
