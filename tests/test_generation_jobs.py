@@ -56,6 +56,31 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
         sample(replace(config, run="x", labels=("dense",)))
 
 
+def test_what_is_sampled_can_be_repaired(tmp_path):
+    from jobs.sample_scenes import Config, sample
+    from pipelines.metrics.validity import SLAB_OFFSET_M, faults
+
+    config = Config(model="town", output=str(tmp_path), num_scenes=4, steps=10, sampler="dpm++", batch_size=4, glb=0)
+    scenes = {}
+    for repair in (False, True):
+        sample(replace(config, run=f"repair-{repair}", repair=repair))
+        scenes[repair] = list(read_scenes(str(tmp_path), source=f"generated-repair-{repair}"))
+    number = {
+        repair: {
+            name: sum(faults(s, SLAB_OFFSET_M)[name][0].sum() for s in made)
+            for name in ("overlapping", "floating", "sunken")
+        }
+        for repair, made in scenes.items()
+    }
+    for before, after in zip(*scenes.values(), strict=True):
+        assert np.array_equal(before.category, after.category)
+    assert number[False]["floating"] > 0 and number[False]["overlapping"] > 0, number
+    assert number[True]["floating"] == number[True]["sunken"] == 0
+    assert number[True]["overlapping"] < 0.7 * number[False]["overlapping"]
+    with pytest.raises(ValueError, match="with repair=True, asked for False"):
+        sample(replace(config, run="repair-True"))
+
+
 def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
     from jobs.sweep_samplers import Config, sweep_samplers
 

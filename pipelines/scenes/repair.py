@@ -6,9 +6,7 @@ a primitive into a third one is not made.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -21,7 +19,7 @@ GOAL_IOU3D = 0.98 * OVERLAP_IOU3D  # what is pushed apart stays apart when it is
 ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # lengths of a push that are tried
-CANDIDATES = 6  # shortest pushes that are tried against everything around
+CANDIDATES = 6  # directions of the shortest pushes that are tried against everything around
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
@@ -57,8 +55,8 @@ def apart(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Sce
     """
     parting = _Parting(scene, chosen, most_m, shrink)
     for _ in range(ROUNDS):
-        for pair in overlapping_pairs(parting.now, parting.solid):
-            parting.part(pair)
+        if not parting.round():
+            break
     center_m, _, size_m = parting.now
     return replace(scene, center_m=center_m.astype(np.float32), size_m=size_m.astype(np.float32))
 
@@ -71,46 +69,71 @@ class _Parting:
         self.chosen, self.solid = chosen, np.isin(scene.category, SOLID)
         self.most_m, self.shrink = most_m, shrink
 
-    def part(self, pair: np.ndarray) -> None:
-        """Part two boxes if they can be; else nothing changes."""
+    def round(self) -> bool:
+        """Part what can be parted, each box once; did anything move?"""
+        pairs = overlapping_pairs(self.now, self.solid)
+        moved = np.zeros(len(self.solid), bool)
         for scale in (1.0, self.shrink):
-            for after in islice(self.ways(pair, scale), CANDIDATES):
-                if not self.hits_others(pair, after):
-                    self.now.center_m[pair], self.now.size_m[pair] = after.center_m, after.size_m
-                    return
+            pairs = pairs[~moved[pairs].any(axis=1)]
+            for pair, ways in zip(pairs, self.ways(pairs, scale), strict=True):
+                if len(ways.size_m) and not moved[pair].any() and len(free := np.flatnonzero(~self.hit(pair, ways))):
+                    self.now.center_m[pair], self.now.size_m[pair] = ways.center_m[free[0]], ways.size_m[free[0]]
+                    moved[pair] = True
+        return bool(moved.any())
 
-    def ways(self, pair: np.ndarray, scale: float) -> Iterator[Boxes]:
-        """The two boxes (2,) where they do not overlap, the shortest way first, within what they may move in all."""
-        start, may_move = self.now.take(pair), self.chosen[pair]
-        share = may_move * start.volume_m3[::-1]
-        if not share.any():
-            return
-        least_m = self.shrink * self.given.size_m[pair]
-        size_m = np.where(may_move[:, None], np.maximum(scale * start.size_m, least_m), start.size_m)
+    def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
+        """For each pair up to CANDIDATES places (k, 2) where its boxes do not overlap, the shortest push first.
+
+        Two boxes that overlap at both ends of a straight way overlap all along it (Brunn-Minkowski: their common volume is
+        log-concave), so a direction whose longest push does not part them is given up at once.
+        """
+        start = self.now.take(pairs)  # (p, 2, ...)
+        share = self.chosen[pairs] * start.size_m.prod(axis=2)[:, ::-1]
+        share /= np.maximum(share.max(axis=1, keepdims=True), 1e-300)
+        least_m = self.shrink * self.given.size_m[pairs]
+        size_m = np.where(self.chosen[pairs][..., None], np.maximum(scale * start.size_m, least_m), start.size_m)
         angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
         directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(DIRECTIONS)], axis=1)
-        length_m = np.arange(1, STEPS + 1) * (self.most_m / STEPS)
-        pushes_m = (length_m[:, None, None] * directions).reshape(-1, 1, 3)
-        center_m = start.center_m + (share / share.max() * [-1, 1])[:, None] * pushes_m  # (k, 2, 3)
-        moved_m = np.linalg.norm((center_m - self.given.center_m[pair])[..., :2], axis=2)
-        center_m = center_m[(moved_m <= self.most_m).all(axis=1)]
-        sides = [
-            Boxes(
-                center_m[:, k], *(np.broadcast_to(v[k], (len(center_m), *v[k].shape)) for v in (start.rotation, size_m))
-            )
-            for k in (0, 1)
-        ]
-        for k in np.flatnonzero(iou3d_pairs(*sides) < GOAL_IOU3D):
-            yield Boxes(center_m[k], start.rotation, size_m)
+        pushes_m = directions[:, None] * (np.arange(1, STEPS + 1) * (self.most_m / STEPS))[:, None]
+        to_m = share[:, None, None, :, None] * [[-1.0], [1.0]] * pushes_m[:, :, None]  # (p, directions, steps, 2, 3)
+        center_m = start.center_m[:, None, None] + to_m
+        moved_m = np.linalg.norm((center_m - self.given.center_m[pairs][:, None, None])[..., :2], axis=-1)
+        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): so far, and no farther
+        within &= share.any(axis=1)[:, None, None]
 
-    def hits_others(self, pair: np.ndarray, after: Boxes) -> bool:
-        """Would one of two boxes overlap with a third too much, and more than now?"""
+        def parted(where: np.ndarray) -> np.ndarray:
+            """(p, directions, steps) bool: of the pushes in the mask `where` those that part their pair."""
+            pair, *_ = np.nonzero(where)
+            a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
+            found = where.copy()
+            found[where] = iou3d_pairs(a, b) < GOAL_IOU3D
+            return found
+
+        longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
+        found = parted(within & parted(longest).any(axis=2, keepdims=True))
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions), STEPS: none
+        result = []
+        for k, steps in enumerate(first):
+            best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]
+            result.append(
+                Boxes(
+                    center_m[k, best, steps[best]],
+                    *(np.stack([v[k]] * len(best)) if len(best) else v[:0] for v in (start.rotation, size_m)),
+                )
+            )
+        return result
+
+    def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
+        """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
-        then = iou3d_matrix(after, around)
-        hit = then > GOAL_IOU3D
-        return bool(hit.any() and (hit & (then > iou3d_matrix(self.now.take(pair), around))).any())
+        then = iou3d_matrix(Boxes(*(part.reshape(-1, *part.shape[2:]) for part in ways)), around)
+        then = then.reshape(-1, 2, len(around.center_m))
+        over = then > GOAL_IOU3D
+        if over.any():
+            over &= then > iou3d_matrix(self.now.take(pair), around)
+        return over.any(axis=(1, 2))
 
 
 def superfluous(scene: Scene, chosen: np.ndarray) -> np.ndarray:
