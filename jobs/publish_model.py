@@ -133,6 +133,8 @@ def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
         raise ValueError(f"--evaluation {directory} is of other weights ({judged[0]}); {advice}")
     if "num_inference_steps" not in (about["sampling"] or {}):
         raise ValueError(f"--evaluation {directory} is not of scenes that jobs/sample_scenes.py made; {advice}")
+    if about["sampling"].get("repair"):
+        raise ValueError(f"--evaluation {directory} is of repaired scenes; sample without --repair to judge a model")
     return about, scores
 
 

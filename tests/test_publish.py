@@ -65,7 +65,9 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
     elsewhere.mkdir()
     (elsewhere / "dataset.json").write_text((Path(about["real"]) / "dataset.json").read_text())
     inpainted = about | {"sampling": {"weights": about["sampling"]["weights"]}}
+    repaired = about | {"sampling": about["sampling"] | {"repair": True}}
     for spoilt, less, message in (
+        (repaired, {}, "of repaired scenes; sample without --repair"),
         (other, {}, r"of other weights \(aa-bb\)"),
         (about | {"sampling": None}, {}, "of other weights"),
         (inpainted, {}, "not of scenes that jobs/sample_scenes.py made"),

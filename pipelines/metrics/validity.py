@@ -47,10 +47,13 @@ def slab_offset_m(surface: str) -> float:
     return SLAB_OFFSET_M if surface == "top" else 0.0
 
 
-def faults(scene: Scene, slab_offset_m: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def faults(
+    scene: Scene, slab_offset_m: float, tolerance_m: float = TOLERANCE_M
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """For each of MEASURES but the last: which primitives (n,) bool are at fault, and among which it is looked for.
 
-    slab_offset_m is how far the scene's ground heights lie above the surface that objects stand on (SLAB_OFFSET_M).
+    slab_offset_m is how far the scene's ground heights lie above the surface that objects stand on (SLAB_OFFSET_M);
+    tolerance_m how far off it a thing may be.
     """
     category = scene.category
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
@@ -65,8 +68,8 @@ def faults(scene: Scene, slab_offset_m: float) -> dict[str, tuple[np.ndarray, np
     drivable, road = (_mask(scene, classes)[pixel] for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
     looked_for = {
         "overlapping": (_overlapping(scene), np.isin(category, SOLID)),
-        "floating": (above_m > TOLERANCE_M, standing & known),
-        "sunken": (above_m < -TOLERANCE_M, standing & known),
+        "floating": (above_m > tolerance_m, standing & known),
+        "sunken": (above_m < -tolerance_m, standing & known),
         "over_unknown_ground": (~known, standing & inside),
         "off_road_vehicles": (~drivable, vehicles & known),
         "buildings_on_road": (road, buildings & known),

@@ -13,9 +13,11 @@ import numpy as np
 
 from models.iou3d import Boxes, boxes_of, iou3d_matrix, iou3d_pairs
 from models.scene import Scene
-from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, faults
+from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, faults
 
-GOAL_IOU3D = 0.98 * OVERLAP_IOU3D  # what is pushed apart stays apart when it is stored
+# What is mended stays so when it is stored, to millimetres.
+GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
+GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # lengths of a push that are tried
@@ -27,7 +29,7 @@ GroundFaults = Literal["both", "floating", "sunken", "none"]
 
 def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
     """Chosen (n,) primitives that float or are sunken, with their lowest point on the surface."""
-    found = faults(scene, slab_offset_m)
+    found = faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
     wrong = np.zeros(len(scene), bool)
     for name in ("floating", "sunken"):
         wrong |= chosen & found[name][0] & (which in ("both", name))
