@@ -21,6 +21,7 @@ GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # lengths of a push that are tried
+PAIRS_AT_ONCE = 256  # that are looked at together: some 50 MB
 CANDIDATES = 6  # directions of the shortest pushes that are tried against everything around
 
 
@@ -77,10 +78,12 @@ class _Parting:
         moved = np.zeros(len(self.solid), bool)
         for scale in (1.0, self.shrink):
             pairs = pairs[~moved[pairs].any(axis=1)]
-            for pair, ways in zip(pairs, self.ways(pairs, scale), strict=True):
-                if len(ways.size_m) and not moved[pair].any() and len(free := np.flatnonzero(~self.hit(pair, ways))):
-                    self.now.center_m[pair], self.now.size_m[pair] = ways.center_m[free[0]], ways.size_m[free[0]]
-                    moved[pair] = True
+            for start in range(0, len(pairs), PAIRS_AT_ONCE):
+                some = pairs[start : start + PAIRS_AT_ONCE]
+                for pair, ways in zip(some, self.ways(some, scale), strict=True):
+                    if not moved[pair].any() and len(free := np.flatnonzero(~self.hit(pair, ways))):
+                        self.now.center_m[pair], self.now.size_m[pair] = ways.center_m[free[0]], ways.size_m[free[0]]
+                        moved[pair] = True
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
@@ -117,16 +120,14 @@ class _Parting:
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]
-            result.append(
-                Boxes(
-                    center_m[k, best, steps[best]],
-                    *(np.stack([v[k]] * len(best)) if len(best) else v[:0] for v in (start.rotation, size_m)),
-                )
-            )
+            always = np.full(len(best), k)
+            result.append(Boxes(center_m[k, best, steps[best]], start.rotation[always], size_m[always]))
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
         """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
+        if not len(ways.center_m):
+            return np.zeros(0, bool)
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
