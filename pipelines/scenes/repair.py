@@ -126,13 +126,11 @@ class _Parting:
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
         """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
-        if not len(ways.center_m):
-            return np.zeros(0, bool)
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
         then = iou3d_matrix(Boxes(*(part.reshape(-1, *part.shape[2:]) for part in ways)), around)
-        then = then.reshape(-1, 2, len(around.center_m))
+        then = then.reshape(len(ways.center_m), 2, len(around.center_m))
         over = then > GOAL_IOU3D
         if over.any():
             over &= then > iou3d_matrix(self.now.take(pair), around)
