@@ -19,6 +19,7 @@ from models.scene import Scene, merge
 
 REACH_M = 8.0  # how far from the border the new ground is bent
 LIMIT_M = 2.0  # classes' edges are moved by no more
+STEEPEST = 0.08  # rise per metre of what was made across the border; a step is none
 
 
 def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
@@ -26,6 +27,7 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
     high above the ground as before. Other pixels are as they were.
 
     Per class: its signed distance from the class's edge and its height take up the difference at the nearest known pixel.
+    Far from the class's known pixels its height takes up what the surfaces differ by, where both are of one class.
     """
     if new.all() or not new.any():
         return made
@@ -36,6 +38,7 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
     limit = LIMIT_M / resolution_m
     distance, nearest = _nearest(given)
     share = _falling(distance * resolution_m)
+    lifted_m = _surface_difference(made, known, window, given)
     occupied, height_m = made.occupied.copy(), made.height_m.copy()
     for c in range(len(made.ground_classes)):
         was, is_made, was_m, is_made_m = (
@@ -49,7 +52,9 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
         # The class's height everywhere: that of its nearest pixel, of the known ones if none was made.
         away, place = _nearest(was) if was.any() else (np.full(new.shape, np.inf), nearest)
         level_m = is_made_m[_nearest(is_made)[1]] if is_made.any() else was_m[place]
-        risen_m = level_m + _falling(away * resolution_m) * (was_m - level_m)[place]
+        own = _falling(away * resolution_m)
+        differs_m = was_m - _across(is_made_m, level_m, is_made & new, STEEPEST * resolution_m)
+        risen_m = level_m + own * differs_m[place] + (1 - own) * lifted_m
         occupied[c][window] = np.where(new, inside, is_made)
         height_m[c][window] = np.where(new, np.where(inside, risen_m, 0), is_made_m)
     bent = replace(made, occupied=occupied, height_m=height_m)
@@ -61,8 +66,8 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
 
 def new_part(made: Scene, known: Scene, new: np.ndarray) -> Scene:
     """What was made in the pixels `new`, fit to be put beside `known`: its ground meets it, no object of it comes again."""
-    part = merge([continued(made, known, new)], [new], made)
-    return part.select(~doubles(part, known))
+    fresh = made.select(~doubles(made, known))
+    return merge([continued(fresh, known, new)], [new], made)
 
 
 def spread(known: Scene, unknown: np.ndarray) -> Scene:
@@ -86,6 +91,26 @@ def _nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray
     """Distance in pixels to the nearest pixel of a mask that is not empty, and which one that is."""
     distance, (row, col) = distance_transform_edt(~mask, return_indices=True)
     return distance, (row, col)
+
+
+def _surface_difference(made: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray) -> np.ndarray:
+    """Metres by which the known surface lies above the made one where both are of one class, less and less away from there."""
+    (was_m, was), (is_made_m, is_made) = ([part[window] for part in scene.surface()] for scene in (known, made))
+    alike = given & (was == is_made) & (was >= 0)
+    if not alike.any():
+        return np.zeros(given.shape, np.float32)
+    distance, nearest = _nearest(alike)
+    return _falling(distance * made.grid.resolution_m) * (was_m - is_made_m)[nearest]
+
+
+def _across(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, steepest_m: float) -> np.ndarray:
+    """The level of a class as it is seen from its nearest new pixel: a step between the two, more than steepest_m per pixel,
+    is not the ground's, and is left out."""
+    if not new.any():
+        return level_m
+    distance, nearest = _nearest(new)
+    rise_m = height_m[nearest] - level_m
+    return height_m[nearest] - np.clip(rise_m, -steepest_m * distance, steepest_m * distance)
 
 
 def _falling(distance_m: np.ndarray) -> np.ndarray:

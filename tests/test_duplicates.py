@@ -32,6 +32,13 @@ def test_an_object_known_already_is_a_double():
     assert not doubles(replace(near, category=(near.category + 1) % 11), scene).any()
 
 
+def test_a_known_object_drawn_aside_is_that_one_and_what_grows_into_it_is_not():
+    known = row_of_boxes([0], [0.9], "vegetation_cuboid")
+    drawn_aside, beside = [2.5, 7], [0.2, 2.5]  # IoU 1.5 / 6.5 is little; 2.5 is the known one, or its neighbour
+    for shift_m, again in ((drawn_aside, [True, False]), (beside, [True, False]), ([3.9, 7], [False, False])):
+        assert doubles(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+
+
 def test_of_two_in_one_place_the_surer_stays():
     assert repeated(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
     assert repeated(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [False, True]  # the first of two as sure
@@ -43,8 +50,8 @@ def test_cars_never_share_room_and_houses_share_a_wall():
         assert repeated(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [False, not both_stay]  # 1 / 7
         assert not repeated(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
         assert repeated(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [False, True]  # 1 / 3
-        near, known = row_of_boxes([3], [0.9], category), row_of_boxes([0], [0.6], category)
-        assert doubles(near, known).tolist() == [not both_stay]
+        made, known = row_of_boxes([0, 3], [0.9, 0.9], category), row_of_boxes([0], [0.6], category)
+        assert doubles(made, known).tolist() == [True, not both_stay]
 
 
 def test_what_is_dropped_drops_nothing():
