@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from models.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
@@ -18,15 +19,17 @@ SAME_IOU3D[CATEGORY_INDEX["construction_big"]] = 0.2
 
 def doubles(made: Scene, known: Scene) -> np.ndarray:
     """(n,) bool: objects of `made` that are known ones drawn again. `made` is all that was drawn, on either side of the
-    border: where a known object has moved across, it is the one that overlaps it most, of its category and by more than
-    DRAWN_IOU3D. What overlaps one by more than SAME_IOU3D is the same in any case.
+    border, so that each known object is one of them, or none: of its category, one to one, such that they overlap most, by
+    more than DRAWN_IOU3D each. What overlaps one by more than SAME_IOU3D is the same in any case.
     """
     if not len(made) or not len(known):
         return np.zeros(len(made), bool)
     same = made.category[:, None] == known.category[None]
     overlap = iou3d_matrix(boxes_of(made), boxes_of(known), same)
-    drawn = (overlap > DRAWN_IOU3D) & (overlap == overlap.max(axis=0))
-    return (drawn | (overlap > SAME_IOU3D[made.category, None])).any(axis=1)
+    again = (overlap > SAME_IOU3D[made.category, None]).any(axis=1)
+    drawn, of = linear_sum_assignment(overlap, maximize=True)
+    again[drawn[overlap[drawn, of] > DRAWN_IOU3D]] = True
+    return again
 
 
 def repeated(scene: Scene) -> np.ndarray:
