@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
-from models.borders import REACH_M, continued, spread
+from models.borders import REACH_M, STEEPEST, continued, spread
 from models.scene import KITTI_GROUND_CLASSES, Grid
 
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)
@@ -39,6 +39,25 @@ def test_a_street_that_was_drawn_aside_and_higher_goes_on():
     far = slice(0, 32 - REACH)
     assert np.array_equal(bent.occupied[:, far], made.occupied[:, far])
     assert np.array_equal(bent.height_m[:, far], made.height_m[:, far])
+
+
+def test_a_step_that_was_drawn_at_the_border_is_left_out():
+    known, made = street(20, 0.0), street(20, 0.0)
+    made.height_m[:, :32] += 0.3 * made.occupied[:, :32]
+    bent = continued(made, known, NEW)
+    for c, column in ((ROAD, 26), (SIDEWALK, 5)):
+        assert abs(bent.height_m[c, 31, column] - known.height_m[c, 32, column]) < STEEPEST * GRID.resolution_m + 0.005
+        assert np.allclose(bent.height_m[c, : 32 - REACH], made.height_m[c, : 32 - REACH])
+
+
+def test_a_class_that_begins_at_the_border_begins_at_the_height_of_the_known():
+    known, made = street(64, 0.3), street(64, 0.0)  # sidewalk all over: known 0.4 m high, drawn at 0.1
+    made.occupied[SIDEWALK, :32], made.occupied[ROAD, :32] = False, True
+    made.height_m[SIDEWALK, :32], made.height_m[ROAD, :32] = 0, 0.1
+    bent = continued(made, known, NEW)
+    assert not bent.occupied[SIDEWALK, :32].any() and bent.occupied[ROAD, :32].all()
+    assert np.abs(bent.height_m[ROAD, 31] - 0.4).max() < 0.005
+    assert np.allclose(bent.height_m[ROAD, : 32 - REACH], 0.1)
 
 
 def test_known_pixels_and_those_that_agree_are_left_alone():
