@@ -57,28 +57,22 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
 
 
 def test_what_is_sampled_can_be_repaired(tmp_path):
-    from jobs.sample_scenes import Config, sample
+    from jobs.given_scenes import pipeline_directory
+    from pipelines.generate import Sampler, SampleRequest
     from pipelines.metrics.validity import SLAB_OFFSET_M, faults
 
-    config = Config(model="town", output=str(tmp_path), num_scenes=4, steps=10, sampler="dpm++", batch_size=4, glb=0)
-    scenes = {}
-    for repair in (False, True):
-        sample(replace(config, run=f"repair-{repair}", repair=repair))
-        scenes[repair] = list(read_scenes(str(tmp_path), source=f"generated-repair-{repair}"))
-    number = {
-        repair: {
-            name: sum(faults(s, SLAB_OFFSET_M)[name][0].sum() for s in made)
-            for name in ("overlapping", "floating", "sunken")
-        }
-        for repair, made in scenes.items()
-    }
-    for before, after in zip(*scenes.values(), strict=True):
+    request = SampleRequest(pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++")
+    scenes, number = [], []
+    for one in (request, replace(request, run="repaired", repair=True)):
+        Sampler(one, batch_size=4)({"id": 0})
+        made = list(read_scenes(str(tmp_path), source=one.source))
+        found = [faults(scene, SLAB_OFFSET_M) for scene in made]
+        scenes.append(made)
+        number.append([sum(f[name][0].sum() for f in found) for name in ("overlapping", "floating", "sunken")])
+    for before, after in zip(*scenes, strict=True):
         assert np.array_equal(before.category, after.category)
-    assert number[False]["floating"] > 0 and number[False]["overlapping"] > 0, number
-    assert number[True]["floating"] == number[True]["sunken"] == 0
-    assert number[True]["overlapping"] < 0.7 * number[False]["overlapping"]
-    with pytest.raises(ValueError, match="with repair=True, asked for False"):
-        sample(replace(config, run="repair-True"))
+    (overlapping, floating, sunken), after = number
+    assert overlapping > 0 and floating + sunken > 0 and after[0] < 0.7 * overlapping and after[1:] == [0, 0]
 
 
 def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
