@@ -150,13 +150,13 @@ def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Trainin
     parameters = sum(value.numel() for value in model.parameters())
     runs = [training_of(experiment, stage, weights_digest(model), parameters)]
     while start := runs[0].options.get("start_from"):
-        runs.insert(0, training_of(experiment, stage, start, parameters))
+        runs.insert(0, training_of(experiment, stage, start, None))  # its network may have been another
     name = experiment.removeprefix("pritti-")
     later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
     return [replace(runs[0], name=name), *later]
 
 
-def training_of(experiment: str, stage: str, digest: str, parameters: int) -> Training:
+def training_of(experiment: str, stage: str, digest: str, parameters: int | None) -> Training:
     """The run that made the weights of a digest. Raises ValueError if nothing tells of it."""
     from jobs.tracking import Tracker, client, shown, tracking_uri
     from pipelines.model_card import Training

@@ -139,8 +139,12 @@ def prepare(config: Config) -> TrainingRun:
         layout=spec.fingerprint(),
         dataset=root,
     ) | ({"augmentation": asdict(augment)} if config.flip or config.jitter else {})
+    if row.least_per_cell != 1:  # runs of before cells had more go on
+        identity |= {"least_per_cell": row.least_per_cell}
     kept = kept_latents(config.keep_latents_of, row.architecture(), spec) if config.keep_latents_of else None
-    identity |= {"start_from": kept.digest} if kept else {}
+    if kept:
+        identity |= {"start_from": kept.digest}
+        require_place(name, kept)
     record = claim(name, home("runs"), identity)
     parameters = identity | {"architecture": row.architecture()}
     tracker = Tracker.start("pritti-lvae", name, parameters, record)
@@ -176,23 +180,25 @@ def train(config: Config) -> str:
 
     output = absolute(config.output) if config.output else home("models", training.name)
     fit(training, config.workers, output)
-    return renewed_pipeline(config.keep_latents_of, output, training.name) if config.keep_latents_of else output
+    return renewed_pipeline(config.keep_latents_of, output, training) if config.keep_latents_of else output
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The weights of a trained layout VAE whose latents stay."""
+    """The weights of a trained layout VAE whose latents stay, and the digest of the transformer that knows them."""
 
     digest: str
+    transformer: str
     state: dict[str, Tensor]
 
 
 def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     """The layout VAE of a trained pipeline. Raises ValueError if its encoders or its layout are not this run's."""
-    from pipelines.encode import load_lvae, weights_digest
+    from pipelines.encode import weights_digest
+    from pipelines.generate import load_pipeline
 
-    directory = pipeline_directory(model)
-    lvae = load_lvae(f"{directory}/lvae")
+    pipeline = load_pipeline(pipeline_directory(model))
+    lvae = pipeline.lvae
     for key, wanted in architecture.items():
         built = lvae.config[key]
         if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
@@ -200,21 +206,42 @@ def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
                 f"--keep-latents-of {model}: its {key} is {built}, this preset's {wanted}; choose its own preset"
             )
     if lvae.spec.fingerprint() != spec.fingerprint():
-        raise ValueError(f"--keep-latents-of {model}: it knows another layout than this dataset; choose its own dataset")
-    return Kept(weights_digest(lvae), lvae.state_dict())
+        raise ValueError(
+            f"--keep-latents-of {model}: it knows another layout than this dataset; choose its own dataset"
+        )
+    return Kept(weights_digest(lvae), weights_digest(pipeline.dit), lvae.state_dict())
 
 
-def renewed_pipeline(model: str, lvae: str, name: str) -> str:
-    """Put a trained pipeline with another layout VAE, of the same latents, where pipelines are; its directory."""
+def require_place(name: str, kept: Kept) -> None:
+    """Raises ValueError where the renewed pipeline would take the place of another one, or of the one it begins with."""
+    from pipelines import storage
+    from pipelines.encode import weights_digest
+    from pipelines.generate import load_pipeline
+
+    place = home("models", f"pritti-{name}")
+    if not storage.exists(storage.join(place, "model_index.json")):
+        return
+    there = load_pipeline(place)
+    if weights_digest(there.lvae) == kept.digest or weights_digest(there.dit) != kept.transformer:
+        raise ValueError(f"--name {name}: {place} holds a pipeline that would be replaced; choose another name")
+
+
+def renewed_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
+    """Put a trained pipeline with another layout VAE, of the same latents, where pipelines are; its directory.
+
+    Raises ValueError if the pipeline is not any more what the training began with.
+    """
     import tempfile
 
     from jobs.ray_training import publish_directory
-    from pipelines.encode import load_lvae
+    from pipelines.encode import load_lvae, weights_digest
     from pipelines.generate import load_pipeline
 
     pipeline = load_pipeline(pipeline_directory(model))
+    if weights_digest(pipeline.lvae) != training.identity["start_from"]:
+        raise ValueError(f"--keep-latents-of {model} was replaced during training; what was trained is in {lvae}")
     pipeline.register_modules(lvae=load_lvae(lvae))
-    output = home("models", f"pritti-{name}")
+    output = home("models", f"pritti-{training.name}")
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)

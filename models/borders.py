@@ -2,8 +2,9 @@
 
 A new part is decoded together with what is known, so the decoder draws both sides as one; but the known side is kept as
 it was given, and where the two drawings of it differ, by a pixel of kerb or a centimetre of height, the border would show.
-What the drawings differ by at the border is therefore added to the new side, less and less with distance. Differs from the
-paper, which pastes.
+What the drawings differ by at the border is therefore added to the new side, less and less with distance. A decoder that
+sees a latent half known and half new may also draw a step right at the border: what is steeper there than STEEPEST and
+than the known ground beside it is taken out in the same way. Differs from the paper, which pastes.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from models.scene import Scene, merge
 
 REACH_M = 8.0  # how far from the border the new ground is bent
 LIMIT_M = 2.0  # classes' edges are moved by no more
-STEEPEST = 0.08  # rise per metre of what was made across the border; a step is none
+STEEPEST = 0.08  # rise per metre across the border where known ground is no steeper; more is a step that decoders draw
 
 
 def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
@@ -53,7 +54,8 @@ def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
         away, place = _nearest(was) if was.any() else (np.full(new.shape, np.inf), nearest)
         level_m = is_made_m[_nearest(is_made)[1]] if is_made.any() else was_m[place]
         own = _falling(away * resolution_m)
-        differs_m = was_m - _across(is_made_m, level_m, is_made & new, STEEPEST * resolution_m)
+        steepest_m = np.maximum(STEEPEST * resolution_m, _steps(was_m, was))
+        differs_m = was_m - _across(is_made_m, level_m, is_made & new, steepest_m)
         risen_m = level_m + own * differs_m[place] + (1 - own) * lifted_m
         occupied[c][window] = np.where(new, inside, is_made)
         height_m[c][window] = np.where(new, np.where(inside, risen_m, 0), is_made_m)
@@ -103,9 +105,20 @@ def _surface_difference(made: Scene, known: Scene, window: tuple[slice, slice], 
     return _falling(distance * made.grid.resolution_m) * (was_m - is_made_m)[nearest]
 
 
-def _across(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, steepest_m: float) -> np.ndarray:
-    """The level of a class as it is seen from its nearest new pixel: a step between the two, more than steepest_m per pixel,
-    is not the ground's, and is left out."""
+def _steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The largest step of height from each pixel of a mask to those of its four neighbours that are in it; 0 if none is."""
+    largest = np.zeros(mask.shape, np.float32)
+    for axis in (0, 1):
+        height, inside, out = (of.swapaxes(0, axis) for of in (height_m, mask, largest))
+        step = np.where(inside[1:] & inside[:-1], np.abs(np.diff(height, axis=0)), 0)
+        np.maximum(out[1:], step, out=out[1:])
+        np.maximum(out[:-1], step, out=out[:-1])
+    return largest
+
+
+def _across(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, steepest_m: np.ndarray) -> np.ndarray:
+    """The level of a class as it is seen from its nearest new pixel: of a step between the two no more than steepest_m
+    per pixel is the ground's, the rest is left out."""
     if not new.any():
         return level_m
     distance, nearest = _nearest(new)

@@ -11,10 +11,10 @@ from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 # Objects of a category that overlap by more are one object. In the town's 1,000 held-out scenes and in KITTI-360's
 # excerpt no two vehicles overlap by more than 0.04 and no two buildings by more than 0.1; fences, poles and signs do by
 # more than 0.3 in 1 of 100. Buildings get 0.2: at 0.1 a thirteenth of the generated ones would go.
-DRAWN_IOU3D = 0.05  # what is drawn of a known object, a little beside it, overlaps it by more
 SAME_IOU3D = np.full(len(CATEGORY_INDEX), 0.3)
 SAME_IOU3D[list(VEHICLES)] = 0.05
 SAME_IOU3D[CATEGORY_INDEX["construction_big"]] = 0.2
+DRAWN_IOU3D = 0.05  # what is drawn of a known object, a little beside it, overlaps it by more
 
 
 def doubles(made: Scene, known: Scene) -> np.ndarray:
@@ -27,8 +27,9 @@ def doubles(made: Scene, known: Scene) -> np.ndarray:
     same = made.category[:, None] == known.category[None]
     overlap = iou3d_matrix(boxes_of(made), boxes_of(known), same)
     again = (overlap > SAME_IOU3D[made.category, None]).any(axis=1)
+    overlap[overlap <= DRAWN_IOU3D] = 0
     drawn, of = linear_sum_assignment(overlap, maximize=True)
-    again[drawn[overlap[drawn, of] > DRAWN_IOU3D]] = True
+    again[drawn[overlap[drawn, of] > 0]] = True
     return again
 
 

@@ -104,9 +104,9 @@ def composited(scene: Scene, made: Scene, region: np.ndarray, contents: Contents
     """
     nothing = np.zeros_like(region)
     ground, objects = (nothing if contents == other else region for other in ("objects", "ground"))
-    made = continued(made, scene, ground)
-    of_ground = merge([scene, made], [~ground, ground], scene)
     kept = merge([scene], [~objects], scene)
-    new = merge([made.select(~doubles(made, kept))], [objects], scene)
+    made = continued(made.select(~doubles(made, kept)), scene, ground)
+    of_ground = merge([scene, made], [~ground, ground], scene)
+    new = merge([made], [objects], scene)
     both = joined([kept, new])
     return replace(scene, height_m=of_ground.height_m, occupied=of_ground.occupied, **both)

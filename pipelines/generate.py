@@ -78,6 +78,8 @@ def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] =
     """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
     options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
     del options["model"]  # the same weights in another directory are the same model
+    if not options.get("repair"):  # runs of before it could be asked for go on
+        options.pop("repair", None)
     claim(options.pop("output"), request.source, request.run, options, parts)
 
 

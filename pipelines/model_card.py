@@ -21,7 +21,7 @@ class Training:
     name: str  # lvae, dit; dit-2 where a second run began with the first one's weights
     stage: str
     weights: str  # digest of what it made
-    parameters: int  # numbers in the network
+    parameters: int | None  # numbers in the network; None where they are not known
     steps: int
     hours: float  # of training steps, without start-up and validation
     options: Mapping[str, str]
@@ -42,7 +42,8 @@ class Training:
         return Chart(f"{self.stage}: losses", self.curves, "training step", "loss", log_y=True)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        yield "parameters", f"{self.parameters:,}"
+        if self.parameters is not None:
+            yield "parameters", f"{self.parameters:,}"
         yield "steps done", f"{self.steps:,}"
         yield "hours of steps", f"{self.hours:.1f}"
         yield from self.origin.items()

@@ -68,6 +68,8 @@ def test_known_pixels_and_those_that_agree_are_left_alone():
     same = continued(known, known, NEW)
     assert np.array_equal(same.occupied, known.occupied) and np.allclose(same.height_m, known.height_m, atol=1e-6)
     assert np.array_equal(same.center_m, known.center_m)
+    known.height_m[:] += 0.2 * GRID.resolution_m * np.arange(64)[:, None] * known.occupied  # a hill of 20 %
+    assert np.allclose(continued(known, known, NEW).height_m, known.height_m, atol=1e-5)
 
 
 @pytest.mark.parametrize("mask", [np.zeros((64, 64), bool), np.ones((64, 64), bool)])

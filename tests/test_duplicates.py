@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scenes import random_scene
 
-from models.duplicates import doubles, repeated
+from models.duplicates import DRAWN_IOU3D, doubles, repeated
+from models.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORY_INDEX, Grid
 
 SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
@@ -37,6 +38,19 @@ def test_a_known_object_drawn_aside_is_that_one_and_what_grows_into_it_is_not():
     drawn_aside, beside = [2.5, 7], [0.2, 2.5]  # IoU 1.5 / 6.5 is little; 2.5 is the known one, or its neighbour
     for shift_m, again in ((drawn_aside, [True, False]), (beside, [True, False]), ([3.9, 7], [False, False])):
         assert doubles(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+
+
+def test_hardly_overlapping_neighbours_do_not_stand_for_a_known_object():
+    known = row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
+    made = row_of_boxes(
+        [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
+    )  # .053 and .039 with the two known; .046 with the first
+    overlaps = iou3d_matrix(boxes_of(made), boxes_of(known))
+    assert (
+        overlaps[0, 0] > DRAWN_IOU3D > overlaps[1, 0] > 0
+        and 0 < overlaps[0, 1] < DRAWN_IOU3D < overlaps[1, 0] + overlaps[0, 1]
+    )
+    assert doubles(made, known).tolist() == [True, False]
 
 
 def test_of_two_in_one_place_the_surer_stays():

@@ -257,6 +257,20 @@ def overlap(scene: Scene) -> float:
     return float(iou3d_matrix(boxes, boxes)[0, 1])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"push_m": -1.0}, "push_m is -1.0"),
+        ({"push_m": np.nan}, "push_m is nan"),
+        ({"shrink": 2.0}, "shrink is 2.0"),
+        ({"shrink": 0.0}, "shrink is 0.0"),
+    ],
+)
+def test_a_repair_that_no_scene_can_take_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        edit.Repair(ALL, **options).check()
+
+
 def test_what_cannot_be_pushed_far_enough_shrinks_or_goes():
     deep = two_boxes(-2, existence=np.array([0.9, 0.6], np.float32))
     mended, (done,) = replayed(deep, [edit.Repair(ALL)])

@@ -75,6 +75,16 @@ def test_what_is_sampled_can_be_repaired(tmp_path):
     assert overlapping > 0 and floating + sunken > 0 and after[0] < 0.7 * overlapping and after[1:] == [0, 0]
 
 
+def test_the_job_asks_for_repair(smoke, tmp_path, monkeypatch):
+    from jobs.sample_scenes import Config, sample
+
+    asked = []
+    monkeypatch.setattr("pipelines.generate.sample_scenes", lambda request, *_: asked.append(request))
+    for repair in (False, True):
+        sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, glb=0, repair=repair))
+    assert [request.repair for request in asked] == [False, True]
+
+
 def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
     from jobs.sweep_samplers import Config, sweep_samplers
 

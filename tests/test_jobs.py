@@ -142,6 +142,8 @@ def test_an_object_decoder_is_trained_anew_under_a_trained_transformer(home):
     changed = {name for name in old if (old[name] != new[name]).any()}
     assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
     assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
+    with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
+        train(Config(preset="smoke", name="smoke", keep_latents_of=str(kept)))
     with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
         train(
             Config(

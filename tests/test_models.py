@@ -359,6 +359,19 @@ def test_noise_on_latents_is_a_samples_own_and_as_large_as_it_says():
             assert torch.equal(noisy.height, plain.height) == (size == 0)
 
 
+def test_more_proposals_in_a_cell_are_trained_on_the_same_latents():
+    old, new = (small_lvae(decoder="cells", shortcut=True, least_per_cell=least) for least in (1, 3))
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
+    new.keep_latents_of(old.state_dict())
+    with torch.no_grad():
+        latents = [lvae.encode(batch).mean for lvae in (old, new)]
+        assert torch.equal(*latents)
+        before, after = (lvae.decode(latents[0]) for lvae in (old, new))
+    assert torch.equal(before.height, after.height) and before.features.shape != after.features.shape
+    trained = {name for name, parameter in new.named_parameters() if parameter.requires_grad}
+    assert trained and all(name.startswith("object_decoder.") for name in trained)
+
+
 def test_dit_is_conditioned_and_starts_at_zero():
     torch.manual_seed(0)
     dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)

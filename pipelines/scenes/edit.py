@@ -286,6 +286,13 @@ class Repair(Edit):
     drop: bool = True
     """Take out one of two that overlap all the same."""
 
+    def check(self) -> None:
+        super().check()
+        if not 0 <= self.push_m < np.inf:
+            raise ValueError(f"push_m is {self.push_m}, expected metres, 0 or more")
+        if not 0 < self.shrink <= 1:
+            raise ValueError(f"shrink is {self.shrink}, expected a share of the size above 0, at most 1 (no shrinking)")
+
     def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
         scene = onto_ground(scene, chosen, self.slab_offset_m, self.ground)
         scene = require_sound(apart(scene, chosen, self.push_m, self.shrink))

@@ -15,7 +15,7 @@ from models.iou3d import Boxes, boxes_of, iou3d_matrix, iou3d_pairs
 from models.scene import Scene
 from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, faults
 
-# What is mended stays so when it is stored, to millimetres.
+# A little less than what is a fault: rounded as tables store it, what was none would else become one.
 GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
 GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
