@@ -29,6 +29,7 @@ from pipelines.encode import weights_digest
 from pipelines.feed import READER_CPUS, Reader, Stream, batches
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
+RETRIES = 2  # of workers that fail, from the last checkpoint
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
             name=run.name,
             storage_path=run.storage_path,
             checkpoint_config=CheckpointConfig(num_to_keep=2),
-            failure_config=FailureConfig(max_failures=2),
+            failure_config=FailureConfig(max_failures=RETRIES),
         ),
     )
     try:

@@ -92,7 +92,8 @@ def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
-def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_run(home, tmp_path):
+def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_run(home, tmp_path, monkeypatch):
+    import jobs.ray_training
     from jobs.ray_training import fit
     from jobs.train_dit import Config, prepare, train
 
@@ -108,6 +109,7 @@ def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_
             raise KeyError("stopped")
         return {}, {}
 
+    monkeypatch.setattr(jobs.ray_training, "RETRIES", 0)
     run, _ = prepare(Config(preset="smoke", name="dit-two", workers=2, checkpoint_every=2))
     assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):
