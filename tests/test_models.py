@@ -296,8 +296,8 @@ def test_losses_are_their_equations():
     assert np.isclose(float(kl_loss(posterior)), float(want), rtol=1e-5)
 
 
-@pytest.mark.parametrize("decoder", ["detr", "cells"])
-def test_lvae_overfits_one_batch(decoder):
+@pytest.mark.parametrize("decoder, steps, ground", [("detr", 200, 0.9), ("cells", 60, 0.7)])
+def test_lvae_overfits_one_batch(decoder, steps, ground):
     spec = small_spec()
     lvae = small_lvae(
         decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
@@ -306,7 +306,7 @@ def test_lvae_overfits_one_batch(decoder):
     optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
     generator = torch.Generator().manual_seed(0)
     losses = []
-    for _ in range(200):
+    for _ in range(steps):
         noise = torch.randn(2, *lvae.latent_shape, generator=generator)
         output, posterior = lvae(batch, noise)
         loss = lvae_loss(output, posterior, batch, spec)
@@ -315,8 +315,8 @@ def test_lvae_overfits_one_batch(decoder):
         optimiser.step()
         losses.append(loss.total.item())
     assert losses[-1] < 0.25 * losses[0]
-    ground = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
-    assert ground.float().mean() > 0.9
+    right = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
+    assert right.float().mean() > ground
 
 
 @pytest.mark.parametrize(
