@@ -27,6 +27,13 @@ def absolute(path: str) -> str:
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
+def require_positive(config: object, *names: str) -> None:
+    """Raises ValueError for an option of these that is below 1."""
+    for name in names:
+        if (given := getattr(config, name)) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} is {given}, expected at least 1")
+
+
 # What Ray reads when it starts, unless the user has set it.
 RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",

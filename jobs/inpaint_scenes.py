@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, require_positive, run, start_ray
 from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
 
 
@@ -50,8 +50,9 @@ def inpaint(config: Config) -> dict[str, float | None]:
     """Make anew, write, and return how far raw decodes drift outside the region."""
     if not (config.polygon_m or config.half_plane or config.objects):
         raise ValueError("no region: give --polygon-m, --half-plane or --objects")
-    if config.variants < 1 or config.pictures < 0:
-        raise ValueError(f"--variants is {config.variants}, --pictures {config.pictures}: expected 1 and 0 or more")
+    require_positive(config, "variants", "actors")
+    if config.pictures < 0:
+        raise ValueError(f"--pictures is {config.pictures}, expected 0 or more")
     if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
         raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of three corners or more")
     model = pipeline_directory(config.model)

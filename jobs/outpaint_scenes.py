@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING, Literal
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, require_positive, run, start_ray
 from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ def last_blocks(config: Config) -> tuple[int, int, int, int]:
 
 def outpaint(config: Config) -> pa.Table:
     """Extend, write, and return what is known of each block."""
-    if config.batch_size < 1:
-        raise ValueError(f"--batch-size is {config.batch_size}, expected 1 or more")
+    require_positive(config, "actors", "batch_size")
     last = last_blocks(config)
     model = pipeline_directory(config.model)
     require_model_labels(model, [config.label] if config.label else [])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, require_positive, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,7 @@ def paint(config: Config) -> tuple[str, int]:
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
         if not value:
             raise ValueError(f"{name} is missing: give a local directory in diffusers' layout")
-    if config.steps < 1 or config.actors < 1:
-        raise ValueError(f"--steps is {config.steps}, --actors {config.actors}: expected 1 or more")
+    require_positive(config, "steps", "actors")
     from pipelines import storage
 
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.command import absolute, home, require_positive, run, start_ray
 from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory, require_model_labels
 
 
@@ -53,9 +53,7 @@ class Config:
 
 def sample(config: Config) -> str:
     """Generate and return the dataset directory."""
-    for name in ("num_scenes", "steps", "actors", "batch_size"):
-        if (given := getattr(config, name)) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} is {given}, expected at least 1")
+    require_positive(config, "num_scenes", "steps", "actors", "batch_size")
     model = pipeline_directory(config.model)
     require_model_labels(model, config.labels)
     from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
-from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.command import absolute, home, print_table, require_positive, run, start_ray
 from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory
 
 if TYPE_CHECKING:
@@ -51,15 +51,16 @@ class Config:
 def sweep_samplers(config: Config) -> list[dict]:
     """Generate, score, write and return a row per sampler and number of steps."""
     model = pipeline_directory(config.model)
+    require_positive(config, "actors", "batch_size")
     if config.num_scenes < 5 or config.pictures < 0:
         raise ValueError(f"--num-scenes is {config.num_scenes}, --pictures {config.pictures}: expected 5 and 0 or more")
-    if not config.samplers or not config.steps or min(config.steps) < 1:
-        raise ValueError(f"--steps is {config.steps}, --samplers {config.samplers}: expected one or more of each")
+    if not config.samplers or not config.steps:
+        raise ValueError("no --samplers or no --steps: expected one or more of each")
     from rich.progress import Progress
 
     from models.diffusion import Diffusion
     from models.labels import LABELS
-    from models.pipeline import SAMPLERS
+    from models.pipeline import SAMPLERS, require_scaling
     from pipelines import storage
     from pipelines.dataset import Dataset
     from pipelines.describe import Looks, describe
@@ -73,8 +74,10 @@ def sweep_samplers(config: Config) -> list[dict]:
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
-    for steps in config.steps:
-        Diffusion().visited(steps)  # a number that cannot be had is said before hours of the others
+    for steps in config.steps:  # numbers that cannot be had are said before hours of the others
+        Diffusion().visited(steps)
+    for scaling in config.noise_scalings:
+        require_scaling(scaling)
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     output = absolute(config.output) if config.output else home("evaluations", "samplers")
     real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.command import absolute, home, print_table, require_positive, run, start_ray
 from jobs.given_scenes import GivenScenes, pipeline_directory
 
 
@@ -37,12 +37,14 @@ class Config(GivenScenes):
 
 def sweep_seams(config: Config) -> list[dict]:
     """Outpaint, measure, write and return a row per setting."""
+    require_positive(config, "actors", "batch_size")
     model = pipeline_directory(config.model)
     if not config.settings:
         raise ValueError("no --settings: expected steps, jump length, resamplings, known guidance and eta, in fives")
     import pyarrow as pa
     from rich.progress import Progress
 
+    from models.diffusion import Diffusion
     from models.pipeline import Resampling
     from pipelines import storage
     from pipelines.metrics.seams import seam_ratios
@@ -55,6 +57,7 @@ def sweep_seams(config: Config) -> list[dict]:
 
     for setting in config.settings:
         Resampling(*setting).transitions()  # numbers that cannot be had are said before hours of the others
+        Diffusion().visited(setting[0])
     output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
     selection = config.selection()
     count = sum(len(rows) for _, rows in selection.shards())

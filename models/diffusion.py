@@ -35,10 +35,21 @@ class Diffusion:
         return np.cumprod(1 - np.linspace(self.beta_start, self.beta_end, self.num_timesteps, dtype=np.float64))
 
     def visited(self, num_steps: int) -> np.ndarray:
-        """(num_steps,) ascending timesteps, "leading" spacing: 0, 4, ..., 996 for 250 of 1000."""
+        """(num_steps,) ascending timesteps, "leading" spacing: 0, 4, ..., 996 for 250 of 1000.
+
+        Raises ValueError for a number that leaves more than a tenth of them unvisited: 600 steps of 1 begin at 599, where
+        the network expects two tenths of the signal, and would be given none.
+        """
         if not 1 <= num_steps <= self.num_timesteps:
             raise ValueError(f"num_steps is {num_steps}, expected 1 to {self.num_timesteps}")
-        return np.arange(num_steps) * (self.num_timesteps // num_steps)
+        apart = self.num_timesteps // num_steps
+        if num_steps * apart < 0.9 * self.num_timesteps:
+            near = self.num_timesteps // (apart + 1), self.num_timesteps // apart
+            raise ValueError(
+                f"num_steps is {num_steps}: {apart} apart, they would begin at {(num_steps - 1) * apart} of "
+                f"{self.num_timesteps}; expected {near[0]} or {near[1]}"
+            )
+        return np.arange(num_steps) * apart
 
     def add_noise(
         self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, b]

@@ -48,7 +48,7 @@ NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
 SAMPLERS = {
     "ddpm": (DDPMScheduler, {"timestep_spacing": "leading"}),
     "ddim": (DDIMScheduler, {"timestep_spacing": "leading"}),
-    "dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True}),
+    "dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}),
     "sde-dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}),
 }
 StepCallback = Callable[[DiffusionPipeline, int, int, dict], dict]  # diffusers' callback_on_step_end
@@ -79,6 +79,13 @@ def scheduler() -> DDPMScheduler:
         timestep_spacing="leading",
         clip_sample=False,
     )
+
+
+def require_scaling(noise_scaling: float) -> float:
+    """The same number. Raises ValueError for one that is not near 1."""
+    if not 0.9 <= noise_scaling <= 1.1:
+        raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or a little more, up to 1.1")
+    return noise_scaling
 
 
 @dataclass(frozen=True)
@@ -216,9 +223,7 @@ class PrITTIPipeline(DiffusionPipeline):
         """The number given, or the pipeline's own with its present sampler. Raises ValueError for one that is not near 1."""
         if noise_scaling is None:
             return 1.0 if isinstance(self.scheduler, DDPMScheduler) else self.config.noise_scaling
-        if not 0.9 <= noise_scaling <= 1.1:
-            raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or a little more, up to 1.1")
-        return noise_scaling
+        return require_scaling(noise_scaling)
 
     @contextmanager
     def _watched(self, evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
@@ -249,6 +254,7 @@ class PrITTIPipeline(DiffusionPipeline):
                 walk = Walk(self.diffusion, num_inference_steps)
                 model = rescaled(self._denoiser(walk.timesteps, label, guidance_scale), noise_scaling)
                 return sample(model, walk, noise, label, on_step=on_step)
+            self.diffusion.visited(num_inference_steps)  # diffusers would take any number
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
             if self.scheduler.timesteps.is_floating_point():
                 raise ValueError(

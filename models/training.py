@@ -212,7 +212,7 @@ class Trainer:
             share = len(positions[part]) / len(positions)
             more = first + size < len(positions)
             with self.wrapped.no_sync() if more and hasattr(self.wrapped, "no_sync") else nullcontext():
-                losses = self._losses({k: v[part] for k, v in arrays.items()}, positions[part])
+                losses = self._losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
                     raise NotFinite(self.steps_done, self._to_blame(arrays, positions))
                 (share * losses["loss"]).backward()
@@ -225,23 +225,26 @@ class Trainer:
             self.update_ema()
         return totals | {"grad_norm": norm}
 
-    def _losses(self, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
-        """The parts of the loss, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
+    def _losses(self, network: nn.Module, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
+        """The parts of the loss by `network`, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
         generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
         try:
             with self.execution.autocast(self.device):
-                losses = self.loss(self.wrapped, arrays, generators)
+                losses = self.loss(network, arrays, generators)
         except NotFiniteError:
             return None
         return losses if torch.isfinite(losses["loss"]) else None
 
     @torch.no_grad()
     def _to_blame(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
-        """The positions whose own loss is not finite; empty if that is all of them."""
+        """The positions whose own loss is not finite; empty if that is all of them.
+
+        By the model itself: a wrapped one would wait here for the other workers, who are elsewhere.
+        """
         bad = [
             position
             for k, position in enumerate(positions)
-            if self._losses({name: value[k : k + 1] for name, value in arrays.items()}, [position]) is None
+            if self._losses(self.model, {name: value[k : k + 1] for name, value in arrays.items()}, [position]) is None
         ]
         return bad if len(bad) < len(positions) else []
 

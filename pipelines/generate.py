@@ -80,6 +80,8 @@ def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] =
     del options["model"]  # the same weights in another directory are the same model
     if not options.get("repair"):  # runs of before it could be asked for go on
         options.pop("repair", None)
+    if "resampling" in options and options["resampling"]["eta"] != 1:  # then the pipeline's own scaling matters
+        options["noise_scaling"] = pipeline.config.noise_scaling
     claim(options.pop("output"), request.source, request.run, options, parts)
 
 

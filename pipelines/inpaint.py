@@ -178,7 +178,13 @@ def inpaint_scenes(
     request.where.region(at_model_resolution(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
-    claim_run(request, pipeline, [storage.join(request.output, "drift", request.run)], input=asdict(selection))
+    claim_run(
+        request,
+        pipeline,
+        [storage.join(request.output, "drift", request.run)],
+        input=asdict(selection),
+        scenes=selection.files(),
+    )
     drifts = []
     for row in fan_out(range(len(chosen)), Inpainter, (request, chosen), num_actors):
         drifts += row["drift"]

@@ -187,7 +187,7 @@ def outpaint_scenes(
     pipeline = load_pipeline(request.model)
     lattice = request.lattice(pipeline.lvae.latent_shape[-1])
     parts = [storage.join(request.output, "blocks", request.run)]
-    claim_run(request, pipeline, parts, input=asdict(selection))
+    claim_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
 
     waiting, done = [], {}
     for number in range(len(chosen)):
@@ -216,7 +216,8 @@ def work_off(
     actor = ray.remote(Outpainter).options(
         num_cpus=1, num_gpus=gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
-    count = min(num_actors, max(len(waiting), len(done)))
+    room = int(ray.cluster_resources().get("GPU" if gpus_per_actor() else "CPU", 0))
+    count = min(num_actors, max(len(waiting), len(done)), max(1, room))  # one without room would take a killed one's
     workers = [actor.remote(request, chosen) for _ in range(count)]
     try:
         hand_out(workers, waiting, done, on_blocks)
@@ -228,12 +229,12 @@ def work_off(
 def hand_out(
     workers: list, waiting: list[Batch], done: dict[int, set[Place]], on_blocks: Callable[[int], None] | None
 ) -> None:
-    """Until nothing is left to do."""
-    idle = list(workers)
+    """Until nothing is left to do. An actor works from when it is up: others may have taken its room."""
+    idle: list = []
+    running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
     left = {number: sum(batch.number == number for batch in waiting) for number in done}
     whole = [number for number, batches_left in left.items() if not batches_left]
-    running: dict[ray.ObjectRef, tuple] = {}
-    while waiting or whole or running:
+    while waiting or whole or any(task is not None for task, _ in running.values()):
         while idle and (task := next_task(waiting, whole, done)) is not None:
             worker = idle.pop()
             call = worker.extend if isinstance(task, Batch) else worker.finish

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 import pyarrow as pa
 
+from pipelines import storage
 from pipelines.scenes.tables import Shard, find_shards
 
 Pick = Literal["spread", "first", "farthest", "apart", "balanced"]
@@ -44,6 +45,10 @@ class Selection:
     def shards(self) -> list[tuple[Shard, list[int]]]:
         """Shards with the rows to take, in order; decided at the first call. Raises ValueError where there is none."""
         return self._shards
+
+    def files(self) -> list[list]:
+        """The chosen files as they are now, with the rows to take: other ones once scenes have come, gone or changed."""
+        return [[*storage.fingerprint(shard.path("scenes")), rows] for shard, rows in self._shards]
 
     @cached_property
     def _shards(self) -> list[tuple[Shard, list[int]]]:

@@ -171,6 +171,11 @@ def test_the_known_part_is_noised_to_the_state_just_reached():
 def test_bad_step_counts_are_named():
     with pytest.raises(ValueError, match="num_steps is 0, expected 1 to 1000"):
         Walk(Diffusion(), 0)
+    with pytest.raises(ValueError, match="600: 1 apart, they would begin at 599 of 1000; expected 500 or 1000"):
+        Walk(Diffusion(), 600)
+    with pytest.raises(ValueError, match="334: 2 apart, they would begin at 666 of 1000; expected 333 or 500"):
+        Walk(Diffusion(), 334)
+    assert all(Diffusion().visited(steps)[-1] >= 850 for steps in (7, 10, 20, 25, 50, 100, 250, 300, 500, 1000))
 
 
 def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
@@ -248,12 +253,13 @@ def test_bf16_and_compile_compute_the_same_loss():
 
 
 def test_a_loss_that_is_not_finite_stops_before_anything_changes():
-    trainer, batch = new_trainer(), dit_batch()
+    trainer, batch, asked = new_trainer(), dit_batch(), []
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
+    trainer.wrapped = lambda *inputs: asked.append(1) or trainer.model(*inputs)
     batch["mean"][3] = float("nan")
     with pytest.raises(NotFinite, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
         trainer.step(batch, range(8, 16))
-    assert caught.value.positions == [11]
+    assert caught.value.positions == [11] and len(asked) == 1  # who is to blame is no step: other workers take none
     batch["mean"][:] = float("nan")
     with pytest.raises(NotFinite, match="of every sample: the weights are broken"):
         trainer.step(batch, range(8))

@@ -243,7 +243,7 @@ def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(smoke, 
                     process.kill()
                     killed.append(process.pid)
 
-    assert outpaint_scenes(request("killed"), chosen, num_actors=2, on_blocks=kill).equals(table)
+    assert outpaint_scenes(request("killed"), chosen, num_actors=3, on_blocks=kill).equals(table)
     assert killed and counts[0] == 0 and sum(counts) == 7
 
     class Stop(Exception):
@@ -300,6 +300,27 @@ def test_inpainting_writes_variants_and_goes_on(smoke, samples, tmp_path):
         inpaint(replace(config, seed=1))
     with pytest.raises(ValueError, match="the region holds no pixel"):
         inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
+    Path(find_shards(str(samples))[0].path("scenes")).touch()  # it may hold other scenes now
+    with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):
+        inpaint(config)
+
+
+def test_a_guided_run_keeps_the_scaling_of_the_models_noise(smoke, tmp_path):
+    from models.pipeline import Resampling
+    from pipelines.generate import claim_run, load_pipeline
+    from pipelines.outpaint import OutpaintRequest
+
+    model = str(smoke / "models/pritti-smoke")
+    pipeline = load_pipeline(model)
+    for run, resampling in (("paper", Resampling()), ("guided", Resampling.guided())):
+        request = OutpaintRequest(model, str(tmp_path), run, None, 0, 0.5, "reencode", resampling, 1.0)
+        pipeline.register_to_config(noise_scaling=1.0)
+        claim_run(request, pipeline, [str(smoke)])
+        pipeline.register_to_config(noise_scaling=1.01)
+        if run == "paper":  # which scales nothing
+            claim_run(request, pipeline, [str(smoke)])
+    with pytest.raises(ValueError, match=r"holds a run 'guided' with noise_scaling=1.0, asked for 1.01"):
+        claim_run(request, pipeline, [str(smoke)])
 
 
 def test_real_against_real_is_near_perfect(smoke, tmp_path):

@@ -74,6 +74,10 @@ def test_every_sampler_gives_a_scene_of_its_own_whatever_stands_beside_it(pipeli
         again = pipeline.sample_latents(labels, 3, range(3), 10)
         assert torch.equal(together, again), name  # nothing is left over from the run before
     assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
+    pipeline.use_sampler("dpm++")  # after the one of its kind that draws noise
+    assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
+    with pytest.raises(ValueError, match="num_steps is 600"):
+        pipeline.sample_latents(labels, 3, range(3), 600)
     with pytest.raises(ValueError, match="sampler 'euler' is unknown, expected one of: ddpm, ddim, dpm"):
         pipeline.use_sampler("euler")
     pipeline.use_sampler("ddpm")
