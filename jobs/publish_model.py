@@ -53,6 +53,7 @@ def publish(config: Config) -> list[str]:
     from jobs.tracking import Tracker
     from models.labels import LABELS
     from models.released import CHECKSUMS, TRAINING, checksums
+    from models.tensors import EXISTENCE_THRESHOLD
     from pipelines import storage
     from pipelines.chart import standalone_svg
     from pipelines.encode import weights_digest
@@ -63,8 +64,10 @@ def publish(config: Config) -> list[str]:
     weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
     directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
     about, scores = evaluation_of(directory, weights)
-    if about["sampling"]["sampler"] != "ddpm":  # the entry samples as it was judged
-        pipeline.register_to_config(noise_scaling=about["sampling"].get("noise_scaling", 1.0))
+    as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
+    if about["sampling"]["sampler"] != "ddpm":
+        as_judged["noise_scaling"] = about["sampling"].get("noise_scaling", 1.0)
+    pipeline.register_to_config(**as_judged)
     facts = storage.read_json(storage.join(about["real"], "dataset.json"))
     stages = [
         history("pritti-lvae", "Layout VAE", pipeline.lvae),

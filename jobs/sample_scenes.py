@@ -40,6 +40,8 @@ class Config:
     noise_scaling: float | None = None
     """Divide the network's noise by this: a little above 1 brings back small and rare things that sampling loses (default: what
     the model was published with; 1 with ddpm)."""
+    existence_threshold: float | None = None
+    """Primitives that are more probable than this are in a scene (default: what the model was published with; the paper's is 0.3)."""
     repair: bool = False
     """Put what floats or is sunken onto the ground and push apart what overlaps; nothing is taken out (as jobs/edit_scenes.py
     repair --no-drop)."""
@@ -76,6 +78,7 @@ def sample(config: Config) -> str:
         guidance_scale=config.guidance,
         sampler=config.sampler,
         noise_scaling=config.noise_scaling,
+        existence_threshold=config.existence_threshold,
         repair=config.repair,
         shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
     )

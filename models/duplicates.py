@@ -8,12 +8,11 @@ from scipy.optimize import linear_sum_assignment
 from models.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 
-# Objects of a category that overlap by more are one object. In the town's 1,000 held-out scenes and in KITTI-360's
-# excerpt no two vehicles overlap by more than 0.04 and no two buildings by more than 0.1; fences, poles and signs do by
-# more than 0.3 in 1 of 100. Buildings get 0.2: at 0.1 a thirteenth of the generated ones would go.
-SAME_IOU3D = np.full(len(CATEGORY_INDEX), 0.3)
+# Objects of a category that overlap by more are one object. In the town's held-out scenes no two vehicles overlap by more
+# than 0.04 and no two buildings by more than 0.1; of its fences 4.5 % would go, of signs 3.0, poles 1.7, other objects 0.9.
+SAME_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
+SAME_IOU3D[list(VEGETATION)] = 0.3  # crowns grow into each other; asked only of what is drawn beside the known
 SAME_IOU3D[list(VEHICLES)] = 0.05
-SAME_IOU3D[CATEGORY_INDEX["construction_big"]] = 0.2
 DRAWN_IOU3D = 0.05  # what is drawn of a known object, a little beside it, overlaps it by more
 
 

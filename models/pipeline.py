@@ -126,12 +126,20 @@ class PrITTIPipeline(DiffusionPipeline):
     """Generates Scenes. `from_pretrained(directory)` and `save_pretrained(directory)` as in diffusers.
 
     `noise_scaling` is what all samplers but the paper's divide the network's noise by (diffusion.rescaled); not in the paper.
+    Primitives whose existence is above `existence_threshold` are in a scene; 0.3 in the paper.
     """
 
-    def __init__(self, lvae: LayoutVAE, dit: DiT, scheduler: SchedulerMixin, noise_scaling: float = 1.0) -> None:
+    def __init__(
+        self,
+        lvae: LayoutVAE,
+        dit: DiT,
+        scheduler: SchedulerMixin,
+        noise_scaling: float = 1.0,
+        existence_threshold: float = EXISTENCE_THRESHOLD,
+    ) -> None:
         super().__init__()
         self.register_modules(lvae=lvae, dit=dit, scheduler=scheduler)
-        self.register_to_config(noise_scaling=noise_scaling)
+        self.register_to_config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
         self.lvae.eval().requires_grad_(False)
         self.dit.eval().requires_grad_(False)
         if dit.config.layout is not None:
@@ -167,13 +175,14 @@ class PrITTIPipeline(DiffusionPipeline):
 
     @torch.no_grad()
     def decode(
-        self, latents: Float[Tensor, "b c h w"], identities: Sequence[Scene], threshold: float = EXISTENCE_THRESHOLD
+        self, latents: Float[Tensor, "b c h w"], identities: Sequence[Scene], existence_threshold: float | None = None
     ) -> list[Scene]:
         """Scenes from latents; ids and labels from `identities`. Latents are decoded one by one.
 
         One at a time on purpose: the scene is then the same to the last bit whatever stood beside it. Where every cell
         decodes by itself, two of them may claim one object: the surer stays (duplicates.repeated).
         """
+        threshold = self.threshold(existence_threshold)
         shift, scale = self._moments()
         layouts = [self.lvae.decode(latent[None] * scale + shift).layouts()[0] for latent in latents]
         scenes = [
@@ -225,6 +234,14 @@ class PrITTIPipeline(DiffusionPipeline):
             return 1.0 if isinstance(self.scheduler, DDPMScheduler) else self.config.noise_scaling
         return require_scaling(noise_scaling)
 
+    def threshold(self, existence_threshold: float | None) -> float:
+        """The number given, or the pipeline's own. Raises ValueError for one that is no probability."""
+        if existence_threshold is None:
+            return self.config.existence_threshold
+        if not 0 < existence_threshold < 1:
+            raise ValueError(f"existence_threshold is {existence_threshold}, expected between 0 and 1")
+        return existence_threshold
+
     @contextmanager
     def _watched(self, evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
         """What a sampler calls after each evaluation of the model: moves a progress bar, then calls the user's."""
@@ -274,11 +291,12 @@ class PrITTIPipeline(DiffusionPipeline):
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
+        existence_threshold: float | None = None,
     ) -> list[Scene]:
         """One Scene per label. Scene i depends on (seed, indices[i], its label) only, whatever the batch.
 
         A `generator` draws the seed, one per scene their seeds. `callback_on_step_end(pipeline, step, timestep,
-        {"latents": ...})` returns such a dict, as in diffusers. `noise_scaling`: instead of the pipeline's own.
+        {"latents": ...})` returns such a dict, as in diffusers. `noise_scaling`, `existence_threshold`: instead of the pipeline's own.
         """
         indices = range(len(labels)) if indices is None else indices
         seeds = seeds_of(generator, seed, len(labels))
@@ -286,7 +304,7 @@ class PrITTIPipeline(DiffusionPipeline):
             labels, seeds, indices, num_inference_steps, guidance_scale, callback_on_step_end, noise_scaling
         )
         scenes = zip(seeds, indices, labels, strict=True)
-        return self.decode(latents, [self.identity(run, *scene) for scene in scenes])
+        return self.decode(latents, [self.identity(run, *scene) for scene in scenes], existence_threshold)
 
     __call__ = generate
 

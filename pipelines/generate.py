@@ -15,7 +15,7 @@ from models.labels import LABELS, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import Grid, Scene
-from models.tensors import ground_on_grid
+from models.tensors import EXISTENCE_THRESHOLD, ground_on_grid
 from pipelines import storage
 from pipelines.claims import claim
 from pipelines.encode import weights_digest
@@ -52,6 +52,7 @@ class SampleRequest(Request):
     guidance_scale: float
     sampler: str = "ddpm"
     noise_scaling: float | None = None  # None: the model's own
+    existence_threshold: float | None = None  # None: the model's own
     repair: bool = False  # onto the ground and apart, nothing taken out (scenes/edit.py)
     shard_scenes: int = 64
 
@@ -78,8 +79,10 @@ def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] =
     """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
     options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
     del options["model"]  # the same weights in another directory are the same model
-    if not options.get("repair"):  # runs of before it could be asked for go on
-        options.pop("repair", None)
+    options.setdefault("existence_threshold", pipeline.config.existence_threshold)
+    for name, usual in (("repair", False), ("existence_threshold", EXISTENCE_THRESHOLD)):
+        if options.get(name) == usual:  # runs of before another could be asked for go on
+            del options[name]
     if "resampling" in options and options["resampling"]["eta"] != 1:  # then the pipeline's own scaling matters
         options["noise_scaling"] = pipeline.config.noise_scaling
     claim(options.pop("output"), request.source, request.run, options, parts)
@@ -136,6 +139,7 @@ class Sampler:
                 num_inference_steps=request.num_inference_steps,
                 guidance_scale=request.guidance_scale,
                 noise_scaling=request.noise_scaling,
+                existence_threshold=request.existence_threshold,
                 run=request.run,
             )
         if request.repair:
@@ -154,7 +158,11 @@ def sample_scenes(
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)
     pipeline.use_sampler(request.sampler)
-    request = replace(request, noise_scaling=pipeline.scaling(request.noise_scaling))
+    request = replace(
+        request,
+        noise_scaling=pipeline.scaling(request.noise_scaling),
+        existence_threshold=pipeline.threshold(request.existence_threshold),
+    )
     claim_run(request, pipeline)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
+from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.chart import Chart
 from pipelines.evaluation_report import VALIDITY, headlines, written
 
@@ -76,7 +77,7 @@ class Card:
         yield "```python\nfrom models import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
         yield f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, num_inference_steps=20)\n```\n'
-        yield f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}, the network's noise divided by {self.sampling.get('noise_scaling', 1):g}.*\n"
+        yield f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}, the network's noise divided by {self.sampling.get('noise_scaling', 1):g}, primitives of an existence above {self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         yield f"Conditioned on: {self.label} ({', '.join(self.labels)}).\n"
 
     def _training(self) -> Iterator[str]:
