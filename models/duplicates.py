@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 from models.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 
-# Objects of a category that overlap by more are one object. In the town's held-out scenes no two vehicles overlap by more
-# than 0.04 and no two buildings by more than 0.1; of its fences 4.5 % would go, of signs 3.0, poles 1.7, other objects 0.9.
+# Objects of a category that overlap by more are one object. In the town's 1,000 held-out scenes no two vehicles overlap by
+# more than 0.04 and no two buildings by more than 0.1; of its fences 4.6 % would go, signs 3.4, poles 2.2, others 0.8.
 SAME_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
 SAME_IOU3D[list(VEGETATION)] = 0.3  # crowns grow into each other; asked only of what is drawn beside the known
 SAME_IOU3D[list(VEHICLES)] = 0.05

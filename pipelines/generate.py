@@ -15,7 +15,7 @@ from models.labels import LABELS, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import Grid, Scene
-from models.tensors import EXISTENCE_THRESHOLD, ground_on_grid
+from models.tensors import ground_on_grid
 from pipelines import storage
 from pipelines.claims import claim
 from pipelines.encode import weights_digest
@@ -80,9 +80,8 @@ def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] =
     options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
     del options["model"]  # the same weights in another directory are the same model
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
-    for name, usual in (("repair", False), ("existence_threshold", EXISTENCE_THRESHOLD)):
-        if options.get(name) == usual:  # runs of before another could be asked for go on
-            del options[name]
+    if not options.get("repair"):  # runs of before it could be asked for go on
+        options.pop("repair", None)
     if "resampling" in options and options["resampling"]["eta"] != 1:  # then the pipeline's own scaling matters
         options["noise_scaling"] = pipeline.config.noise_scaling
     claim(options.pop("output"), request.source, request.run, options, parts)

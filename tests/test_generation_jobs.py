@@ -52,6 +52,8 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
     assert [s.scene_id for s in read_scenes(str(samples))] == before
     with pytest.raises(ValueError, match="with seed=0, asked for 5"):
         sample(replace(config, seed=5))
+    with pytest.raises(ValueError, match=r"with existence_threshold=0.3, asked for 0.5"):
+        sample(replace(config, existence_threshold=0.5))
     with pytest.raises(ValueError, match="unknown to a vegetation model, expected one of: low, medium, high"):
         sample(replace(config, run="x", labels=("dense",)))
 

@@ -118,6 +118,25 @@ def test_scaled_noise_is_the_pipelines_own_and_leaves_the_papers_sampler_alone(p
     pipeline.use_sampler("ddpm")
 
 
+def test_what_is_in_a_scene_is_what_is_more_probable_than_the_pipelines_threshold(pipeline, tmp_path):
+    latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.identity("run", 0, 0, "low")]
+    (everything,) = pipeline.decode(latents, identities, 1e-6)
+    middle = float(np.median(everything.existence))
+    (probable,) = pipeline.decode(latents, identities, middle)
+    assert 0 < len(probable) < len(everything) and probable.existence.min() > middle
+    pipeline.register_to_config(existence_threshold=middle)
+    pipeline.save_pretrained(tmp_path)
+    pipeline.register_to_config(existence_threshold=0.3)  # the paper's
+    again = PrITTIPipeline.from_pretrained(tmp_path)
+    again.set_progress_bar_config(disable=True)
+    assert same(again.decode(latents, identities)[0], probable)
+    asked = {"seed": 1, "num_inference_steps": 2}
+    drawn = again.generate(["low"], **asked)[0], pipeline.generate(["low"], **asked, existence_threshold=middle)[0]
+    assert same(*drawn)
+    with pytest.raises(ValueError, match="existence_threshold is 30, expected between 0 and 1"):
+        pipeline.generate(["low"], **asked, existence_threshold=30)
+
+
 def test_guided_resampling_takes_the_pipelines_scaling_and_the_papers_none(pipeline):
     mask = torch.zeros(1, *pipeline.lvae.latent_shape)
     mask[..., :4] = 1

@@ -13,7 +13,11 @@ def evaluated(smoke) -> Path:
     """Scores of the smoke model's own scenes and reconstructions."""
     from jobs import evaluate_scenes, sample_scenes
 
-    sample_scenes.sample(sample_scenes.Config(num_scenes=6, run="judged", sampler="dpm++", steps=2))
+    sample_scenes.sample(
+        sample_scenes.Config(
+            num_scenes=6, run="judged", sampler="dpm++", steps=2, noise_scaling=1.01, existence_threshold=0.25
+        )
+    )
     real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
     config = evaluate_scenes.Config(
         real=real, real_split="test", run="judged", lvae=lvae, limit=4, pictures=0, actors=1
@@ -38,7 +42,9 @@ def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
         assert path.is_dir() or b"/tmp/" not in path.read_bytes()
     for picture in ("samples.png", "failures.png"):
         assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
-    trained = {name: value.tolist() for name, value in load_pipeline(output).dit.state_dict().items()}
+    pipeline = load_pipeline(output)  # which samples as it was judged
+    assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
+    trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
     for name in ("tiny", reference, run_id):
         again = load_pipeline(pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
