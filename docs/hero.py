@@ -1,6 +1,6 @@
 """README's picture, from the released weights: scenes by label, one of them outpainted, and a drive through it.
 
-python docs/hero.py            writes docs/hero.png; a minute on two cores
+python docs/hero.py            writes docs/hero.png; half a minute on two cores
 """
 
 from __future__ import annotations

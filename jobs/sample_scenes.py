@@ -48,7 +48,7 @@ class Config:
     actors: int = 1
     """Pipelines at work at once; one per GPU."""
     batch_size: int = 8
-    """Scenes at once in each pipeline; changes no scene."""
+    """Scenes at once in each pipeline; changes no scene beyond rounding."""
     glb: int = 0
     """Also export the first N scenes as GLB under <output>/glb/<run>."""
 

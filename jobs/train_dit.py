@@ -20,6 +20,8 @@ import tyro
 from jobs.command import absolute, home, run
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from jobs.ray_training import TrainingRun
@@ -70,8 +72,8 @@ class Config:
     seed: int = 0
 
 
-def prepare(config: Config) -> tuple[TrainingRun, str]:
-    """The run that the options mean, and the directory of its LVAE; makes the smoke preset's inputs."""
+def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
+    """The run that the options mean, and what makes a pipeline of its results; makes the smoke preset's inputs."""
     from jobs.smoke import smoke_dataset, smoke_latents
     from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
     from pipelines import storage
@@ -173,18 +175,18 @@ def prepare(config: Config) -> tuple[TrainingRun, str]:
         log_every=max(1, min(50, settings.steps // 50)),
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label),
     )
-    return training, latents["lvae"]
+    return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
 
 
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
-    training, lvae = prepare(config)
+    training, complete = prepare(config)
     from jobs.ray_training import fit
     from pipelines import storage
 
     output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
     fit(training, config.workers, storage.join(output, "dit"))
-    return complete_pipeline(lvae, output)
+    return complete(output)
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,7 @@ class Start:
 
     digest: str
     normalisation: dict  # of latents, as these weights know them
+    sampling: dict  # what their pipeline was published with: noise scaling, existence threshold
     state: dict[str, Tensor]
 
 
@@ -216,7 +219,8 @@ def starting_weights(model: str, lvae_digest: str, architecture: dict) -> Start:
                 f"--start-from {model}: its {key} is {built[key]}, this run's {architecture[key]}; choose them alike"
             )
     normalisation = {"shift": built["shift"], "scale": built["scale"]}
-    return Start(weights_digest(pipeline.dit), normalisation, pipeline.dit.state_dict())
+    sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold")}
+    return Start(weights_digest(pipeline.dit), normalisation, sampling, pipeline.dit.state_dict())
 
 
 def build(
@@ -235,8 +239,11 @@ def build(
     return dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
 
 
-def complete_pipeline(lvae: str, output: str) -> str:
-    """Put the LVAE and the noise schedule beside a trained DiT: `output` is then a PrITTIPipeline directory."""
+def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
+    """Put the LVAE and the noise schedule beside a trained DiT: `output` is then a PrITTIPipeline directory.
+
+    `sampling` holds its `noise_scaling` and `existence_threshold`, where these are not the paper's.
+    """
     import tempfile
 
     from jobs.ray_training import publish_directory
@@ -245,9 +252,8 @@ def complete_pipeline(lvae: str, output: str) -> str:
     from pipelines import storage
     from pipelines.encode import load_lvae
 
-    pipeline = PrITTIPipeline(
-        load_lvae(lvae), DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False), scheduler()
-    )
+    dit = DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False)
+    pipeline = PrITTIPipeline(load_lvae(lvae), dit, scheduler(), **sampling)
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)

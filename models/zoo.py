@@ -1,5 +1,5 @@
 """Presets: one row per model size, same code on every rung. `smoke` takes seconds (tests), `demo` and `town` are
-what two CPU cores can train in minutes and in an hour, `kitti360` and `av2` are the paper (supplement B.2 and B.3)."""
+what two CPU cores can train in half an hour (layout VAE) and three hours (transformer), `kitti360` and `av2` are the paper (supplement B.2 and B.3)."""
 
 from __future__ import annotations
 

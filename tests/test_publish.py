@@ -109,7 +109,7 @@ def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monke
     assert cards[0].read_text() == cards[1].read_text()
 
 
-def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke):
+def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_path):
     import torch
 
     from jobs.publish_model import history
@@ -119,9 +119,12 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke):
     from pipelines.feed import batches
     from pipelines.generate import load_pipeline
 
-    start = str(smoke / "models/pritti-smoke")
+    start, more = str(tmp_path / "start"), tmp_path / "more"
+    pipeline = load_pipeline(str(smoke / "models/pritti-smoke"))
+    pipeline.register_to_config(noise_scaling=1.01, existence_threshold=0.25)
+    pipeline.save_pretrained(start)
     options = {"final_learning_rate": 1e-5, "warmup_steps": 1, "steps": 2}
-    run, _ = prepare(Config(preset="smoke", name="more", start_from=start, **options))
+    run, complete = prepare(Config(preset="smoke", name="more", start_from=start, **options))
     trainer = run.build(torch.device("cpu"), lambda model: model)
     first = load_pipeline(start).dit
     assert weights_digest(trainer.model) == weights_digest(first) == run.identity["start_from"]
@@ -135,6 +138,9 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke):
         ("dit-2", "Transformer, run 2", 2),
     ]
     assert told[1].options["start_from"] == told[0].weights == weights_digest(first)
+    first.save_pretrained(more / "dit")
+    sampling = load_pipeline(complete(str(more))).config
+    assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # as where it began
     with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
