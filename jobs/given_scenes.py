@@ -59,7 +59,7 @@ class Repainting(GivenScenes):
     """The same with one set of RePaint's numbers (paper, Sec. 3.3 and supplement B.3)."""
 
     guided: bool = False
-    """50 steps without RePaint's resamplings and without noise, drawn to what is known: joins better than the paper's numbers and
+    """50 steps without RePaint's resamplings and with little noise, drawn to what is known: joins better than the paper's numbers and
     keeps more objects, for a twenty-fourth of the work. The options below still change its numbers."""
     steps: int | None = None
     """Denoising steps, those that RePaint repeats not counted (default: the paper's 250, or 50)."""
@@ -70,7 +70,7 @@ class Repainting(GivenScenes):
     known_guidance: float | None = None
     """How strongly what is made is drawn to what is known (default: 0, not at all, or 1); a step then costs about two."""
     eta: float | None = None
-    """How much noise a step adds: 1 as DDPM (the paper), 0 none (the default with --guided)."""
+    """How much noise a step adds: 1 as DDPM (the paper), 0 none (default: 1, or 0.3 with --guided)."""
 
     def resampling(self) -> Resampling:
         from models.pipeline import Resampling

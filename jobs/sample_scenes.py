@@ -4,7 +4,7 @@
     jobs/sample_scenes.py                                           64 town scenes, labels in equal parts
     jobs/sample_scenes.py --num-scenes 1000 --labels low --seed 7 --actors 2
     jobs/sample_scenes.py --num-scenes 4 --glb 4                    with GLB files of the first four
-    jobs/sample_scenes.py --sampler dpm++ --steps 20                twelve times as fast
+    jobs/sample_scenes.py --sampler dpm++ --steps 20                eleven times as fast
 
 Scene i depends on --seed and i only, whatever the number of actors or the batch. Run it again with the same options
 to go on after an interruption.
