@@ -28,7 +28,7 @@ def street_views(scene: Scene) -> list[np.ndarray]:
     request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
     cameras = cameras_along(drive(road_network(scene)), request)
     renderer = StreetRenderer(scene)
-    return [shaded(renderer.view(cameras[k])) for k in np.linspace(0, 0.8 * len(cameras), FRAMES).astype(int)]
+    return [shaded(renderer.view(cameras[k])) for k in np.linspace(0, 0.6 * len(cameras), FRAMES).astype(int)]
 
 
 def stacked(pictures: list[np.ndarray], axis: int) -> np.ndarray:
