@@ -5,7 +5,7 @@ python benchmarks/bev.py --dataset DIRECTORY  scenes spread over a dataset
 
 The plain way is vectorised within a primitive, on the pixels of its bounds, and knows no tolerance at edges. CPU
 seconds of one thread; reading is not counted. Workers of the jobs keep freed memory, so set MALLOC_MMAP_MAX_=0 and
-MALLOC_TRIM_THRESHOLD_=-1 as jobs/command.py does.
+MALLOC_TRIM_THRESHOLD_=-1 as jobs/support/cli.py does.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import tyro
 from common import DENSE_SEEDS, interleaved, ratios, spread, where
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, GROUND_CLASS_ID
-from pipelines.scenes.render import bev_picture
-from pipelines.selection import Selection
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.rendering.render import bev_picture
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, GROUND_CLASS_ID
+from pipelines.schema.scene_subset import Selection
 
 ROUNDS = 7
 SCENES = 32

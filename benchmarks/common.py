@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import origin
-from pipelines.sources.drive import Drive
-from pipelines.sources.town import town_drive, write_kitti360
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.runtime import provenance
 
 DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop
 
 
 def where() -> str:
     """Machine, versions and commit in one line."""
-    return f"{origin.machine()}, {origin.versions()}, numpy {np.__version__}, commit {origin.commit()}"
+    return f"{provenance.machine()}, {provenance.versions()}, numpy {np.__version__}, commit {provenance.commit()}"
 
 
 def interleaved(

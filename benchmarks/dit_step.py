@@ -21,9 +21,9 @@ from common import interleaved, ratios, spread, where
 from diffusers import DiTTransformer2DModel
 from plain_dit import PlainDiT
 
-from models.diffusion import Diffusion, guided
 from models.dit import DiT
-from models.zoo import DIT_PRESETS
+from models.presets import DIT_PRESETS
+from models.sampling.diffusion import Diffusion, guided
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def alone(count: int) -> None:
 def over_ray(count: int) -> None:
     import ray
 
-    from pipelines.evaluate import spread_neighbourhoods
+    from pipelines.evaluation.evaluate import spread_neighbourhoods
 
     ray.init(address="local", logging_level="WARNING")
     real, generated = (features(count, seed, True) for seed in (0, 1))

@@ -20,7 +20,7 @@ from common import DENSE_SEEDS, interleaved, ratios, spread, where
 from scipy.spatial.transform import Rotation
 from test_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs, random_boxes, sphere_lens
 
-from models.iou3d import (
+from models.geometry.iou3d import (
     Boxes,
     boxes,
     boxes_of,
@@ -30,7 +30,7 @@ from models.iou3d import (
     overlapping_bounds,
 )
 from models.scene import ELLIPSOID
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
 
 ROUNDS = 7
 NUM_PAIRS, NUM_MANIFOLD = 100_000, 1_000

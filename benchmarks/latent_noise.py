@@ -17,10 +17,10 @@ from common import where
 from models.lvae import LayoutVAE
 from models.scene import CATEGORIES, Scene
 from models.tensors import layout_batch, scene_from_layout
-from pipelines.dataset import Dataset
-from pipelines.encode import load_lvae
 from pipelines.metrics.validity import LABEL_MEASURES, label_fidelity, scene_validity, slab_offset_m, validity_rates
-from pipelines.selection import Selection
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
+from pipelines.training.latents import load_lvae
 
 
 @dataclass(frozen=True)

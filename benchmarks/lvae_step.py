@@ -18,11 +18,11 @@ import tyro
 from common import ratios, spread, where
 from matching import town_batch
 
-from models import losses
 from models.layout import LayoutSpec
-from models.losses import lvae_loss
 from models.lvae import LayoutVAE
-from models.zoo import LVAE_PRESETS, preset
+from models.presets import LVAE_PRESETS, preset
+from models.vae import losses
+from models.vae.losses import lvae_loss
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import torch
 from common import interleaved, ratios, spread, where
 
 from models.layout import LayoutSpec
-from models.matching import PAPER_WEIGHTS, match
 from models.scene import Grid
 from models.tensors import layout_batch
-from pipelines.sources.town import town_drive
+from models.vae.matching import PAPER_WEIGHTS, match
+from pipelines.preprocess.sources.town.generator import town_drive
 
 BATCH = 32
 

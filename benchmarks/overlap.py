@@ -17,15 +17,15 @@ import torch
 import tyro
 from common import where
 
+from models.composition.outpaint import Block, Lattice, World, height_near
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.outpaint import Block, Lattice, World, height_near
 from models.scene import Grid, Scene
 from models.tensors import layout_batch, new_scene, scene_from_layout
-from pipelines.encode import load_lvae
-from pipelines.generate import on_model_grid
-from pipelines.inpaint import drift, drift_scores
-from pipelines.sources.town import town_drive
+from pipelines.generation.inpaint import drift, drift_scores
+from pipelines.generation.sample import on_model_grid
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.training.latents import load_lvae
 
 STEP_M = 32.0
 

@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from scipy.optimize import linear_sum_assignment
 
-from models import losses
 from models.layout import LayoutSpec
-from models.objects import ObjectEncoder
+from models.vae import losses
+from models.vae.objects import ObjectEncoder
 
 
 def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
@@ -36,7 +36,7 @@ def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
 
 @torch.no_grad()
 def match(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
-    """As models.matching.match."""
+    """As models.vae.matching.match."""
     assignment = torch.full(logit.shape, -1, dtype=torch.long)
     for sample in range(len(features)):
         slot = proposal = 0
@@ -53,7 +53,7 @@ def match(features, logit, truth, real, slots, proposals, weights) -> torch.Tens
 
 
 def object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
-    """As models.losses.object_losses."""
+    """As models.vae.losses.object_losses."""
     totals = [features.new_zeros(()) for _ in range(3)]
     batch = len(features)
     for sample in range(batch):

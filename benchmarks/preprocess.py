@@ -23,14 +23,15 @@ import tyro
 from common import interleaved, ratios, spread, where, with_dense_poses, write_raw
 
 from models.scene import Grid
-from pipelines import cut, storage
-from pipelines.dataset import training_statistics
-from pipelines.feed import LayoutReader
-from pipelines.plan import plan_kitti360
-from pipelines.scenes.tables import Shard, scene_tables
-from pipelines.sources import kitti360
-from pipelines.sources.drive import Drive
-from pipelines.sources.town import town_drive, write_kitti360
+from pipelines.preprocess import shard_writer
+from pipelines.preprocess.sharding import plan_kitti360
+from pipelines.preprocess.sources import kitti360
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.runtime import storage
+from pipelines.schema.dataset import training_statistics
+from pipelines.schema.tables import Shard, scene_tables
+from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
 pa.set_io_thread_count(1)
@@ -84,16 +85,18 @@ def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, fl
         clock = time.process_time()
         near = drive.at(poses[start : start + 256], grid)
         tables = []
-        for first in range(0, len(near), cut.BATCH_SCENES):
-            batch = [near.scene(k, "train", grid) for k in range(first, min(first + cut.BATCH_SCENES, len(near)))]
+        for first in range(0, len(near), shard_writer.BATCH_SCENES):
+            batch = [
+                near.scene(k, "train", grid) for k in range(first, min(first + shard_writer.BATCH_SCENES, len(near)))
+            ]
             now = time.process_time()
             spent["cut and rasterise"] += now - clock
             tables.append(scene_tables(batch))
-            cut.extremes(batch)
+            shard_writer.extremes(batch)
             clock = time.process_time()
             spent["to tables"] += clock - now
         shard = Shard(out, "kitti360", "train", number)
-        for name, table in cut.joined_tables(tables).items():
+        for name, table in shard_writer.joined_tables(tables).items():
             storage.write_parquet(table, shard.path(name))
         spent["write Parquet"] += time.process_time() - clock
     return {name: 1e3 * seconds / len(poses) for name, seconds in spent.items()}
@@ -136,7 +139,7 @@ def peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
 
 def _one_shard(folder: str, results: multiprocessing.Queue) -> None:
     tasks = plan_kitti360(folder + "/raw", split=False)
-    cut.write_shard(tasks[0], folder + "/out", Grid())
+    shard_writer.write_shard(tasks[0], folder + "/out", Grid())
     poses = sum(len(task.parts[0].poses) for task in tasks)
     peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     results.put((poses, int(peak.split()[1]) / 1024))
@@ -191,7 +194,7 @@ def main(config: Config) -> None:
 
         shards = [Shard(f"{out}/0", "kitti360", "train", k) for k in range(-(-len(poses) // 256))]
         manifest = {"source": "kitti360", "split": "train", "number": 0, "scenes": 1, "ground_classes": list(drive.ground_classes)}  # fmt: skip
-        manifest["extremes"] = cut.extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
+        manifest["extremes"] = shard_writer.extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
         spec = training_statistics([manifest], f"{out}/0", grid, None).spec
         for pixels in (256, 128):
             reader, rates = LayoutReader(spec.with_resolution(pixels)), []

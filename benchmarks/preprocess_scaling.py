@@ -27,10 +27,10 @@ import ray.data
 import tyro
 from common import DENSE_SEEDS, spread, where, write_raw
 
-from pipelines.ingest import ingest
-from pipelines.plan import Task, plan_kitti360
-from pipelines.scenes.tables import find_shards
-from pipelines.sources import kitti360
+from pipelines.preprocess.ingest import ingest
+from pipelines.preprocess.sharding import Task, plan_kitti360
+from pipelines.preprocess.sources import kitti360
+from pipelines.schema.tables import find_shards
 
 FULL_POSES, FULL_LOGS = 80_000, 1_000  # KITTI-360; Argoverse 2, two logs a shard
 

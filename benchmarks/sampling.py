@@ -27,9 +27,9 @@ from models.labels import LABELS
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline, scheduler
-from models.zoo import DIT_PRESETS, LVAE_PRESETS
-from pipelines.generate import load_pipeline
-from pipelines.scenes.tables import Shard
+from models.presets import DIT_PRESETS, LVAE_PRESETS
+from pipelines.generation.sample import load_pipeline
+from pipelines.schema.tables import Shard
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ import tyro
 from common import DENSE_SEEDS, interleaved, ratios, spread, where
 
 from models.scene import Scene
-from pipelines.scenes.mesh import scene_triangles
-from pipelines.scenes.palette import EMPTY
-from pipelines.scenes.render import png
-from pipelines.scenes.roads import drive, road_network
-from pipelines.scenes.street import Lens, StreetCamera, StreetRenderer, shaded
-from pipelines.sources.town import town_drive
-from pipelines.streets import StreetRequest, cameras_along, depth_image
+from pipelines.geometry.centerlines import drive, road_network
+from pipelines.io.mesh_export import scene_triangles
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shaded
+from pipelines.rendering.render import png
+from pipelines.rendering.street_views import StreetRequest, cameras_along, depth_image
+from pipelines.schema.palette import EMPTY
 
 ROUNDS = 5
 FRAMES = 8  # of a scene

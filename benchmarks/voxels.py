@@ -18,10 +18,10 @@ from common import DENSE_SEEDS, interleaved, ratios, spread, where
 from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORY_INDEX, ELLIPSOID, Scene
+from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, voxelise
 from pipelines.metrics.reconstruction import voxel_confusion
-from pipelines.scenes.palette import CLASS_ID, EMPTY
-from pipelines.scenes.voxels import PRECEDENCE, VoxelGrid, voxelise
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.palette import CLASS_ID, EMPTY
 
 ROUNDS = 7
 PAPER_OBJECTS = 514

@@ -12,10 +12,10 @@ import numpy as np
 from models import PrITTIPipeline
 from models.pipeline import Resampling
 from models.scene import Scene
-from pipelines.scenes.render import picture_3d, png
-from pipelines.scenes.roads import drive, road_network
-from pipelines.scenes.street import Lens, StreetRenderer, shaded
-from pipelines.streets import StreetRequest, cameras_along
+from pipelines.geometry.centerlines import drive, road_network
+from pipelines.rendering.pinhole import Lens, StreetRenderer, shaded
+from pipelines.rendering.render import picture_3d, png
+from pipelines.rendering.street_views import StreetRequest, cameras_along
 
 GAP, WIDTH, HEIGHT, FRAME = 12, 480, 360, 154  # pixels: between pictures, of a scene, height of a street view
 SEED = 0

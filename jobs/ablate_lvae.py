@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.support.cli import absolute, home, print_table, run, start_ray
 
 if TYPE_CHECKING:
-    from jobs.ray_training import TrainingRun
-    from jobs.tracking import Tracker
+    from jobs.support.tracking import Tracker
+    from jobs.support.trainer import TrainingRun
     from models.batch import LayoutBatch
     from models.lvae import LayoutVAE
-    from pipelines.ablation import Variant
-    from pipelines.chart import Chart
-    from pipelines.report import Table
+    from pipelines.evaluation.ablation import Variant
+    from pipelines.reporting.chart import Chart
+    from pipelines.reporting.report import Table
 
 TIMING_STEPS = 60
 
@@ -135,9 +135,10 @@ def compare_encodings(config: Encoding) -> str:
     """Train what is missing, write the tables, figures and page, and return the directory."""
     from rich.progress import Progress
 
-    from jobs.tracking import Tracker
-    from models.orientation_study import Settings
-    from pipelines import ablation, storage
+    from jobs.support.tracking import Tracker
+    from models.studies.orientation_study import Settings
+    from pipelines.evaluation import ablation
+    from pipelines.runtime import storage
 
     output = absolute(config.output) if config.output else home("ablations", "encoding")
     settings = Settings(config.epochs, config.batch_size, config.learning_rate)
@@ -191,9 +192,10 @@ def compare_encodings(config: Encoding) -> str:
 
 def compare_variants(config: Branches) -> str:
     """Train and score what is missing, write the table, curves and page, and return the directory."""
-    from jobs.tracking import Tracker
-    from models.zoo import LVAE_PRESETS, preset
-    from pipelines import ablation, storage
+    from jobs.support.tracking import Tracker
+    from models.presets import LVAE_PRESETS, preset
+    from pipelines.evaluation import ablation
+    from pipelines.runtime import storage
 
     output = absolute(config.output) if config.output else home("ablations", config.name)
     if config.minutes <= 0 or config.seeds < 1:
@@ -225,7 +227,7 @@ def compare_variants(config: Branches) -> str:
 
 def variants(config: Branches) -> dict[str, Variant]:
     """By name, those of `--only`. Raises ValueError for a name that the study lacks."""
-    from pipelines import ablation
+    from pipelines.evaluation import ablation
 
     studies = {
         Branches: ablation.BRANCHES,
@@ -277,12 +279,13 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     import time
     from dataclasses import replace
 
-    from jobs.ray_training import fit
+    from jobs.support.trainer import fit
     from models.tensors import layout_batch
-    from pipelines import ablation, storage
-    from pipelines.encode import load_lvae
-    from pipelines.rebuild import rebuild
-    from pipelines.selection import Selection
+    from pipelines.evaluation import ablation
+    from pipelines.evaluation.reconstruction import rebuild
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
+    from pipelines.training.latents import load_lvae
 
     timed = variant if at_equal_time(config) else next(iter(variants(replace(config, only=()))))
     steps = config.steps or affordable_steps(config, timed, output)
@@ -316,8 +319,8 @@ def affordable_steps(config: Branches, variant: str, output: str) -> int:
     from dataclasses import replace
     from statistics import median
 
-    from jobs.ray_training import fit
-    from pipelines import storage
+    from jobs.support.trainer import fit
+    from pipelines.runtime import storage
 
     record = storage.join(output, f"timing-{slug(variant)}.json")
     if not storage.exists(record):
@@ -338,7 +341,7 @@ def affordable_steps(config: Branches, variant: str, output: str) -> int:
 
 def claim(output: str, options: dict) -> None:
     """Keep a directory for one set of options. Raises ValueError if it holds the trials of another."""
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     record = storage.join(output, "study.json")
     kept = [path for path in storage.list_files(output, ".json") if not path.endswith(("/study.json", "/mlflow.json"))]
@@ -357,8 +360,8 @@ def write_tables(
     """NAME.json and NAME.parquet with every number, NAME.txt with the tables as shown, NAME.svg with the figure."""
     import pyarrow as pa
 
-    from pipelines import storage
-    from pipelines.chart import standalone_svg
+    from pipelines.reporting.chart import standalone_svg
+    from pipelines.runtime import storage
 
     storage.write_json({"machine": machine(), "rows": rows}, storage.join(output, f"{name}.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, f"{name}.parquet"))
@@ -373,7 +376,7 @@ def write_tables(
 
 def publish(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -> None:
     """Write the page, hand it to MLflow, print the tables."""
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     path = storage.join(output, "report.html")
     storage.write_text(html, path)

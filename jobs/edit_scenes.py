@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.support.cli import absolute, home, print_table, run, start_ray
 
 if TYPE_CHECKING:
-    from pipelines.edits import Edited
-    from pipelines.scenes.edit import Edit
+    from pipelines.editing.edit import Edit
+    from pipelines.generation.batch_edit import Edited
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,8 @@ Config = (
 
 def edits_of(config: Chosen | Replay) -> list[Edit]:
     """The edits that the command line or a file asks for. Raises ValueError for a list that is none."""
-    from pipelines import storage
-    from pipelines.scenes import edit
+    from pipelines.editing import edit
+    from pipelines.runtime import storage
 
     if isinstance(config, Replay):
         if not config.edits:
@@ -205,7 +205,7 @@ def edits_of(config: Chosen | Replay) -> list[Edit]:
 
 def edit_scenes(config: Chosen | Replay) -> Edited:
     """Edit, write, and return what was changed."""
-    from pipelines.selection import Selection
+    from pipelines.schema.scene_subset import Selection
 
     if config.pictures < 0 or not config.run or set(config.run) & set("/=\\"):
         raise ValueError(f"--pictures is {config.pictures}, --run {config.run!r}: expected 0 or more, a plain word")
@@ -217,7 +217,7 @@ def edit_scenes(config: Chosen | Replay) -> Edited:
     total = sum(len(rows) for _, rows in selection.shards())
     from rich.progress import Progress
 
-    from pipelines import edits as graph
+    from pipelines.generation import batch_edit as graph
 
     start_ray()
     with Progress() as bar:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class Config:
 
 def encode(config: Config) -> dict:
     """Encode and return the content of latents.json."""
-    from pipelines.dataset import Dataset
+    from pipelines.schema.dataset import Dataset
 
     dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
     from rich.progress import Progress
 
-    from pipelines.encode import encode_latents
+    from pipelines.training.latents import encode_latents
 
     lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
     output = absolute(config.output) if config.output else dataset.root

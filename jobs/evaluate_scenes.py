@@ -21,13 +21,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from pipelines.dataset import Dataset
-    from pipelines.describe import Looks, Side
+    from pipelines.evaluation.features import Looks, Side
+    from pipelines.schema.dataset import Dataset
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def evaluate(config: Config) -> dict:
     """Score, write and return the nested metrics, as metrics.json holds them."""
     from rich.progress import Progress
 
-    from jobs.tracking import publish_scores
-    from pipelines.dataset import Dataset
+    from jobs.support.tracking import publish_scores
+    from pipelines.schema.dataset import Dataset
 
     for name, least in (("pictures", 0), ("samples", 2), ("supersample", 1)):
         if (given := getattr(config, name)) < least:
@@ -92,7 +92,7 @@ def evaluate(config: Config) -> dict:
     named = config.run or config.generated_source or not config.lvae
     wanted = config.generated or (home("generated") if named else "")
     output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     if config.inception and not storage.exists(absolute(config.inception)):
         raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
@@ -119,9 +119,9 @@ def evaluate(config: Config) -> dict:
 
 def scored(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> dict:
     """What scores are of: either side, how the generated one was sampled if one run made it all, the LVAE's weights."""
-    from pipelines import storage
-    from pipelines.encode import load_lvae, weights_digest
-    from pipelines.selection import Selection
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
+    from pipelines.training.latents import load_lvae, weights_digest
 
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
     about["lvae_weights"] = weights_digest(load_lvae(absolute(config.lvae))) if config.lvae else None
@@ -137,12 +137,12 @@ def scored(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> d
 
 def generation(config: Config, dataset: Dataset | None, sides: dict[str, Side], output: str, bar: Progress) -> dict:
     """Scores of the generated scenes; writes evaluation.html and what is known of each scene, under described/."""
-    from pipelines import storage
-    from pipelines.describe import Looks, PictureFile, describe
-    from pipelines.evaluate import compare, memorisation, plain
-    from pipelines.evaluation_report import evaluation_html
+    from pipelines.evaluation.evaluate import compare, memorisation, plain
+    from pipelines.evaluation.example_images import pictures_shown
+    from pipelines.evaluation.features import Looks, PictureFile, describe
     from pipelines.metrics.adm_npz import reference_moments
-    from pipelines.sides import pictures_shown
+    from pipelines.reporting.evaluation_report import evaluation_html
+    from pipelines.runtime import storage
 
     looks = Looks(config.supersample, config.inception and absolute(config.inception))
     described = {}
@@ -171,9 +171,9 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     """Both sides, of equal number. Raises ValueError for pictures of unequal size."""
     from dataclasses import replace
 
-    from pipelines.describe import PictureFile
+    from pipelines.evaluation.features import PictureFile
     from pipelines.metrics.adm_npz import picture_shape
-    from pipelines.selection import Selection
+    from pipelines.schema.scene_subset import Selection
 
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = absolute(config.generated) if config.generated else home("generated")
@@ -201,7 +201,7 @@ def chosen_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
 
 def protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
     """How it was done, in words."""
-    from pipelines.describe import PictureFile
+    from pipelines.evaluation.features import PictureFile
     from pipelines.metrics.inception import weights_line
 
     how = {
@@ -224,10 +224,10 @@ def protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
 
 def reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Scores; writes reconstruction.parquet, a row per scene, and reconstruction.html with the best and worst of them."""
-    from pipelines import storage
-    from pipelines.rebuild import draw, rebuild
-    from pipelines.reconstruction_report import reconstruction_html
-    from pipelines.selection import Selection
+    from pipelines.evaluation.reconstruction import draw, rebuild
+    from pipelines.reporting.reconstruction_report import reconstruction_html
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
 
     real = Selection(dataset.root, dataset.source, config.lvae_split, config.limit)
     lvae = absolute(config.lvae)
@@ -257,7 +257,7 @@ def main(config: Config) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pipelines.evaluation_report import headlines, written
+    from pipelines.reporting.evaluation_report import headlines, written
 
     lines = Table("metric", "value")
     for name, value in headlines(evaluate(config)):

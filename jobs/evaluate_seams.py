@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 ENOUGH_SEAMS = 200
 SHOWN = 6
@@ -48,11 +48,11 @@ def evaluate_seams(config: Config) -> dict:
     """Score, write and return the ratios of both sides."""
     from rich.progress import Progress
 
-    from jobs.tracking import publish_scores
-    from pipelines import storage
-    from pipelines.evaluate import plain
-    from pipelines.seams import Lines, join_sides, measure, seams_html, seams_table
-    from pipelines.selection import Selection
+    from jobs.support.tracking import publish_scores
+    from pipelines.evaluation.evaluate import plain
+    from pipelines.evaluation.seams import Lines, join_sides, measure, seams_html, seams_table
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
 
     output = absolute(config.output) if config.output else home("evaluations", "seams")
     source = f"generated-{config.run}" if config.run else None
@@ -93,7 +93,7 @@ def main(config: Config) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pipelines.seams import shown_rows
+    from pipelines.evaluation.seams import shown_rows
 
     scores = evaluate_seams(config)
     lines = Table("across seams over nearby lines", "generated", "real")

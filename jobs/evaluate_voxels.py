@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ def evaluate(config: Config) -> dict:
     """Score, write and return the nested metrics."""
     from rich.progress import Progress
 
-    from jobs.tracking import publish_scores
-    from pipelines import storage
-    from pipelines.rebuilt_voxels import files_by_scene, paired, score_voxels, true_scenes
-    from pipelines.scenes.axes import scene_from_axes
-    from pipelines.scenes.voxel_import import VOXEL_AXES
-    from pipelines.scenes.voxels import VoxelGrid
+    from jobs.support.tracking import publish_scores
+    from pipelines.evaluation.voxel_reconstruction import files_by_scene, paired, score_voxels, true_scenes
+    from pipelines.geometry.voxels import VoxelGrid
+    from pipelines.io.voxel_import import VOXEL_AXES
+    from pipelines.runtime import storage
+    from pipelines.schema.axis_convention import scene_from_axes
 
     axes, truth_axes = config.axes or VOXEL_AXES, config.truth_axes or VOXEL_AXES
     for words in (axes, truth_axes):

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Config:
 
 def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     """Write and return the output directory, the number of files per format, and why which were not written."""
-    from pipelines import storage
-    from pipelines.selection import Selection
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
 
     if not config.formats:
         raise ValueError("--formats is empty, expected some of glb, ply, npz, xodr")
@@ -49,7 +49,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     total = sum(len(rows) for _, rows in selection.shards())
     from rich.progress import Progress
 
-    from pipelines.export import export_scenes
+    from pipelines.io.export import export_scenes
 
     start_ray()
     with Progress() as bar:

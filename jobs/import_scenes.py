@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ def import_scenes(config: Config) -> tuple[str, dict]:
     """Import and return what to give to evaluate_scenes --generated, and the content of imported-<name>.json."""
     from rich.progress import Progress
 
-    from pipelines.imports import ImportRequest, find_files, import_files
-    from pipelines.scenes.axes import scene_from_axes
-    from pipelines.scenes.mesh_import import AUTHORS_AXES
-    from pipelines.scenes.voxel_import import VOXEL_AXES
+    from pipelines.io.mesh_import import AUTHORS_AXES
+    from pipelines.io.voxel_import import VOXEL_AXES
+    from pipelines.preprocess.import_external import ImportRequest, find_files, import_files
+    from pipelines.schema.axis_convention import scene_from_axes
 
     if not config.name or set(config.name) & set("/=\\"):
         raise ValueError(f"--name is {config.name!r}, expected a word without slashes")

@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, require_positive, run, start_ray
-from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
+from jobs.support.cli import absolute, home, require_positive, run, start_ray
+from jobs.support.options import Repainting, pipeline_directory, require_model_labels
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
     require_model_labels(model, [config.label] if config.label else [])
     from rich.progress import Progress
 
-    from pipelines.inpaint import InpaintRequest, Where, inpaint_scenes
+    from pipelines.generation.inpaint import InpaintRequest, Where, inpaint_scenes
 
     selection = config.selection()
     total = sum(len(rows) for _, rows in selection.shards())

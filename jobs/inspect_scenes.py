@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipelines.gallery import Catalogue
+    from pipelines.reporting.contact_sheet import Catalogue
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,10 @@ def draw_scenes(config: OneScene) -> list[str]:
     """Write the PNGs, and GLBs, and return their paths."""
     from rich.progress import Progress
 
-    from pipelines import storage
-    from pipelines.gallery import Catalogue, scene_plate
-    from pipelines.scenes.mesh import scene_glb
-    from pipelines.scenes.render import png
+    from pipelines.io.mesh_export import scene_glb
+    from pipelines.rendering.render import png
+    from pipelines.reporting.contact_sheet import Catalogue, scene_plate
+    from pipelines.runtime import storage
 
     if config.count < 1:
         raise ValueError(f"--count is {config.count}, expected at least 1")
@@ -160,7 +160,7 @@ def painted(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> list[list
     """Pictures of the chosen scenes, drawn by Ray under a progress bar."""
     from rich.progress import Progress
 
-    from pipelines.gallery import paint
+    from pipelines.reporting.contact_sheet import paint
 
     start_ray()
     with Progress() as bar:
@@ -170,9 +170,9 @@ def painted(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> list[list
 
 def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
-    from pipelines import storage
-    from pipelines.gallery import Catalogue, View, captions, scene_sheet, sheet_title
-    from pipelines.scenes.render import png
+    from pipelines.rendering.render import png
+    from pipelines.reporting.contact_sheet import Catalogue, View, captions, scene_sheet, sheet_title
+    from pipelines.runtime import storage
 
     for name in ("count", "size"):
         if getattr(config, name) < 1:
@@ -191,10 +191,10 @@ def write_page(config: Report) -> str:
     """Write the page and return its path."""
     from rich.progress import Progress
 
-    from pipelines import storage
-    from pipelines.dataset_report import dataset_html, read_facts
-    from pipelines.gallery import View, captions
-    from pipelines.report import Picture
+    from pipelines.reporting.contact_sheet import View, captions
+    from pipelines.reporting.dataset_report import dataset_html, read_facts
+    from pipelines.reporting.report import Picture
+    from pipelines.runtime import storage
 
     with Progress() as bar:
         shown = bar.add_task("read tables", total=None)
@@ -223,9 +223,9 @@ def write_gallery(config: Gallery) -> str:
     """Write the page and return its path."""
     from rich.progress import Progress
 
-    from pipelines import storage
-    from pipelines.gallery import Catalogue
-    from pipelines.gallery_page import gallery_html
+    from pipelines.reporting.contact_sheet import Catalogue
+    from pipelines.reporting.gallery_page import gallery_html
+    from pipelines.runtime import storage
 
     if config.count < 1:
         raise ValueError(f"--count is {config.count}, expected at least 1")

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING, Literal
 
-from jobs.command import absolute, home, require_positive, run, start_ray
-from jobs.given_scenes import Repainting, pipeline_directory, require_model_labels
+from jobs.support.cli import absolute, home, require_positive, run, start_ray
+from jobs.support.options import Repainting, pipeline_directory, require_model_labels
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -78,7 +78,7 @@ def outpaint(config: Config) -> pa.Table:
     require_model_labels(model, [config.label] if config.label else [])
     from rich.progress import MofNCompleteColumn, Progress
 
-    from pipelines.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 
     selection = config.selection()
     count = sum(len(rows) for _, rows in selection.shards())
@@ -106,7 +106,7 @@ def outpaint(config: Config) -> pa.Table:
 def main(config: Config) -> None:
     import pyarrow.compute as pc
 
-    from pipelines.outpaint import HARDLY_KNOWN
+    from pipelines.generation.outpaint import HARDLY_KNOWN
 
     blocks, output = outpaint(config), config.output_directory()
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, require_positive, run, start_ray
+from jobs.support.cli import absolute, home, require_positive, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def paint(config: Config) -> tuple[str, int]:
         if not value:
             raise ValueError(f"{name} is missing: give a local directory in diffusers' layout")
     require_positive(config, "steps", "actors")
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
         if not storage.list_files(absolute(value), ".json"):
@@ -50,7 +50,7 @@ def paint(config: Config) -> tuple[str, int]:
     streets = absolute(config.streets) if config.streets else home("generated", "streets", "drive")
     from rich.progress import Progress
 
-    from pipelines.street_photos import PhotoRequest, drives, paint_streets
+    from pipelines.rendering.controlnet import PhotoRequest, drives, paint_streets
 
     directories = drives(streets)
     request = PhotoRequest(

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,9 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from models.layout import PAPER_SLOTS
-    from pipelines import plan
-    from pipelines.ingest import ingest
-    from pipelines.sources.town import TOWN_VERSION
+    from pipelines.preprocess import sharding
+    from pipelines.preprocess.ingest import ingest
+    from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
     source = type(config).__name__.lower()
     options = asdict(config) | {"source": source}
@@ -103,15 +103,15 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     skip = options.pop("skip_unreadable", False)
     if isinstance(config, Town):
         options["town_version"] = TOWN_VERSION
-        tasks = plan.plan_town(config.num_train, config.num_test, config.seed)
+        tasks = sharding.plan_town(config.num_train, config.num_test, config.seed)
     else:
         options["input"] = absolute(config.input)
         if "://" not in config.input and not os.path.isdir(options["input"]):
             raise ValueError(f"--input {config.input}: no such directory; give the dataset's root")
         if isinstance(config, Av2):
-            tasks = plan.plan_argoverse2(options["input"])
+            tasks = sharding.plan_argoverse2(options["input"])
         else:
-            plan_drives = plan.plan_kitti360 if isinstance(config, Kitti360) else plan.plan_own
+            plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_own
             tasks = plan_drives(options["input"], config.split, skip)
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
 

@@ -17,13 +17,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jobs.command import absolute, home, run
-from jobs.given_scenes import ModelOption, pipeline_directory
+from jobs.support.cli import absolute, home, run
+from jobs.support.options import ModelOption, pipeline_directory
 
 if TYPE_CHECKING:
     import torch
 
-    from pipelines.model_card import Training
+    from pipelines.reporting.model_card import Training
 
 SHOWN = 32  # scenes on the card, the first ones
 JUDGED = 256  # of which the ones with most faults are shown
@@ -48,17 +48,17 @@ def publish(config: Config) -> list[str]:
     """Write the entry; what --model takes for it: its directory, and if registered models:/NAME/VERSION and the run."""
     import tempfile
 
-    from jobs.ray_training import publish_directory
-    from jobs.registry import EXPERIMENT, PIPELINE, registered
-    from jobs.tracking import Tracker
+    from jobs.support.registry import EXPERIMENT, PIPELINE, registered
+    from jobs.support.tracking import Tracker
+    from jobs.support.trainer import publish_directory
     from models.labels import LABELS
-    from models.released import CHECKSUMS, TRAINING, checksums
+    from models.pretrained import CHECKSUMS, TRAINING, checksums
     from models.tensors import EXISTENCE_THRESHOLD
-    from pipelines import storage
-    from pipelines.chart import standalone_svg
-    from pipelines.encode import weights_digest
-    from pipelines.generate import load_pipeline
-    from pipelines.model_card import Card
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.reporting.chart import standalone_svg
+    from pipelines.reporting.model_card import Card
+    from pipelines.runtime import storage
+    from pipelines.training.latents import weights_digest
 
     pipeline = load_pipeline(pipeline_directory(config.model))
     weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
@@ -113,7 +113,7 @@ def publish(config: Config) -> list[str]:
 
 def forget_paths(directory: str) -> None:
     """Drop what diffusers keeps of where a model was loaded from: a directory of this machine."""
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     for path in storage.list_files(directory, ".json"):
         content = storage.read_json(path)
@@ -122,7 +122,7 @@ def forget_paths(directory: str) -> None:
 
 def evaluation_of(directory: str, weights: list[str]) -> tuple[dict, dict]:
     """What was evaluated, and its scores. Raises ValueError if that is missing or of other weights."""
-    from pipelines import storage
+    from pipelines.runtime import storage
 
     advice = "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and name its --output"
     if not storage.exists(storage.join(directory, "evaluation.json")):
@@ -148,7 +148,7 @@ def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Trainin
     """
     from dataclasses import replace
 
-    from pipelines.encode import weights_digest
+    from pipelines.training.latents import weights_digest
 
     parameters = sum(value.numel() for value in model.parameters())
     runs = [training_of(experiment, stage, weights_digest(model), parameters)]
@@ -161,8 +161,8 @@ def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Trainin
 
 def training_of(experiment: str, stage: str, digest: str, parameters: int | None) -> Training:
     """The run that made the weights of a digest. Raises ValueError if nothing tells of it."""
-    from jobs.tracking import Tracker, client, shown, tracking_uri
-    from pipelines.model_card import Training
+    from jobs.support.tracking import Tracker, client, shown, tracking_uri
+    from pipelines.reporting.model_card import Training
 
     uri = tracking_uri()
     api = client(uri)
@@ -190,8 +190,8 @@ def training_of(experiment: str, stage: str, digest: str, parameters: int | None
 
 def recorded(digest: str) -> dict | None:
     """What a published entry of this machine, or of the package, says of the run that made these weights."""
-    from models.released import TRAINING, WEIGHTS
-    from pipelines import storage
+    from models.pretrained import TRAINING, WEIGHTS
+    from pipelines.runtime import storage
 
     for zoo in (str(WEIGHTS), home("zoo")):
         for path in storage.list_files(zoo, TRAINING):
@@ -228,10 +228,10 @@ def pictures(about: Mapping) -> dict[str, bytes]:
     """PNGs of the first scenes of those that were evaluated, and of those with most faults among the first JUDGED."""
     import numpy as np
 
-    from pipelines.dataset import Dataset
     from pipelines.metrics.validity import scene_validity, slab_offset_m
-    from pipelines.scenes.render import bev_picture, contact_sheet, png
-    from pipelines.scenes.tables import read_scenes
+    from pipelines.rendering.render import bev_picture, contact_sheet, png
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.tables import read_scenes
 
     offset_m = slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))

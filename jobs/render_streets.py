@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
+from jobs.support.cli import absolute, home, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ def render(config: Config) -> dict[str, int]:
         raise ValueError(
             f"--pitch-deg is {config.pitch_deg}, --right {config.right}: expected -90 to 90, and -0.5 to 0.5"
         )
-    from pipelines.selection import Selection
+    from pipelines.schema.scene_subset import Selection
 
     directory = absolute(config.input) if config.input else home("generated")
     selection = Selection(directory, config.source or None, config.split or None, config.limit, "first")
     total = sum(len(rows) for _, rows in selection.shards())
     from rich.progress import Progress
 
-    from pipelines.scenes.street import Lens
-    from pipelines.streets import StreetRequest, render_streets
+    from pipelines.rendering.pinhole import Lens
+    from pipelines.rendering.street_views import StreetRequest, render_streets
 
     request = StreetRequest(
         output=absolute(config.output) if config.output else directory,

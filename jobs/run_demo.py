@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from jobs.command import absolute, run, start_ray
+from jobs.support.cli import absolute, run, start_ray
 
 RELEASED = "town"
 CHECKPOINTS = 8  # per training run: each also validates and draws
@@ -52,14 +52,14 @@ class Stages:
     """Runs stages one after the other, says so, and keeps their times over interruptions."""
 
     def __init__(self, path: str, total: int) -> None:
-        from pipelines import storage
+        from pipelines.runtime import storage
 
         self.path, self.total, self.started = path, total, time.perf_counter()
         self.seconds: dict[str, float] = storage.read_json(path) if storage.exists(path) else {}
         self.done = 0
 
     def run(self, name: str, work: Callable[[], Any]) -> Any:
-        from pipelines import storage
+        from pipelines.runtime import storage
 
         self.done += 1
         print(f"\n[{self.done}/{self.total}] {name}", flush=True)
@@ -74,10 +74,10 @@ class Stages:
 def show_released(config: Config) -> None:
     """Scenes of the weights that come with the package, and a picture of them to look at while the rest trains."""
     from jobs import sample_scenes
-    from jobs.command import home
-    from pipelines import storage
-    from pipelines.scenes.render import contact_sheet, picture_3d, png
-    from pipelines.scenes.tables import read_scenes
+    from jobs.support.cli import home
+    from pipelines.rendering.render import contact_sheet, picture_3d, png
+    from pipelines.runtime import storage
+    from pipelines.schema.tables import read_scenes
 
     sample_scenes.sample(
         sample_scenes.Config(
@@ -110,8 +110,8 @@ def main(config: Config) -> None:
         train_dit,
         train_lvae,
     )
-    from jobs.command import home
-    from jobs.demo_report import write_demo_report
+    from jobs.support.cli import home
+    from jobs.support.demo_report import write_demo_report
 
     data, lvae, model = (
         home("datasets", "town"),

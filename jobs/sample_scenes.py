@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, require_positive, run, start_ray
-from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory, require_model_labels
+from jobs.support.cli import absolute, home, require_positive, run, start_ray
+from jobs.support.options import ModelOption, model_label_kind, pipeline_directory, require_model_labels
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,10 @@ def sample(config: Config) -> str:
     from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
     from models.labels import LABELS
-    from pipelines import storage
-    from pipelines.generate import SampleRequest, sample_scenes
-    from pipelines.scenes.mesh import scene_glb
-    from pipelines.scenes.tables import read_scenes
+    from pipelines.generation.sample import SampleRequest, sample_scenes
+    from pipelines.io.mesh_export import scene_glb
+    from pipelines.runtime import storage
+    from pipelines.schema.tables import read_scenes
 
     output = absolute(config.output) if config.output else home("generated")
     request = SampleRequest(

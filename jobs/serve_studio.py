@@ -14,8 +14,8 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, run, start_ray
-from jobs.given_scenes import ModelOption, pipeline_directory
+from jobs.support.cli import absolute, home, run, start_ray
+from jobs.support.options import ModelOption, pipeline_directory
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def serve(config: Config) -> str:
     if not 0 <= config.port < 2**16:
         raise ValueError(f"--port is {config.port}, expected 0 to 65535")
     model = pipeline_directory(config.model)
-    from pipelines import storage
-    from pipelines.scenes.tables import find_shards
+    from pipelines.runtime import storage
+    from pipelines.schema.tables import find_shards
 
     tables = [absolute(table) for table in config.tables]
     for table in tables:
@@ -50,15 +50,14 @@ def serve(config: Config) -> str:
     require_free(config.host, config.port)
     import secrets
 
-    from pipelines.studio import LOOPBACK
+    from pipelines.studio.session import LOOPBACK
 
     local = config.host in LOOPBACK
     token = config.token or ("" if local else secrets.token_urlsafe(24))
     hosts = (*LOOPBACK, config.host, *config.names) if local or config.names else ()
     start_ray()
+    from pipelines.studio.session.serve import deployment
     from ray import serve as ray_serve
-
-    from pipelines.studio_server import deployment
 
     quiet = {"log_level": "WARNING", "enable_access_log": False}
     ray_serve.start(http_options={"host": config.host, "port": config.port}, logging_config=quiet)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.command import absolute, home, print_table, run, start_ray
+from jobs.support.cli import absolute, home, print_table, run, start_ray
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ def sweep_references(config: Config) -> list[dict]:
     import pyarrow as pa
     from rich.progress import Progress
 
-    from pipelines import storage
-    from pipelines.chart import standalone_svg
-    from pipelines.dataset import Dataset
-    from pipelines.describe import Looks, describe
-    from pipelines.selection import Selection, described_columns, label_pairs, poses
-    from pipelines.sweep import references, sweep, sweep_charts, sweep_html
+    from pipelines.evaluation.features import Looks, describe
+    from pipelines.evaluation.reference_sweep import references, sweep, sweep_charts, sweep_html
+    from pipelines.reporting.chart import standalone_svg
+    from pipelines.runtime import storage
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection, described_columns, label_pairs, poses
 
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     output = absolute(config.output) if config.output else home("evaluations", "sweep")
@@ -94,7 +94,7 @@ def sweep_references(config: Config) -> list[dict]:
 
 
 def main(config: Config) -> None:
-    from pipelines.sweep import sweep_table
+    from pipelines.evaluation.reference_sweep import sweep_table
 
     print_table(sweep_table(sweep_references(config)))
 

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
-from jobs.command import absolute, home, print_table, require_positive, run, start_ray
-from jobs.given_scenes import ModelOption, model_label_kind, pipeline_directory
+from jobs.support.cli import absolute, home, print_table, require_positive, run, start_ray
+from jobs.support.options import ModelOption, model_label_kind, pipeline_directory
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from pipelines.generate import SampleRequest
-    from pipelines.report import Picture
+    from pipelines.generation.sample import SampleRequest
+    from pipelines.reporting.report import Picture
 
 
 @dataclass(frozen=True)
@@ -58,19 +58,19 @@ def sweep_samplers(config: Config) -> list[dict]:
         raise ValueError("no --samplers or no --steps: expected one or more of each")
     from rich.progress import Progress
 
-    from models.diffusion import Diffusion
     from models.labels import LABELS
     from models.pipeline import SAMPLERS, require_scaling
-    from pipelines import storage
-    from pipelines.dataset import Dataset
-    from pipelines.describe import Looks, describe
-    from pipelines.evaluate import compare
-    from pipelines.generate import SampleRequest
-    from pipelines.report import Picture
-    from pipelines.sampler_sweep import sampler_row
-    from pipelines.scenes.render import bev_picture
-    from pipelines.scenes.tables import read_scenes
-    from pipelines.selection import Selection
+    from models.sampling.diffusion import Diffusion
+    from pipelines.evaluation.evaluate import compare
+    from pipelines.evaluation.features import Looks, describe
+    from pipelines.evaluation.sampler_sweep import sampler_row
+    from pipelines.generation.sample import SampleRequest
+    from pipelines.rendering.render import bev_picture
+    from pipelines.reporting.report import Picture
+    from pipelines.runtime import storage
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection
+    from pipelines.schema.tables import read_scenes
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
@@ -124,8 +124,8 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 def timed_sampling(config: Config, request: SampleRequest, bar: Progress) -> float | None:
     """Generate what is missing; an actor's seconds a scene, over the shards whose time was seen; None of none."""
-    from pipelines import storage
-    from pipelines.generate import sample_scenes
+    from pipelines.generation.sample import sample_scenes
+    from pipelines.runtime import storage
 
     record = storage.join(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}
@@ -148,9 +148,9 @@ def publish(output: str, rows: list[dict], pictures: list[Picture], columns: int
     """Write rows, figures and the page."""
     import pyarrow as pa
 
-    from pipelines import storage
-    from pipelines.chart import standalone_svg
-    from pipelines.sampler_sweep import CHARTED, sampler_charts, sampler_html
+    from pipelines.evaluation.sampler_sweep import CHARTED, sampler_charts, sampler_html
+    from pipelines.reporting.chart import standalone_svg
+    from pipelines.runtime import storage
 
     storage.write_json(rows, storage.join(output, "samplers.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
@@ -160,7 +160,7 @@ def publish(output: str, rows: list[dict], pictures: list[Picture], columns: int
 
 
 def main(config: Config) -> None:
-    from pipelines.sampler_sweep import sampler_table
+    from pipelines.evaluation.sampler_sweep import sampler_table
 
     print_table(sampler_table(sweep_samplers(config)))
 

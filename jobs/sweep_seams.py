@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.command import absolute, home, print_table, require_positive, run, start_ray
-from jobs.given_scenes import GivenScenes, pipeline_directory
+from jobs.support.cli import absolute, home, print_table, require_positive, run, start_ray
+from jobs.support.options import GivenScenes, pipeline_directory
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,16 @@ def sweep_seams(config: Config) -> list[dict]:
     import pyarrow as pa
     from rich.progress import Progress
 
-    from models.diffusion import Diffusion
     from models.pipeline import Resampling
-    from pipelines import storage
+    from models.sampling.diffusion import Diffusion
+    from pipelines.evaluation.seam_sweep import objects_per_ha, seam_row, seam_sweep_html
+    from pipelines.evaluation.seams import Lines, measure, with_lines
+    from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
     from pipelines.metrics.seams import seam_ratios
-    from pipelines.outpaint import OutpaintRequest, outpaint_scenes
-    from pipelines.report import Picture
-    from pipelines.scenes.tables import read_scenes
-    from pipelines.seam_sweep import objects_per_ha, seam_row, seam_sweep_html
-    from pipelines.seams import Lines, measure, with_lines
-    from pipelines.selection import Selection
+    from pipelines.reporting.report import Picture
+    from pipelines.runtime import storage
+    from pipelines.schema.scene_subset import Selection
+    from pipelines.schema.tables import read_scenes
 
     for setting in config.settings:
         Resampling(*setting).transitions()  # numbers that cannot be had are said before hours of the others
@@ -95,7 +95,7 @@ def sweep_seams(config: Config) -> list[dict]:
 
 
 def main(config: Config) -> None:
-    from pipelines.seam_sweep import seam_table
+    from pipelines.evaluation.seam_sweep import seam_table
 
     print_table(seam_table(sweep_seams(config)))
 

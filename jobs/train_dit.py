@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from jobs.command import absolute, home, run
+from jobs.support.cli import absolute, home, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from torch import Tensor
 
-    from jobs.ray_training import TrainingRun
+    from jobs.support.trainer import TrainingRun
 
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
+    """Options of a training run; what is left out comes from the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
@@ -74,10 +74,10 @@ class Config:
 
 def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     """The run that the options mean, and what makes a pipeline of its results; makes the smoke preset's inputs."""
-    from jobs.smoke import smoke_dataset, smoke_latents
-    from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
-    from pipelines import storage
-    from pipelines.dataset import Dataset
+    from jobs.support.smoke_inputs import smoke_dataset, smoke_latents
+    from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
+    from pipelines.runtime import storage
+    from pipelines.schema.dataset import Dataset
 
     row = preset(DIT_PRESETS, config.preset)
     smoke = config.preset == "smoke" and not config.dataset
@@ -96,14 +96,14 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
 
     from functools import partial
 
-    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
-    from jobs.tracking import Tracker
-    from jobs.validation import SamplingCheck
+    from jobs.support.callbacks import SamplingCheck
+    from jobs.support.tracking import Tracker
+    from jobs.support.trainer import TrainingRun, claim, identity_of, settings_with
     from models.labels import LABELS
     from models.training import Execution, Optimisation
-    from pipelines.encode import load_lvae, weights_digest
-    from pipelines.feed import LatentReader, Stream
-    from pipelines.scenes.tables import find_shards
+    from pipelines.schema.tables import find_shards
+    from pipelines.training.data_loader import LatentReader, Stream
+    from pipelines.training.latents import load_lvae, weights_digest
 
     lvae = load_lvae(latents["lvae"])
     if weights_digest(lvae) != latents["lvae_digest"]:
@@ -181,8 +181,8 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
     training, complete = prepare(config)
-    from jobs.ray_training import fit
-    from pipelines import storage
+    from jobs.support.trainer import fit
+    from pipelines.runtime import storage
 
     output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
     fit(training, config.workers, storage.join(output, "dit"))
@@ -201,9 +201,9 @@ class Start:
 
 def starting_weights(model: str, lvae_digest: str, architecture: dict) -> Start:
     """The transformer of a trained pipeline. Raises ValueError if it knows other latents or is built otherwise."""
-    from jobs.given_scenes import pipeline_directory
-    from pipelines.encode import weights_digest
-    from pipelines.generate import load_pipeline
+    from jobs.support.options import pipeline_directory
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.training.latents import weights_digest
 
     directory = pipeline_directory(model)
     pipeline = load_pipeline(directory)
@@ -246,11 +246,11 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
     """
     import tempfile
 
-    from jobs.ray_training import publish_directory
+    from jobs.support.trainer import publish_directory
     from models.dit import DiT
     from models.pipeline import PrITTIPipeline, scheduler
-    from pipelines import storage
-    from pipelines.encode import load_lvae
+    from pipelines.runtime import storage
+    from pipelines.training.latents import load_lvae
 
     dit = DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False)
     pipeline = PrITTIPipeline(load_lvae(lvae), dit, scheduler(), **sampling)

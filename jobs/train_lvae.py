@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jobs.command import absolute, home, run
-from jobs.given_scenes import pipeline_directory
+from jobs.support.cli import absolute, home, run
+from jobs.support.options import pipeline_directory
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from jobs.ray_training import TrainingRun
+    from jobs.support.trainer import TrainingRun
     from models.layout import LayoutSpec
 
 OF_OBJECT_DECODER = ("decoder", "head_hidden", "least_per_cell")  # parts of an architecture
@@ -32,7 +32,7 @@ START_SCENES, START_SHARDS = 96, 16  # the sample of training scenes that says w
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; what is left out comes from the preset (models/zoo.py)."""
+    """Options of a training run; what is left out comes from the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """smoke, demo, town, kitti360, kitti360-light or av2."""
@@ -74,9 +74,9 @@ class Config:
 
 def prepare(config: Config) -> TrainingRun:
     """The run that the options mean; makes the smoke preset's data."""
-    from jobs.smoke import smoke_dataset
-    from models.zoo import LVAE_PRESETS, preset
-    from pipelines.dataset import Dataset
+    from jobs.support.smoke_inputs import smoke_dataset
+    from models.presets import LVAE_PRESETS, preset
+    from pipelines.schema.dataset import Dataset
 
     row = preset(LVAE_PRESETS, config.preset)
     root = (
@@ -93,13 +93,13 @@ def prepare(config: Config) -> TrainingRun:
 
     import numpy as np
 
-    from jobs.ray_training import TrainingRun, claim, identity_of, settings_with
-    from jobs.tracking import Tracker
-    from jobs.validation import ReconstructionCheck
+    from jobs.support.callbacks import ReconstructionCheck
+    from jobs.support.tracking import Tracker
+    from jobs.support.trainer import TrainingRun, claim, identity_of, settings_with
     from models.augment import Augmentation
     from models.training import Execution, Optimisation
-    from pipelines.feed import LayoutReader, Stream
-    from pipelines.scenes.tables import find_shards
+    from pipelines.schema.tables import find_shards
+    from pipelines.training.data_loader import LayoutReader, Stream
 
     spec = dataset.spec.with_resolution(row.raster_px)
     name = config.name or f"lvae-{config.preset}"
@@ -176,7 +176,7 @@ def prepare(config: Config) -> TrainingRun:
 def train(config: Config) -> str:
     """Train and return the directory of the model, of the pipeline where one was given."""
     training = prepare(config)
-    from jobs.ray_training import fit
+    from jobs.support.trainer import fit
 
     output = absolute(config.output) if config.output else home("models", training.name)
     fit(training, config.workers, output)
@@ -194,8 +194,8 @@ class Kept:
 
 def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     """The layout VAE of a trained pipeline. Raises ValueError if its encoders or its layout are not this run's."""
-    from pipelines.encode import weights_digest
-    from pipelines.generate import load_pipeline
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.training.latents import weights_digest
 
     pipeline = load_pipeline(pipeline_directory(model))
     lvae = pipeline.lvae
@@ -214,9 +214,9 @@ def kept_latents(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
 
 def require_place(name: str, kept: Kept) -> None:
     """Raises ValueError where the renewed pipeline would take the place of another one, or of the one it begins with."""
-    from pipelines import storage
-    from pipelines.encode import weights_digest
-    from pipelines.generate import load_pipeline
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.runtime import storage
+    from pipelines.training.latents import weights_digest
 
     place = home("models", f"pritti-{name}")
     if not storage.exists(storage.join(place, "model_index.json")):
@@ -233,9 +233,9 @@ def renewed_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
     """
     import tempfile
 
-    from jobs.ray_training import publish_directory
-    from pipelines.encode import load_lvae, weights_digest
-    from pipelines.generate import load_pipeline
+    from jobs.support.trainer import publish_directory
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.training.latents import load_lvae, weights_digest
 
     pipeline = load_pipeline(pipeline_directory(model))
     if weights_digest(pipeline.lvae) != training.identity["start_from"]:
@@ -252,7 +252,7 @@ def sample_layouts(shards: list, counts: list[int], spec) -> dict:
     """Compact layouts of up to START_SCENES training scenes from all over the dataset (LayoutVAE.start_at)."""
     import numpy as np
 
-    from pipelines.feed import LayoutReader
+    from pipelines.training.data_loader import LayoutReader
 
     read, parts = LayoutReader(spec), []
     for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):
@@ -276,7 +276,7 @@ def build(
     """The Trainer of stage 1, with the same initial weights on every worker."""
     import torch
 
-    from jobs.ray_training import as_tensors
+    from jobs.support.trainer import as_tensors
     from models.batch import LayoutBatch
     from models.lvae import LayoutVAE
     from models.training import lvae_trainer

@@ -19,7 +19,7 @@ from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from models.diffusion import Denoiser, Diffusion
+from models.sampling.diffusion import Denoiser, Diffusion
 
 FREQUENCIES = 256
 Prediction = Literal["noise", "velocity"]

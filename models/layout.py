@@ -1,6 +1,6 @@
 """The contract between scenes and networks: LayoutSpec says what the numbers of a LayoutBatch (batch.py) mean.
 
-A LayoutSpec is made once per dataset (pipelines/ingest.py writes it to dataset.json), travels inside every
+A LayoutSpec is made once per dataset (pipelines/preprocess/ingest.py writes it to dataset.json), travels inside every
 checkpoint and inverts a network's outputs without the data.
 """
 

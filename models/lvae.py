@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from models.batch import LayoutBatch
-from models.cells import CellDecoder
-from models.ground import GroundDecoder, GroundEncoder
-from models.ground import start_at as start_ground
 from models.layout import FEATURES, LayoutSpec
-from models.matching import MatchWeights
-from models.objects import ObjectDecoder, ObjectEncoder
 from models.tensors import DecodedLayout
+from models.vae.cell_decoder import CellDecoder
+from models.vae.ground import GroundDecoder, GroundEncoder
+from models.vae.ground import start_at as start_ground
+from models.vae.matching import MatchWeights
+from models.vae.objects import ObjectDecoder, ObjectEncoder
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class LayoutVAE(ModelMixin, ConfigMixin):
 
     @torch.no_grad()
     def start_at(self, batch: LayoutBatch) -> None:
-        """Start every output at its mean over `batch`, a sample of training layouts (shortcuts: models/ground.py).
+        """Start every output at its mean over `batch`, a sample of training layouts (shortcuts: models/vae/ground.py).
 
         Adam moves a bias by about the learning rate per step: from zero, thousands of steps would go into learning
         that a pole is thin and that most pixels are no road.

@@ -13,7 +13,15 @@ from diffusers import DDIMScheduler, DDPMScheduler, DiffusionPipeline, DPMSolver
 from jaxtyping import Float
 from torch import Tensor
 
-from models.diffusion import (
+from models.composition.deduplicate import repeated
+from models.composition.inpaint import Contents, composited, latent_mask, whole_cells
+from models.composition.outpaint import Block, Lattice, Place, World, height_near
+from models.dit import DiT
+from models.labels import label_index
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.pretrained import pipeline_path
+from models.sampling.diffusion import (
     GENERATE,
     INPAINT,
     OUTPAINT,
@@ -29,15 +37,7 @@ from models.diffusion import (
     sample,
     solve,
 )
-from models.dit import DiT
-from models.duplicates import repeated
-from models.inpaint import Contents, composited, latent_mask, whole_cells
-from models.labels import label_index
-from models.layout import LayoutSpec
-from models.lvae import LayoutVAE
-from models.outpaint import Block, Lattice, Place, World, height_near
-from models.released import pipeline_path
-from models.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
+from models.sampling.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
 
@@ -149,7 +149,7 @@ class PrITTIPipeline(DiffusionPipeline):
     def from_pretrained(cls, directory: str, **options) -> PrITTIPipeline:
         """A pipeline from a directory that `save_pretrained` or jobs/train_dit.py wrote, or by the name of released weights.
 
-        "town" comes with the package (models/released.py); nothing is ever fetched. Raises ValueError for what is neither.
+        "town" comes with the package (models/pretrained.py); nothing is ever fetched. Raises ValueError for what is neither.
         """
         return super().from_pretrained(pipeline_path(directory), **{"low_cpu_mem_usage": False} | options)
 

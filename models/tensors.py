@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from models.batch import LayoutBatch
-from models.cholesky import boxes_from_cholesky, cholesky_parameters
+from models.geometry.cholesky import boxes_from_cholesky, cholesky_parameters
 from models.layout import FEATURES, LayoutSpec
 from models.scene import CATEGORY_INDEX, Grid, Scene, canonical_boxes
 

@@ -23,12 +23,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from models.batch import LayoutBatch
-from models.diffusion import Diffusion, keyed_generator
 from models.dit import DiT
 from models.layout import LayoutSpec
-from models.losses import lvae_loss
 from models.lvae import LayoutVAE
-from models.matching import NotFiniteError
+from models.sampling.diffusion import Diffusion, keyed_generator
+from models.vae.losses import lvae_loss
+from models.vae.matching import NotFiniteError
 
 
 @dataclass(frozen=True)

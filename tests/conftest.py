@@ -45,7 +45,7 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
     """One small local Ray for all tests that need it, and a $PRITTI_HOME that is nobody's."""
-    from jobs.command import RAY_ENVIRONMENT
+    from jobs.support.cli import RAY_ENVIRONMENT
 
     settings = {
         "PRITTI_HOME": str(tmp_path_factory.mktemp("nobody")),
@@ -94,22 +94,22 @@ def smoke(tmp_path_factory, cluster) -> Path:
     os.environ["PRITTI_HOME"] = str(path)
     import torch
 
-    import jobs.ray_training
-    from jobs.ray_training import as_tensors
+    import jobs.support.trainer
+    from jobs.support.trainer import as_tensors
     from jobs.train_dit import Config, train
-    from pipelines.feed import batches
+    from pipelines.training.data_loader import batches
 
     def fit_here(run, num_workers: int, output: str) -> str:
         trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(as_tensors(batch), range(run.stream.batch_size))
         model = trainer.averaged()
-        jobs.ray_training.tag_weights(run.tracker, model, trainer.steps_done)
+        jobs.support.trainer.tag_weights(run.tracker, model, trainer.steps_done)
         model.save_pretrained(output)
         run.tracker.finish("FINISHED")
         return output
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(jobs.ray_training, "fit", fit_here)
+        monkeypatch.setattr(jobs.support.trainer, "fit", fit_here)
         train(Config(preset="smoke"))
     return path

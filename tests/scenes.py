@@ -7,8 +7,8 @@ from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline, scheduler
+from models.presets import LVAE_PRESETS
 from models.scene import CATEGORIES, KITTI_GROUND_CLASSES, Grid, Scene, canonical_boxes, yaw_rotation
-from models.zoo import LVAE_PRESETS
 
 
 def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) -> np.ndarray:

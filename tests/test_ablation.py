@@ -13,15 +13,15 @@ import torch
 from scenes import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
-from models.encodings import ENCODINGS, harmonics, nearest_frame
+from models.geometry.encodings import ENCODINGS, harmonics, nearest_frame
 from models.layout import LayoutSpec
-from models.losses import lvae_loss
 from models.lvae import LayoutVAE
-from models.orientation_study import THINGS, OneObjectAutoencoder, Settings, draw_boxes, fit
+from models.presets import LVAE_PRESETS
 from models.scene import canonical_boxes, yaw_rotation
+from models.studies.orientation_study import THINGS, OneObjectAutoencoder, Settings, draw_boxes, fit
 from models.tensors import layout_batch, scene_from_layout
-from models.zoo import LVAE_PRESETS
-from pipelines.ablation import (
+from models.vae.losses import lvae_loss
+from pipelines.evaluation.ablation import (
     AUGMENTATIONS,
     BRANCHES,
     DECODERS,
@@ -295,8 +295,8 @@ def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, 
 
 def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
     from jobs.ablate_lvae import Augmentation, Branches, Decoders, prepare_variant
-    from jobs.ray_training import as_tensors
-    from pipelines.feed import read_samples
+    from jobs.support.trainer import as_tensors
+    from pipelines.training.data_loader import read_samples
 
     for config, variant, switch in (
         *((Branches(preset="smoke"), *item) for item in BRANCHES.items()),

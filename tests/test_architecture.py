@@ -35,7 +35,7 @@ def test_imports_point_one_way(package):
 
 def test_data_jobs_import_no_torch():
     """A second or two of every process that preprocesses."""
-    code = "import sys, pipelines.ingest; sys.exit('torch' in sys.modules)"
+    code = "import sys, pipelines.preprocess.ingest; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
@@ -43,7 +43,7 @@ def test_models_import_without_ray_or_pyarrow():
     code = (
         "import sys\n"
         "for name in ('ray', 'pyarrow', 'mlflow', 'trimesh', 'pandas'): sys.modules[name] = None\n"
-        "import models.training, models.zoo\n"
+        "import models.training, models.presets\n"
         "from models import DiT, LayoutVAE, PrITTIPipeline\n"
         "print(PrITTIPipeline.__name__)"
     )

@@ -11,7 +11,7 @@ import pyarrow.feather
 import pytest
 
 from models.scene import CATEGORIES
-from pipelines.sources.argoverse2 import CATEGORY_OF, logs, read_drive
+from pipelines.preprocess.sources.argoverse2 import CATEGORY_OF, logs, read_drive
 
 LOG = "00000000-aaaa-bbbb-cccc-000000000001"
 SWEEPS = np.array([315969904359876000, 315969904459712000, 315969904559845000])

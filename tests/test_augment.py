@@ -7,9 +7,9 @@ import pytest
 from scenes import random_scene
 
 from models.augment import Augmentation, mirrored, moved_vehicle
-from models.cholesky import scatter_matrix
+from models.geometry.cholesky import scatter_matrix
 from models.scene import Grid
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
 
 
 def test_a_mirror_twice_is_none_and_once_reflects_every_box():

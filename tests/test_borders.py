@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
-from models.borders import REACH_M, STEEPEST, continued, spread
+from models.composition.seam_blending import REACH_M, STEEPEST, continued, spread
 from models.scene import KITTI_GROUND_CLASSES, Grid
 
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)

@@ -5,9 +5,9 @@ import json
 import pytest
 from scenes import random_scene
 
-from pipelines import storage
-from pipelines.claims import claim
-from pipelines.scenes.tables import Shard, rejects_table
+from pipelines.runtime import storage
+from pipelines.schema.run_guard import claim
+from pipelines.schema.tables import Shard, rejects_table
 
 
 def test_a_run_that_wrote_nothing_gives_its_name_free(tmp_path):

@@ -5,10 +5,10 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, RePaintScheduler
 
-from models.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
 from models.dit import DiT
 from models.pipeline import scheduler
-from models.repaint import repaint_transitions
+from models.sampling.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
+from models.sampling.repaint import repaint_transitions
 from models.training import Execution, NotFinite, Optimisation, dit_trainer
 
 SHAPE = (4, 8, 8)

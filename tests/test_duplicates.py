@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scenes import random_scene
 
-from models.duplicates import DRAWN_IOU3D, doubles, repeated
-from models.iou3d import boxes_of, iou3d_matrix
+from models.composition.deduplicate import DRAWN_IOU3D, doubles, repeated
+from models.geometry.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORY_INDEX, Grid
 
 SMALL = Grid(rows=32, cols=32, resolution_m=2.0)

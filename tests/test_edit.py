@@ -8,14 +8,14 @@ import pyarrow.parquet as pq
 import pytest
 from scenes import random_scene
 
-from models.iou3d import boxes_of, iou3d_matrix
+from models.geometry.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, PER_PRIMITIVE, Scene, canonical_boxes
+from pipelines.editing import edit
+from pipelines.editing.edit import Select, edits_from_json, edits_to_json, replayed
+from pipelines.io.mesh_export import scene_triangles
 from pipelines.metrics.validity import SLAB_OFFSET_M, faults, scene_validity, validity_rates
-from pipelines.scenes import edit
-from pipelines.scenes.edit import Select, edits_from_json, edits_to_json, replayed
-from pipelines.scenes.mesh import scene_triangles
-from pipelines.scenes.tables import Shard, read_scenes
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.tables import Shard, read_scenes
 
 CAR = CATEGORY_INDEX["vehicle_small"]
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T

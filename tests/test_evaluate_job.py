@@ -9,14 +9,14 @@ import safetensors.numpy
 from golden_recipe import random_state_dict
 
 from jobs.evaluate_scenes import Config, evaluate
-from pipelines.dataset import Dataset
-from pipelines.describe import Looks, chosen_scenes, describe
-from pipelines.evaluate import compare, memorisation
+from pipelines.evaluation.evaluate import compare, memorisation
+from pipelines.evaluation.features import Looks, chosen_scenes, describe
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.metrics.inception import Inception
 from pipelines.metrics.intervals import Estimate
-from pipelines.scenes.render import bev_picture
-from pipelines.selection import Selection
+from pipelines.rendering.render import bev_picture
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
 
 SAMPLES = 5  # of a network that takes a second per picture
 

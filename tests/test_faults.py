@@ -31,12 +31,14 @@ import pytest
 from jobs.preprocess_scenes import Kitti360, Town
 from jobs.preprocess_scenes import main as preprocess
 from models.scene import CATEGORIES, Grid
-from pipelines import ingest, plan, storage
-from pipelines.cut import write_shard
-from pipelines.plan import Task, plan_argoverse2, plan_kitti360, plan_own
-from pipelines.sources import argoverse2, own, town_kitti360
-from pipelines.sources.kitti360 import GROUND_LABELS, read_poses
-from pipelines.sources.town import town_drive, write_kitti360
+from pipelines.preprocess import ingest, sharding
+from pipelines.preprocess.shard_writer import write_shard
+from pipelines.preprocess.sharding import Task, plan_argoverse2, plan_kitti360, plan_own
+from pipelines.preprocess.sources import argoverse2, custom
+from pipelines.preprocess.sources.kitti360 import GROUND_LABELS, read_poses
+from pipelines.preprocess.sources.town import kitti360_writer
+from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.runtime import storage
 
 import psutil  # isort: skip  # Ray brings it, in a folder that importing Ray makes known
 
@@ -116,7 +118,7 @@ def shards(cluster, tmp_path_factory) -> tuple[list[Task], Path]:
     root = tmp_path_factory.mktemp("shards")
     write_kitti360(town_drive(7).at(np.arange(40, 84), CROP), root / "raw")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(plan, "SHARD_SCENES", 4)
+        monkeypatch.setattr(sharding, "SHARD_SCENES", 4)
         tasks = plan_kitti360(str(root / "raw"), split=False)
     made = ingest.ingest(tasks, str(root / "undisturbed"), {}, grid=CROP)
     assert len(tasks) == 11 and made.scenes == {"train": 44} and made.duplicates > 5
@@ -536,7 +538,7 @@ GROUND_NAMES = {label for labels in GROUND_LABELS.values() for label in labels}
 
 def write_kitti360_excerpt(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four poses of the town and what lies about them, in two annotation windows that share objects."""
-    monkeypatch.setattr(town_kitti360, "WINDOW_POSES", 2)
+    monkeypatch.setattr(kitti360_writer, "WINDOW_POSES", 2)
     write_kitti360(town_drive(7).at(np.arange(60, 64), Grid(4.0, 4.0, 0.5, 16, 16)), root)
 
 
@@ -913,8 +915,8 @@ def write_own(root: Path, suffix: str) -> None:
         boxes = [
             {
                 "category": CATEGORIES[k % len(CATEGORIES)],
-                **dict(zip(own.PLACE, (rng.uniform([1, -7, 0], [20, 7, 2]) + [x0, y0, z0]).tolist(), strict=True)),
-                **dict(zip(own.SIZE, rng.uniform(0.5, 4, 3).tolist(), strict=True)),
+                **dict(zip(custom.PLACE, (rng.uniform([1, -7, 0], [20, 7, 2]) + [x0, y0, z0]).tolist(), strict=True)),
+                **dict(zip(custom.SIZE, rng.uniform(0.5, 4, 3).tolist(), strict=True)),
                 "yaw_rad": float(rng.uniform(-3, 3)),
                 "frame": None if k < 14 else k % 3,
                 "instance_id": 100 + k,
@@ -931,7 +933,8 @@ def write_own(root: Path, suffix: str) -> None:
             for c, (a, b) in classes.items()
         ]
         poses = [
-            {"frame": k, "yaw_rad": 0.1 * k} | dict(zip(own.PLACE, (x0 + 3 * k, y0, z0), strict=True)) for k in range(3)
+            {"frame": k, "yaw_rad": 0.1 * k} | dict(zip(custom.PLACE, (x0 + 3 * k, y0, z0), strict=True))
+            for k in range(3)
         ]
         folder = root / name
         folder.mkdir(parents=True)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scenes import random_scene, small_spec
 
-from jobs.ray_training import with_scene_ids
+from jobs.support.trainer import with_scene_ids
 from models.augment import Augmentation
 from models.tensors import compact_layout
 from models.training import NotFinite
-from pipelines import feed
-from pipelines.feed import LayoutReader, Stream, batches, read_samples
-from pipelines.scenes.tables import Shard
+from pipelines.schema.tables import Shard
+from pipelines.training import data_loader
+from pipelines.training.data_loader import LayoutReader, Stream, batches, read_samples
 
 COUNTS = (5, 3, 7, 4, 6)
 
@@ -53,7 +53,7 @@ def test_two_workers_read_what_one_would(shards, augment):
 
 
 def test_batches_are_read_ahead_and_come_in_order(shards, cluster, monkeypatch):
-    monkeypatch.setattr(feed, "SAMPLES_PER_TASK", 8)  # two steps a task
+    monkeypatch.setattr(data_loader, "SAMPLES_PER_TASK", 8)  # two steps a task
     reader, stream = LayoutReader(small_spec(32)), Stream(shards, COUNTS, 4, seed=0)
     got = list(batches(stream, reader, start_step=3, stop_step=14, rank=1, world=2))
     assert len(got) == 11

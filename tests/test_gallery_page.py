@@ -14,10 +14,10 @@ from browser import faults, start_browser, wait_for
 from PIL import Image
 
 from models.scene import Scene
-from pipelines.scenes.palette import CLASS_COLORS, ground_ids
-from pipelines.scenes.tables import Shard, read_scenes
-from pipelines.scenes.web import web_scene
-from pipelines.sources.town import town_drive
+from pipelines.io.web_export import web_scene
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.palette import CLASS_COLORS, ground_ids
+from pipelines.schema.tables import Shard, read_scenes
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from models.scene import DENSITIES
-from pipelines.scenes.tables import find_shards, read_scenes
+from pipelines.schema.tables import find_shards, read_scenes
 
 
 @pytest.fixture(scope="session")
@@ -59,8 +59,8 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
 
 
 def test_what_is_sampled_can_be_repaired(tmp_path):
-    from jobs.given_scenes import pipeline_directory
-    from pipelines.generate import Sampler, SampleRequest
+    from jobs.support.options import pipeline_directory
+    from pipelines.generation.sample import Sampler, SampleRequest
     from pipelines.metrics.validity import SLAB_OFFSET_M, faults
 
     request = SampleRequest(pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++")
@@ -81,7 +81,7 @@ def test_the_job_asks_for_repair(smoke, tmp_path, monkeypatch):
     from jobs.sample_scenes import Config, sample
 
     asked = []
-    monkeypatch.setattr("pipelines.generate.sample_scenes", lambda request, *_: asked.append(request))
+    monkeypatch.setattr("pipelines.generation.sample.sample_scenes", lambda request, *_: asked.append(request))
     for repair in (False, True):
         sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, glb=0, repair=repair))
     assert [request.repair for request in asked] == [False, True]
@@ -196,7 +196,7 @@ def test_a_killed_sampler_loses_and_doubles_nothing(smoke, samples, tmp_path):
     from test_faults import psutil
 
     from models.labels import LABELS
-    from pipelines.generate import SampleRequest, sample_scenes
+    from pipelines.generation.sample import SampleRequest, sample_scenes
 
     model = str(smoke / "models/pritti-smoke")
     request = SampleRequest(model, str(tmp_path), "samples", 9, LABELS["vegetation"], 0, 10, 1.0, shard_scenes=1)
@@ -220,8 +220,8 @@ def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(smoke, 
 
     from jobs.outpaint_scenes import Config, last_blocks
     from models.pipeline import Resampling
-    from pipelines.outpaint import OutpaintRequest, outpaint_scenes
-    from pipelines.selection import Selection
+    from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.schema.scene_subset import Selection
 
     def request(name: str, **options) -> OutpaintRequest:
         resampling = Resampling(num_steps=4, jump_length=2, resamplings=2)
@@ -309,8 +309,8 @@ def test_inpainting_writes_variants_and_goes_on(smoke, samples, tmp_path):
 
 def test_a_guided_run_keeps_the_scaling_of_the_models_noise(smoke, tmp_path):
     from models.pipeline import Resampling
-    from pipelines.generate import claim_run, load_pipeline
-    from pipelines.outpaint import OutpaintRequest
+    from pipelines.generation.outpaint import OutpaintRequest
+    from pipelines.generation.sample import claim_run, load_pipeline
 
     model = str(smoke / "models/pritti-smoke")
     pipeline = load_pipeline(model)
@@ -327,10 +327,10 @@ def test_a_guided_run_keeps_the_scaling_of_the_models_noise(smoke, tmp_path):
 
 def test_real_against_real_is_near_perfect(smoke, tmp_path):
     """The training scenes scored against themselves: the evaluator's own floor."""
-    from pipelines.dataset import Dataset
-    from pipelines.describe import Looks, describe
-    from pipelines.evaluate import compare
-    from pipelines.selection import Selection
+    from pipelines.evaluation.evaluate import compare
+    from pipelines.evaluation.features import Looks, describe
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     side = describe(Selection(dataset.root, "town", "train"), dataset, Looks(), str(tmp_path / "described"))
@@ -344,9 +344,9 @@ def test_real_against_real_is_near_perfect(smoke, tmp_path):
 
 def test_a_description_goes_on_where_it_stopped(smoke, tmp_path, monkeypatch):
     """Parts that are there are kept, missing ones made again; other options or other scenes begin anew."""
-    from pipelines import describe as module
-    from pipelines.dataset import Dataset
-    from pipelines.selection import Selection
+    from pipelines.evaluation import features as module
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     chosen, looks, directory = Selection(dataset.root, "town", "train"), module.Looks(), tmp_path / "described"

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from models.scene import CATEGORIES, Grid
-from pipelines import ingest, storage
-from pipelines.cut import ShardCut, write_shard
-from pipelines.dataset import Dataset
-from pipelines.labels import density, density_thresholds
-from pipelines.plan import plan_argoverse2, plan_kitti360, plan_town
-from pipelines.scenes.tables import find_shards, read_scenes
-from pipelines.sources.drive import Drive
-from pipelines.sources.town import take, town_drive, write_kitti360
+from pipelines.preprocess import ingest
+from pipelines.preprocess.shard_writer import ShardCut, write_shard
+from pipelines.preprocess.sharding import plan_argoverse2, plan_kitti360, plan_town
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.town.generator import take, town_drive, write_kitti360
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.density_labels import density, density_thresholds
+from pipelines.schema.tables import find_shards, read_scenes
 
 
 def table(root: Path, query: str, name: str = "scenes") -> list[tuple]:

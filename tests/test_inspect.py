@@ -19,14 +19,23 @@ from test_report import Page as PlainPage
 from jobs.inspect_scenes import OneScene, Report, Sheet, draw_scenes, draw_sheet, write_page
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, ELLIPSOID, Grid
-from pipelines import storage
-from pipelines.dataset_report import dataset_html, read_facts
-from pipelines.drawings import MAX_NAMED, count_bins, count_histogram, track_map
-from pipelines.gallery import RAMP, Catalogue, View, best_columns, footprints_m, heights_picture, paint, scene_plate
-from pipelines.scenes.mesh import cuboid_triangles, ellipsoid_triangles
-from pipelines.scenes.render import bev_picture, picture_3d
-from pipelines.scenes.tables import Shard, rejects_table
-from pipelines.sources.town import town_drive
+from pipelines.io.mesh_export import cuboid_triangles, ellipsoid_triangles
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.rendering.render import bev_picture, picture_3d
+from pipelines.reporting.contact_sheet import (
+    RAMP,
+    Catalogue,
+    View,
+    best_columns,
+    footprints_m,
+    heights_picture,
+    paint,
+    scene_plate,
+)
+from pipelines.reporting.dataset_charts import MAX_NAMED, count_bins, count_histogram, track_map
+from pipelines.reporting.dataset_report import dataset_html, read_facts
+from pipelines.runtime import storage
+from pipelines.schema.tables import Shard, rejects_table
 
 SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}
 REASON = "heights <beyond> 327 m"

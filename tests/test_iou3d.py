@@ -7,8 +7,8 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
-from models import iou3d
-from models.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
+from models.geometry import iou3d
+from models.geometry.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
 from models.scene import yaw_rotation
 
 TOLERANCE = 1e-4

@@ -12,7 +12,7 @@ import pytest
 from safetensors.torch import load_file
 from test_commands import command
 
-from pipelines.scenes.tables import find_shards
+from pipelines.schema.tables import find_shards
 
 
 def weights(directory: Path) -> dict:
@@ -33,7 +33,7 @@ def test_a_smoke_preset_makes_its_own_inputs(home):
 
 def test_latents_are_aligned_and_what_the_lvae_says(home):
     from models.tensors import layout_batch
-    from pipelines.encode import load_lvae
+    from pipelines.training.latents import load_lvae
 
     shard = find_shards(str(home / "datasets/smoke"), split="test")[0]
     table, scenes = shard.read("latents"), shard.scenes()
@@ -45,7 +45,7 @@ def test_latents_are_aligned_and_what_the_lvae_says(home):
 
 
 def test_mlflow_has_parameters_losses_pictures_and_the_model(home):
-    from jobs.tracking import client
+    from jobs.support.tracking import client
 
     api = client(f"sqlite:///{home}/mlflow.db")
     for experiment in ("pritti-lvae", "pritti-dit"):
@@ -70,7 +70,7 @@ def test_running_a_finished_job_again_changes_nothing(home):
 
 def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
     """A worker dies by SIGKILL in the middle; Ray Train starts another from the last checkpoint."""
-    from jobs.ray_training import fit
+    from jobs.support.trainer import fit
     from jobs.train_lvae import Config, prepare
 
     marker, seen = str(tmp_path / "died"), tmp_path / "validated"
@@ -93,8 +93,8 @@ def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
 
 
 def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_run(home, tmp_path, monkeypatch):
-    import jobs.ray_training
-    from jobs.ray_training import fit
+    import jobs.support.trainer
+    from jobs.support.trainer import fit
     from jobs.train_dit import Config, prepare, train
 
     seen = tmp_path / "validated"
@@ -109,7 +109,7 @@ def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_
             raise KeyError("stopped")
         return {}, {}
 
-    monkeypatch.setattr(jobs.ray_training, "RETRIES", 0)
+    monkeypatch.setattr(jobs.support.trainer, "RETRIES", 0)
     run, _ = prepare(Config(preset="smoke", name="dit-two", workers=2, checkpoint_every=2))
     assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORIES, KITTI_GROUND_CLASSES
-from pipelines.sources.drive import STATIC
-from pipelines.sources.kitti360 import read_drive, read_poses, sequences
+from pipelines.preprocess.sources.drive import STATIC
+from pipelines.preprocess.sources.kitti360 import read_drive, read_poses, sequences
 
 NAME = "2013_05_28_drive_0003_sync"
 CUBE = np.array(

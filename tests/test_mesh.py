@@ -21,7 +21,7 @@ from models.scene import (
     canonical_boxes,
     yaw_rotation,
 )
-from pipelines.scenes.mesh import (
+from pipelines.io.mesh_export import (
     GLTF_FROM_SCENE,
     GROUND,
     ground_mesh,
@@ -30,7 +30,7 @@ from pipelines.scenes.mesh import (
     scene_triangles,
     write_glb,
 )
-from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, GROUND_CLASS_ID, rgb
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, GROUND_CLASS_ID, rgb
 
 
 def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene:

@@ -9,10 +9,10 @@ import trimesh
 from scenes import random_rotations, random_scene
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, Grid, Scene, canonical_boxes
-from pipelines.scenes.mesh import scene_glb
-from pipelines.scenes.mesh_import import scene_from_glb
-from pipelines.scenes.palette import COLOR_HEX, rgb
-from pipelines.sources.town import town_drive
+from pipelines.io.mesh_export import scene_glb
+from pipelines.io.mesh_import import scene_from_glb
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.palette import COLOR_HEX, rgb
 
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
 Z_DOWN = np.diag([1.0, -1.0, -1.0])

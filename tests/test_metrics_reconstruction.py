@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
-from models.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
+from models.geometry.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, yaw_rotation
 from models.tensors import layout_batch
+from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelise
 from pipelines.metrics.reconstruction import (
     MEMORY,
     SCORED,
@@ -28,8 +29,7 @@ from pipelines.metrics.reconstruction import (
     voxel_confusion,
     voxel_scores,
 )
-from pipelines.scenes.palette import CLASS_ID
-from pipelines.scenes.voxels import NUM_CLASSES, VoxelGrid, voxelise
+from pipelines.schema.palette import CLASS_ID
 
 GRID = Grid(front_m=2.0, left_m=1.0, resolution_m=0.5, rows=4, cols=4)
 CAR, POLE, TREE = CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["pole"], CATEGORY_INDEX["vegetation_cuboid"]

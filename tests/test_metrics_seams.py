@@ -8,9 +8,9 @@ from scenes import random_scene
 
 from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Grid
+from pipelines.evaluation.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.seams import MEASURES, footprint_ranges, neighbours, seam_ratios, seam_record
-from pipelines.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
 
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene
-from pipelines.labels import DensityThresholds
 from pipelines.metrics.validity import (
     LABEL_MEASURES,
     MEASURES,
@@ -12,6 +11,7 @@ from pipelines.metrics.validity import (
     scene_validity,
     validity_rates,
 )
+from pipelines.schema.density_labels import DensityThresholds
 
 GRID = Grid(front_m=16.0, left_m=8.0, resolution_m=1.0, rows=16, cols=16)
 CAR, POLE, HOUSE, TREE, HUMAN = (

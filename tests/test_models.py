@@ -12,14 +12,14 @@ from torch.nn import functional as F
 
 from models.batch import LayoutBatch
 from models.dit import DiT
-from models.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
 from models.layout import LayoutSpec
-from models.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
 from models.lvae import LayoutVAE, Posterior
-from models.matching import MatchWeights, match
+from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
 from models.tensors import compact_layout, layout_batch
 from models.training import Execution, Optimisation, Trainer, lvae_trainer, stacked_corruption
-from models.zoo import DIT_PRESETS, LVAE_PRESETS, preset
+from models.vae.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
+from models.vae.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
+from models.vae.matching import MatchWeights, match
 
 
 def millions(model) -> float:
@@ -265,7 +265,7 @@ def test_losses_are_their_equations():
     assignment = match(features, logit, truth, real, spec.slots, spec.slots)
     got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
 
-    from models.losses import OBJECT_WEIGHTS
+    from models.vae.losses import OBJECT_WEIGHTS
 
     want = np.zeros(3)
     for sample in range(b):

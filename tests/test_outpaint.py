@@ -9,9 +9,9 @@ import torch
 from scenes import random_scene
 from test_pipeline import QUICK, SPEC, pipeline, same  # noqa: F401 (a fixture)
 
-from models.city import City
+from models.composition.infinite import City
+from models.composition.outpaint import Block, Lattice, World, colour, height_near, outward
 from models.layout import LayoutSpec
-from models.outpaint import Block, Lattice, World, colour, height_near, outward
 from models.scene import KITTI_GROUND_CLASSES, Grid
 from models.tensors import new_scene
 

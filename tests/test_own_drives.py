@@ -15,11 +15,11 @@ import shapely
 from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, Grid
-from pipelines.scenes.tables import Shard, read_scenes
-from pipelines.sources import own
-from pipelines.sources.drive import STATIC, Drive, Pose
-from pipelines.sources.own import drives, ground_classes, read_drive, read_poses, read_splits
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources import custom
+from pipelines.preprocess.sources.custom import drives, ground_classes, read_drive, read_poses, read_splits
+from pipelines.preprocess.sources.drive import STATIC, Drive, Pose
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.tables import Shard, read_scenes
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "own_drives.md"
 ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # a place in UTM
@@ -110,7 +110,7 @@ def test_a_data_frame_with_gaps_and_an_index_is_the_same_drive(tmp_path):
     frame = pandas.DataFrame([*rows[:2], {"category": "pole"}, *rows[2:]])
     frame[frame.x_m > 0].to_parquet(folder / "boxes.parquet")
     stored = pq.read_schema(folder / "boxes.parquet")
-    assert own.PANDAS_INDEX in stored.names and stored.field("frame").type == pa.float64()
+    assert custom.PANDAS_INDEX in stored.names and stored.field("frame").type == pa.float64()
     assert_same_drive(a, read_drive(tmp_path / "b", "street"))
 
 
@@ -119,7 +119,7 @@ def test_yaw_quaternion_and_matrix_are_the_same_orientation(tmp_path):
     a = written(tables, tmp_path / "a")
     for row in [*tables["boxes"], *tables["poses"]]:
         q = Rotation.from_rotvec([0, 0, row.pop("yaw_rad")]).as_quat(scalar_first=True)
-        row |= dict(zip(own.QUATERNION, q.tolist(), strict=True))
+        row |= dict(zip(custom.QUATERNION, q.tolist(), strict=True))
     assert_same_drive(a, written(tables, tmp_path / "b"), 1e-12)
     tables["poses"] = [
         {"frame": int(frame), "world_from_ego": matrix.ravel().tolist()}
@@ -190,7 +190,7 @@ def test_a_box_keeps_its_lean_and_a_standing_one_has_no_heading(tmp_path):
     tables = street()
     tables["boxes"] = [
         {name: value for name, value in box("vehicle_small", 20, k, 0).items() if name != "yaw_rad"}
-        | dict(zip(own.QUATERNION, q.tolist(), strict=True))
+        | dict(zip(custom.QUATERNION, q.tolist(), strict=True))
         for k, q in enumerate(turn.as_quat(scalar_first=True))
     ]
     drive = written(tables, tmp_path)
@@ -358,7 +358,7 @@ def exported(drive: Drive) -> Tables:
         "category": [CATEGORIES[c] for c in drive.category],
         **dict(zip(("x_m", "y_m", "z_m"), drive.center_m.T.tolist(), strict=True)),
         **dict(zip(("length_m", "width_m", "height_m"), drive.size_m.T.tolist(), strict=True)),
-        **dict(zip(own.QUATERNION, quaternion.T.tolist(), strict=True)),
+        **dict(zip(custom.QUATERNION, quaternion.T.tolist(), strict=True)),
         "frame": [None if t == STATIC else t for t in drive.timestamp.tolist()],
         "instance_id": drive.instance_id.tolist(),
         "label": drive.label.tolist(),
@@ -461,7 +461,7 @@ def test_the_documents_turn_into_the_world_is_right(example):
 def test_the_document_names_every_column_category_and_class():
     text = DOCUMENT.read_text()
     tables = {title: body for title, body in re.findall(r"## (boxes|polygons|poses)\n(.*?)(?=\n## )", text, re.DOTALL)}
-    known = {"boxes": own.BOX_COLUMNS, "polygons": own.POLYGON_COLUMNS, "poses": own.POSE_COLUMNS}
+    known = {"boxes": custom.BOX_COLUMNS, "polygons": custom.POLYGON_COLUMNS, "poses": custom.POSE_COLUMNS}
     for title, body in tables.items():
         cells = [line.split("|")[1] for line in body.splitlines() if line.startswith("| `")]
         assert set(re.findall(r"`(\w+)`", " ".join(cells))) == set(known[title])

@@ -10,14 +10,21 @@ from diffusers import DPMSolverMultistepScheduler
 from scenes import random_scene, small_spec, tiny_pipeline
 from test_diffusion import SHAPE
 
-from models.borders import continued
-from models.diffusion import Diffusion, Known, SceneNoise, Walk, rescaled, sample, solve
+from models.composition.inpaint import (
+    cells_of,
+    composited,
+    half_plane_region,
+    latent_mask,
+    object_region,
+    polygon_region,
+)
+from models.composition.seam_blending import continued
 from models.dit import DiT
-from models.inpaint import cells_of, composited, half_plane_region, latent_mask, object_region, polygon_region
 from models.lvae import LayoutVAE
 from models.pipeline import SAMPLERS, PrITTIPipeline, Resampling, scheduler
+from models.presets import LVAE_PRESETS
+from models.sampling.diffusion import Diffusion, Known, SceneNoise, Walk, rescaled, sample, solve
 from models.scene import Grid
-from models.zoo import LVAE_PRESETS
 
 SPEC = small_spec()
 QUICK = Resampling(num_steps=6, jump_length=2, resamplings=2)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from models.released import CHECKSUMS, WEIGHTS, checksums, pipeline_path, released
+from models.pretrained import CHECKSUMS, WEIGHTS, checksums, pipeline_path, released
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +27,9 @@ def evaluated(smoke) -> Path:
 
 
 def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
-    from jobs.given_scenes import pipeline_directory
     from jobs.publish_model import Config, publish
-    from pipelines.generate import load_pipeline
+    from jobs.support.options import pipeline_directory
+    from pipelines.generation.sample import load_pipeline
 
     output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
     entry = Path(output)
@@ -113,11 +113,11 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_
     import torch
 
     from jobs.publish_model import history
-    from jobs.ray_training import as_tensors, tag_weights
+    from jobs.support.trainer import as_tensors, tag_weights
     from jobs.train_dit import Config, prepare
-    from pipelines.encode import weights_digest
-    from pipelines.feed import batches
-    from pipelines.generate import load_pipeline
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.training.data_loader import batches
+    from pipelines.training.latents import weights_digest
 
     start, more = str(tmp_path / "start"), tmp_path / "more"
     pipeline = load_pipeline(str(smoke / "models/pritti-smoke"))
@@ -148,14 +148,14 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_
 
 
 def test_a_password_in_the_tracking_uri_is_not_shown():
-    from jobs.tracking import shown
+    from jobs.support.tracking import shown
 
     assert shown("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
     assert shown("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
 
 
 def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
-    from jobs.given_scenes import pipeline_directory
+    from jobs.support.options import pipeline_directory
 
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
         with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
@@ -163,7 +163,7 @@ def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
 
 
 def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_path, monkeypatch):
-    from jobs.given_scenes import pipeline_directory
+    from jobs.support.options import pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
     assert pipeline_directory("") == pipeline_path("town")
@@ -179,12 +179,15 @@ def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_
 
 
 def test_a_command_is_told_without_paths_of_this_machine(monkeypatch):
-    from pipelines import origin
+    from pipelines.runtime import provenance
 
     monkeypatch.setenv("PRITTI_HOME", "/data")
     typed = ["jobs/train_dit.py", "demo", "--dataset", "/data/sets/town", "--output=/data2/a b", "--name", "x y"]
-    monkeypatch.setattr(origin.sys, "argv", [str(origin.ROOT / typed[0]), *typed[1:]])
-    assert origin.command() == "jobs/train_dit.py demo --dataset $PRITTI_HOME/sets/town '--output=.../a b' --name 'x y'"
+    monkeypatch.setattr(provenance.sys, "argv", [str(provenance.ROOT / typed[0]), *typed[1:]])
+    assert (
+        provenance.command()
+        == "jobs/train_dit.py demo --dataset $PRITTI_HOME/sets/town '--output=.../a b' --name 'x y'"
+    )
 
 
 def test_released_weights_are_what_their_checksums_say():

@@ -5,7 +5,7 @@ import shapely
 import trimesh
 
 from models.scene import Grid
-from pipelines.scenes.rasters import cast_down, fill_polygon
+from pipelines.geometry.rasterize import cast_down, fill_polygon
 
 
 def cast_by_rays(triangles_m: np.ndarray, grid: Grid) -> np.ndarray:

@@ -11,10 +11,8 @@ from scenes import random_scene, small_spec
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import DecodedLayout, compact_layout, layout_batch
-from pipelines import storage
-from pipelines.evaluate import flattened
-from pipelines.metrics.intervals import Estimate
-from pipelines.rebuild import (
+from pipelines.evaluation.evaluate import flattened
+from pipelines.evaluation.reconstruction import (
     Rebuilt,
     SceneRecord,
     chunks_of,
@@ -25,9 +23,11 @@ from pipelines.rebuild import (
     table_bytes,
     voxel_grid,
 )
-from pipelines.reconstruction_report import reconstruction_html
-from pipelines.scenes.tables import Shard
-from pipelines.selection import Selection
+from pipelines.metrics.intervals import Estimate
+from pipelines.reporting.reconstruction_report import reconstruction_html
+from pipelines.runtime import storage
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import Shard
 
 LATENT = np.zeros((4, 8, 8), np.float32)
 SPEC = replace(
@@ -195,7 +195,7 @@ def test_the_page_shows_truth_beside_reconstruction(dataset, rebuilt):
 
 
 def test_one_mlflow_run_per_output_directory(tmp_path, monkeypatch):
-    from jobs.tracking import client, publish_scores, tracking_uri
+    from jobs.support.tracking import client, publish_scores, tracking_uri
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)

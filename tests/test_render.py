@@ -9,10 +9,10 @@ from scenes import random_scene
 from test_mesh import empty_scene, example_scene
 
 from models.scene import CATEGORY_INDEX, ELLIPSOID, Grid, Scene
-from pipelines.scenes.casting import cast_ellipsoids, ellipsoids_over, looking_at, looking_down
-from pipelines.scenes.mesh import cuboid_triangles, scene_from_unit, scene_triangles
-from pipelines.scenes.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
-from pipelines.scenes.render import bev_picture, contact_sheet, picture_3d
+from pipelines.geometry.orthographic import cast_ellipsoids, ellipsoids_over, looking_at, looking_down
+from pipelines.io.mesh_export import cuboid_triangles, scene_from_unit, scene_triangles
+from pipelines.rendering.render import bev_picture, contact_sheet, picture_3d
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
 
 
 def literal(scene: Scene, view: Grid) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipelines.chart import Chart, chart_svg, log_ticks, number, ticks
-from pipelines.report import (
+from pipelines.reporting.chart import Chart, chart_svg, log_ticks, number, ticks
+from pipelines.reporting.report import (
     Charts,
     Figure,
     KeyFigures,

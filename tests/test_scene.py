@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import random_rotations, random_scene
 
-from models.cholesky import boxes_from_cholesky, cholesky_parameters, scatter_matrix
+from models.geometry.cholesky import boxes_from_cholesky, cholesky_parameters, scatter_matrix
 from models.scene import Grid, canonical_boxes, merge, yaw_of
 
 

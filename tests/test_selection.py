@@ -5,8 +5,8 @@ import pyarrow as pa
 import pytest
 from scenes import random_scene
 
-from pipelines.scenes.tables import Shard
-from pipelines.selection import Selection, apart, balanced, evenly, farthest, poses
+from pipelines.schema.scene_subset import Selection, apart, balanced, evenly, farthest, poses
+from pipelines.schema.tables import Shard
 
 
 def test_farthest_poses_equal_brute_force():

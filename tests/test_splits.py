@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from pipelines.splits import no_split, num_segments, split_poses
+from pipelines.schema.splits import no_split, num_segments, split_poses
 
 
 def winding_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray) -> np.ndarray:

@@ -15,13 +15,13 @@ from scenes import random_scene
 from scipy.integrate import cumulative_trapezoid
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.scenes.mesh import GROUND, scene_triangles
-from pipelines.scenes.opendrive import lanes_of, reference_lines, scene_opendrive
-from pipelines.scenes.palette import CATEGORY_IDS, EMPTY
-from pipelines.scenes.roads import drive, road_network
-from pipelines.scenes.street import Lens, StreetCamera, StreetRenderer, shaded
-from pipelines.scenes.tables import Shard
-from pipelines.sources.town import town_drive
+from pipelines.geometry.centerlines import drive, road_network
+from pipelines.io.mesh_export import GROUND, scene_triangles
+from pipelines.io.opendrive import lanes_of, reference_lines, scene_opendrive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shaded
+from pipelines.schema.palette import CATEGORY_IDS, EMPTY
+from pipelines.schema.tables import Shard
 
 SMALL = Lens().resized(176, 47)
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pipelines.scenes.palette import CLASS_COLORS, CLASS_ID, EMPTY
-from pipelines.street_photos import SKY, Painter, PhotoRequest, control_image
+from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, control_image
+from pipelines.schema.palette import CLASS_COLORS, CLASS_ID, EMPTY
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,12 @@ from browser import faults, start_browser, wait_for
 from PIL import Image
 from scenes import random_scene, small_spec, tiny_pipeline
 
-from models.extend import extended, grown, inpainting, region_blocks, windows
-from models.inpaint import polygon_region
+from models.composition.extend import extended, grown, inpainting, region_blocks, windows
+from models.composition.inpaint import polygon_region
 from models.pipeline import Resampling
 from models.scene import CATEGORY_INDEX, Scene
-from pipelines.scenes.mesh_import import scene_from_glb
-from pipelines.scenes.tables import Shard, read_scenes
+from pipelines.io.mesh_import import scene_from_glb
+from pipelines.schema.tables import Shard, read_scenes
 
 SPEC = small_spec()
 POST = {"x-studio": "1"}
@@ -221,7 +221,7 @@ def test_with_a_token_nobody_enters_without_it(tables):
     """The same interface without Ray, on any address."""
     from starlette.testclient import TestClient
 
-    from pipelines.studio import Studio, studio_app
+    from pipelines.studio.session import Studio, studio_app
 
     studio = Studio(str(tables / "model"), [])
     client = TestClient(studio_app(lambda: studio, "secret", ()), base_url="http://studio.example")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipelines.metrics.intervals import Estimate
-from pipelines.sampler_sweep import (
+from pipelines.evaluation.reference_sweep import references, sweep, sweep_charts, sweep_html
+from pipelines.evaluation.sampler_sweep import (
     as_good_as,
     reference_row,
     sampler_charts,
@@ -12,8 +12,8 @@ from pipelines.sampler_sweep import (
     sampler_row,
     sampler_table,
 )
-from pipelines.selection import apart, farthest
-from pipelines.sweep import references, sweep, sweep_charts, sweep_html
+from pipelines.metrics.intervals import Estimate
+from pipelines.schema.scene_subset import apart, farthest
 
 
 def test_references_fit_both_sides():

@@ -9,8 +9,8 @@ import pytest
 from scenes import random_scene
 
 from models.scene import Grid
-from pipelines import storage
-from pipelines.scenes.tables import HEIGHT_STEP_M, PRIMITIVES, SCENES, Shard, find_shards, read_scenes
+from pipelines.runtime import storage
+from pipelines.schema.tables import HEIGHT_STEP_M, PRIMITIVES, SCENES, Shard, find_shards, read_scenes
 
 
 def assert_same(a, b):

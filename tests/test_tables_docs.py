@@ -19,11 +19,13 @@ import pytest
 from scenes import random_scene
 
 from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, yaw_rotation
-from pipelines import storage
-from pipelines.edits import EditRequest, edited
-from pipelines.labels import density, density_thresholds
-from pipelines.scenes.edit import Remove, Select
-from pipelines.scenes.tables import (
+from pipelines.editing.edit import Remove, Select
+from pipelines.generation.batch_edit import EditRequest, edited
+from pipelines.preprocess.sources import argoverse2, kitti360
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.runtime import storage
+from pipelines.schema.density_labels import density, density_thresholds
+from pipelines.schema.tables import (
     CATEGORY_MEANING,
     EDITS,
     HEIGHT_STEP_M,
@@ -36,8 +38,6 @@ from pipelines.scenes.tables import (
     read_scenes,
     rejects_table,
 )
-from pipelines.sources import argoverse2, kitti360
-from pipelines.sources.town import town_drive
 
 PAGE = Path(__file__).parents[1] / "docs" / "tables.md"
 SCHEMAS = {
@@ -425,7 +425,7 @@ def test_units_are_those_in_the_names():
 
 def test_labelling_keeps_the_explanations(root, tmp_path):
     """The last step of preprocessing rewrites the scenes tables."""
-    from pipelines.dataset import Statistics, label_scenes
+    from pipelines.schema.dataset import Statistics, label_scenes
 
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
     thresholds = density_thresholds(np.arange(4), np.arange(4.0))

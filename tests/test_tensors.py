@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import random_scene, small_spec
 
-from models.cholesky import scatter_matrix
+from models.geometry.cholesky import scatter_matrix
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Grid
 from models.tensors import DecodedLayout, compact_layout, ground_on_grid, layout_batch, scene_from_layout

@@ -9,9 +9,9 @@ import pytest
 import shapely
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, Grid
-from pipelines.sources import kitti360
-from pipelines.sources.drive import STATIC
-from pipelines.sources.town import (
+from pipelines.preprocess.sources import kitti360
+from pipelines.preprocess.sources.drive import STATIC
+from pipelines.preprocess.sources.town.generator import (
     DISTRICTS,
     TEST_SEEDS_START,
     TRAIN_SEEDS_START,
@@ -22,7 +22,7 @@ from pipelines.sources.town import (
     town_plan,
     write_kitti360,
 )
-from pipelines.sources.town_land import clip_ears, outlines_of
+from pipelines.preprocess.sources.town.land import clip_ears, outlines_of
 
 SMALL = Grid(resolution_m=1.0, rows=64, cols=64)
 
@@ -310,6 +310,6 @@ def test_without_defects_every_object_is_written_once(tmp_path, drives):
 
 def test_importing_the_town_needs_numpy_only():
     heavy = ["ray", "pyarrow", "shapely", "trimesh", "torch", "scipy", "PIL"]
-    code = f"import sys, pipelines.sources.town; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, pipelines.preprocess.sources.town.generator; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scenes import random_scene
 
+from pipelines.geometry.voxels import VoxelGrid, voxelise
+from pipelines.io.mesh_export import scene_glb
+from pipelines.io.voxel_import import FULL, SHAPES, read_voxels, voxel_picture, write_voxels
 from pipelines.metrics.reconstruction import voxel_confusion
-from pipelines.scenes.mesh import scene_glb
-from pipelines.scenes.palette import CLASS_COLORS, CLASS_ID
-from pipelines.scenes.render import bev_picture
-from pipelines.scenes.tables import Shard, find_shards, read_scenes
-from pipelines.scenes.voxel_import import FULL, SHAPES, read_voxels, voxel_picture, write_voxels
-from pipelines.scenes.voxels import VoxelGrid, voxelise
-from pipelines.sources.town import town_drive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.rendering.render import bev_picture
+from pipelines.schema.palette import CLASS_COLORS, CLASS_ID
+from pipelines.schema.tables import Shard, find_shards, read_scenes
 
 
 @pytest.fixture(scope="module")

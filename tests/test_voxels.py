@@ -7,11 +7,11 @@ import pytest
 import trimesh
 from scenes import random_rotations, random_scene
 
-import pipelines.scenes.voxels
+import pipelines.geometry.voxels
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
-from pipelines.scenes.mesh import scene_from_unit, unit_cuboid
-from pipelines.scenes.palette import CATEGORY_IDS, CLASS_ID, EMPTY
-from pipelines.scenes.voxels import PRECEDENCE, VoxelGrid, outside, voxelise
+from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, outside, voxelise
+from pipelines.io.mesh_export import scene_from_unit, unit_cuboid
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_ID, EMPTY
 
 # 24 x 20 columns of 0.5 m, 16 levels of 0.5 m.
 SMALL = VoxelGrid(Grid(front_m=12.0, left_m=5.0, resolution_m=0.5, rows=24, cols=20), -2.0, 6.0, 16)
@@ -70,7 +70,7 @@ def test_voxels_equal_testing_every_centre_in_every_primitive(seed, tilt_rad):
 def test_parts_make_no_difference(monkeypatch):
     scene = objects(8, n=50)
     whole = voxelise(scene, SMALL)
-    monkeypatch.setattr(pipelines.scenes.voxels, "PART_COLUMNS", 100)
+    monkeypatch.setattr(pipelines.geometry.voxels, "PART_COLUMNS", 100)
     np.testing.assert_array_equal(voxelise(scene, SMALL), whole)
 
 

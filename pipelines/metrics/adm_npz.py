@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
-from pipelines.storage import resolve, write_whole
+from pipelines.runtime.storage import resolve, write_whole
 
 PICTURES = "arr_0"
 

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from models.batch import LayoutBatch
-from models.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
+from models.geometry.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
 from models.scene import CATEGORIES, ELLIPSOID, Scene
-from pipelines.scenes.palette import CLASS_ID, EMPTY
-from pipelines.scenes.voxels import NUM_CLASSES
+from pipelines.geometry.voxels import NUM_CLASSES
+from pipelines.schema.palette import CLASS_ID, EMPTY
 
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # IoU3D, Omni3D's ten steps
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)

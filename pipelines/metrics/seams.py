@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.iou3d import boxes_of, iou3d_matrix
+from models.geometry.iou3d import boxes_of, iou3d_matrix
 from models.scene import Scene
 from pipelines.metrics.intervals import Estimate, estimate, weights
 

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy import ndimage
 
-from models.iou3d import boxes_of, iou3d_matrix
+from models.geometry.iou3d import boxes_of, iou3d_matrix
 from models.scene import CATEGORIES, CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
-from pipelines.labels import DensityThresholds, density
+from pipelines.schema.density_labels import DensityThresholds, density
 
 MEASURES = (
     "overlapping",  # solid primitives with IoU3D > 0.05 with another solid one

@@ -1,4 +1,4 @@
-// The gallery page: cards that filters and an order choose from; one scene at a time in 3D. Data: pipelines/gallery_page.py.
+// The gallery page: cards that filters and an order choose from; one scene at a time in 3D. Data: pipelines/reporting/gallery_page.py.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);

@@ -1,4 +1,4 @@
-// The studio's page. What can be asked of the server: pipelines/studio.py.
+// The studio's page. What can be asked of the server: pipelines/studio/session.py.
 import { Viewer } from "/viewer.js";
 
 const $ = (id) => document.getElementById(id);

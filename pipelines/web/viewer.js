@@ -1,6 +1,6 @@
 // A scene in 3D: ground, boxes and ellipsoids in soft light, on WebGL2 alone. Frame of the scene: x ahead, y left, z up, metres.
 //
-//   const viewer = new Viewer(canvas); viewer.show(scene);   // scene: what pipelines/scenes/web.py makes
+//   const viewer = new Viewer(canvas); viewer.show(scene);   // scene: what pipelines/io/web_export.py makes
 //   viewer.onpick = index => ...                              // a click on a primitive, -1 elsewhere
 //
 // Drag turns, right drag or two fingers move, the wheel goes nearer.

@@ -1,0 +1,1 @@
+"""What the jobs share: command line, options, trainer, tracking."""

@@ -1,0 +1,136 @@
+"""What rank 0 looks at while a model trains: losses on held-out scenes and pictures of the same few every time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from models.lvae import LayoutVAE
+from models.sampling.diffusion import Diffusion, SceneNoise, Walk, keyed_generator, sample
+from models.scene import Scene
+from models.tensors import layout_batch, scene_from_layout
+from models.training import Trainer, stacked_noise
+from models.vae.losses import lvae_loss
+from pipelines.metrics.reconstruction import detection_scores, ground_scores, ground_sums, join_matches, match_scene
+from pipelines.rendering.render import bev_picture, contact_sheet
+from pipelines.schema.tables import find_shards, read_scenes
+from pipelines.training.data_loader import LatentReader
+from pipelines.training.latents import load_lvae
+
+SHOWN = 4
+
+
+@lru_cache(maxsize=2)
+def held_out_scenes(root: str, source: str, count: int) -> tuple[Scene, ...]:
+    """The first test scenes of a dataset; training scenes where there is no test split."""
+    try:
+        return tuple(read_scenes(root, source, "test", count))
+    except ValueError:
+        return tuple(read_scenes(root, source, "train", count))
+
+
+@dataclass(frozen=True)
+class ReconstructionCheck:
+    """Validation of stage 1 on the first `count` held-out scenes."""
+
+    root: str
+    source: str
+    kl_weight: float
+    count: int = 32
+    batch: int = 8
+
+    @torch.no_grad()
+    def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Losses of a sampled latent, as in training; ground IoU, height error and AP3D of the mean, as the evaluator
+        takes them; pictures: truth above reconstruction.
+        """
+        model, scenes = trainer.averaged().eval(), list(held_out_scenes(self.root, self.source, self.count))
+        spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
+        for start in range(0, len(scenes), self.batch):
+            chosen = scenes[start : start + self.batch]
+            batch = layout_batch(chosen, spec).to(trainer.device)
+            noise = stacked_noise(
+                [keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
+            )
+            output, posterior = model(batch, noise)
+            parts = lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
+            losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
+            layouts = model.decode(posterior.mean).layouts()
+            for scene, layout, *truth in zip(chosen, layouts, batch.occupied, batch.height, strict=True):
+                rebuilt.append(scene_from_layout(layout, spec, scene))
+                matches.append(match_scene(scene, scene_from_layout(layout, spec, scene, threshold=-1.0)))
+                occupied, height = (v.cpu().numpy() for v in truth)
+                height_m = [spec.height_bounds_m.restore(h[..., None])[..., 0] for h in (height, layout.height)]
+                part = ground_sums(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
+                sums = part if sums is None else sums + part
+        model.train()
+        scores = ground_scores(
+            sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high])
+        )
+        metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
+        metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
+        metrics |= {"validation_ap3d": detection_scores(join_matches(matches)).ap3d}
+        pictures = [bev_picture(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
+        return metrics, {"reconstruction": contact_sheet(pictures, columns=min(SHOWN, len(scenes)))}
+
+
+@dataclass(frozen=True)
+class SamplingCheck:
+    """Validation of stage 2: loss on held-out latents, and the same few noises sampled every time."""
+
+    root: str
+    source: str
+    latents: str
+    lvae: str
+    label: str
+    count: int = 64
+    num_inference_steps: int = 25
+
+    @torch.no_grad()
+    def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Validation loss (same noise every time) and pictures of SHOWN generated scenes."""
+        dit, device = trainer.averaged().eval(), trainer.device
+        arrays = held_out_latents(self.root, self.source, self.latents, self.label, self.count)
+        arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
+        generators = [keyed_generator(1, k) for k in range(len(arrays["label"]))]
+        loss = float(trainer.loss(dit, arrays, generators)["loss"])
+
+        shape = (dit.config.channels, dit.config.size, dit.config.size)
+        labels = torch.arange(SHOWN, device=device) % dit.config.num_labels
+        latents = sample(
+            dit, Walk(Diffusion(), self.num_inference_steps), SceneNoise(0, range(SHOWN), shape, device), labels
+        )
+        shift, scale = (
+            torch.tensor(v or [d] * shape[0], device=device)[:, None, None]
+            for v, d in ((dit.config.shift, 0.0), (dit.config.scale, 1.0))
+        )
+        dit.train()
+        lvae = cached_lvae(self.lvae).to(device)
+        identity = held_out_scenes(self.root, self.source, 1)[0]
+        scenes = [scene_from_layout(x, lvae.spec, identity) for x in lvae.decode(latents * scale + shift).layouts()]
+        return {"validation_loss": loss}, {"samples": contact_sheet([bev_picture(s) for s in scenes], columns=SHOWN)}
+
+
+@lru_cache(maxsize=1)
+def cached_lvae(directory: str) -> LayoutVAE:
+    return load_lvae(directory)
+
+
+@lru_cache(maxsize=1)
+def held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
+    """The first latents of the test split (training split where there is none), with their labels."""
+    try:
+        shards = find_shards(root, source=source, split="test")
+    except ValueError:
+        shards = find_shards(root, source=source, split="train")
+    read, parts, left = LatentReader(latents, label), [], count
+    for shard in shards:
+        rows = np.arange(min(left, shard.read("scenes", ["scene_id"]).num_rows))
+        parts.append(read(shard, rows))
+        left -= len(rows)
+        if left == 0:
+            break
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

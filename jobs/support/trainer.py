@@ -1,0 +1,246 @@
+"""Feeds models/training.py through Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
+
+Resume = the same command again: Ray Train finds the run of the same name and hands its last checkpoint back.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import ray.train
+import ray.train.torch
+import torch
+from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
+
+from jobs.support.cli import root_cause, run_packed, start_ray
+from jobs.support.tracking import Tracker
+from models.training import NotFinite, Optimisation, Trainer
+from pipelines.runtime import storage
+from pipelines.training.data_loader import READER_CPUS, Reader, Stream, batches
+from pipelines.training.latents import weights_digest
+
+Wrap = Callable[[torch.nn.Module], torch.nn.Module]
+RETRIES = 2  # of workers that fail, from the last checkpoint
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """One training run, as its workers receive it. Everything in it pickles.
+
+    `build(device, wrap)` makes the Trainer; `validate(trainer)` returns metrics and pictures (names to arrays) and
+    runs on rank 0 at every checkpoint; `identity` is what a resumed run must share with the one it continues.
+    """
+
+    name: str
+    storage_path: str
+    build: Callable[[torch.device, Wrap], Trainer]
+    stream: Stream
+    reader: Reader
+    settings: Optimisation
+    identity: dict
+    tracker: Tracker
+    checkpoint_every: int
+    log_every: int
+    validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
+
+
+def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {
+        name: torch.from_numpy(np.array(value))  # a copy: Ray's are read-only
+        for name, value in batch.items()
+    }
+
+
+def train_worker(run: TrainingRun, threads: int) -> None:
+    """What every worker runs: batches -> steps, with a log line, a checkpoint and a validation now and then."""
+    logging.getLogger("ray.train").setLevel(logging.WARNING)
+    logging.getLogger("ray.data").setLevel(logging.WARNING)
+    context = ray.train.get_context()
+    rank, world = context.get_world_rank(), context.get_world_size()
+    torch.set_num_threads(threads)
+    device = ray.train.torch.get_device()
+    wrap = ray.train.torch.prepare_model if world > 1 else lambda model: model
+    trainer = run.build(device, wrap)
+    if checkpoint := ray.train.get_checkpoint():
+        with checkpoint.as_directory() as directory:
+            trainer.load(directory)
+    local = run.stream.batch_size // world
+    positions = range(rank * local, (rank + 1) * local)
+    started, logged, waited = time.perf_counter(), trainer.steps_done, 0.0
+    feed = timed(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
+    for batch, seconds in feed:
+        waited += seconds
+        try:
+            losses = trainer.step(as_tensors(batch), positions)
+        except NotFinite as error:
+            raise ValueError(with_scene_ids(error, run.stream)) from error
+        step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
+        if rank == 0 and (step % run.log_every == 0 or last):
+            elapsed, done = time.perf_counter() - started, step - logged
+            metrics = {name: float(value) for name, value in losses.items()} | {
+                "learning_rate": run.settings.at(step - 1)[0],
+                "scenes_per_second": done * run.stream.batch_size / elapsed,
+                "waiting_for_data": waited / elapsed,
+            }
+            run.tracker.metrics(metrics, step)
+            left = (run.settings.steps - step) * elapsed / done
+            print(
+                f"{run.name}: step {step}/{run.settings.steps}  loss {metrics['loss']:.4g}  "
+                f"{metrics['scenes_per_second']:.1f} scenes/s  {left / 60:.1f} min left",
+                flush=True,
+            )
+            started, logged, waited = time.perf_counter(), step, 0.0
+        if step % run.checkpoint_every == 0 or last:
+            report(run, trainer, rank, float(losses["loss"]))
+            started, logged, waited = time.perf_counter(), step, 0.0
+
+
+def with_scene_ids(error: NotFinite, stream: Stream) -> str:
+    """The message of a loss that is not finite, with the scenes that are to blame."""
+    shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
+    ids = [
+        stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
+    ]
+    return (
+        f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
+    )
+
+
+def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:
+    """Items with the seconds that each was waited for."""
+    while True:
+        started = time.perf_counter()
+        try:
+            item = next(iterator)
+        except StopIteration:
+            return
+        yield item, time.perf_counter() - started
+
+
+def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
+    """Save a checkpoint (rank 0) and tell Ray Train; every worker must call it."""
+    metrics = {"step": trainer.steps_done, "loss": loss}
+    if rank != 0:
+        ray.train.report(metrics)
+        return
+    if run.validate:
+        values, pictures = run.validate(trainer)
+        if values:
+            run.tracker.metrics(values, trainer.steps_done)
+        for name, image in pictures.items():
+            run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
+    model = trainer.averaged()
+    tag_weights(run.tracker, model, trainer.steps_done)
+    with tempfile.TemporaryDirectory() as directory:
+        trainer.save(directory)
+        model.save_pretrained(os.path.join(directory, "model"))
+        ray.train.report(metrics, checkpoint=Checkpoint.from_directory(directory))
+
+
+def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
+    """Say in MLflow which weights a run has made so far: jobs/publish_model.py finds the run by them."""
+    tracker.tag("weights", weights_digest(model))
+    tracker.tag("steps", str(steps))
+
+
+def fit(run: TrainingRun, num_workers: int, output: str) -> str:
+    """Train to the end and put the model (EMA weights if there are any) into `output`; returns `output`.
+
+    Raises ValueError for a number of workers that does not fit, or for a loss that is not finite.
+    """
+    start_ray(training=True)
+    scaling = scaling_for(num_workers, run.stream.batch_size)
+    threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
+    trainer = ray.train.torch.TorchTrainer(
+        run_packed,
+        train_loop_config={"packed": ray.cloudpickle.dumps(partial(train_worker, run, threads))},
+        scaling_config=scaling,
+        run_config=RunConfig(
+            name=run.name,
+            storage_path=run.storage_path,
+            checkpoint_config=CheckpointConfig(num_to_keep=2),
+            failure_config=FailureConfig(max_failures=RETRIES),
+        ),
+    )
+    try:
+        result = trainer.fit()
+    except KeyboardInterrupt:
+        run.tracker.finish("KILLED")
+        raise
+    except Exception as error:
+        run.tracker.finish("FAILED")
+        for failure in getattr(error, "worker_failures", {}).values():
+            if isinstance(root_cause(failure), ValueError):
+                raise root_cause(failure) from error
+        raise
+    with result.checkpoint.as_directory() as directory:
+        publish_directory(os.path.join(directory, "model"), output)
+        run.tracker.artifacts(os.path.join(directory, "model"), "model")
+    run.tracker.finish("FINISHED")
+    return output
+
+
+def scaling_for(num_workers: int, batch_size: int) -> ScalingConfig:
+    """Workers that fit the cluster and leave room for reading. Raises ValueError: too many would wait for ever."""
+    cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
+    per_worker = 1.0 if cpus > 2 * num_workers else 0.5
+    most = int((cpus - READER_CPUS) // per_worker)
+    if not 1 <= num_workers <= most:
+        raise ValueError(f"--workers is {num_workers}, this cluster of {cpus:.0f} CPUs has room for 1 to {most}")
+    if batch_size < 1 or batch_size % num_workers:
+        raise ValueError(f"--batch-size {batch_size} does not divide by --workers {num_workers}")
+    return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
+
+
+def claim(name: str, storage_path: str, identity: dict) -> str:
+    """Claim a run's name for one set of options; where its MLflow run is recorded.
+
+    Raises ValueError if it belongs to another set and has checkpoints already.
+    """
+    directory = storage.join(storage_path, name)
+    record = storage.join(directory, "identity.json")
+    if storage.exists(record) and (made := storage.read_json(record)) != identity:
+        if any("/checkpoint_" in path for path in storage.list_files(directory, ".json")):
+            key = next(key for key in sorted(made | identity) if made.get(key) != identity.get(key))
+            raise ValueError(
+                f"run {name!r} was started with {key}={made.get(key)}, asked for {identity.get(key)}; "
+                "use the same options to resume, or another --name for a new run"
+            )
+        storage.delete_directory(directory)  # nothing was trained yet
+    storage.write_json(identity, record)
+    return storage.join(directory, "mlflow.json")
+
+
+def publish_directory(directory: str, output: str) -> None:
+    """Copy a saved model or pipeline into place, file by file; what says that it is complete comes last."""
+    paths = [
+        os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
+    ]
+    for path in sorted(paths, key=lambda path: (path == "model_index.json", path.endswith("config.json"), path)):
+        with open(os.path.join(directory, path), "rb") as source:
+            storage.write_whole(
+                storage.join(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
+            )
+
+
+def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:
+    """The settings with every change that is not None. Raises ValueError for a change that is not positive."""
+    changes = {name: value for name, value in changes.items() if value is not None}
+    for name, value in changes.items():
+        if value <= 0:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}, expected more than 0")
+    return replace(settings, **changes)
+
+
+def identity_of(settings: Optimisation, **more: Any) -> dict:
+    """What makes a run the same run: its optimisation and whatever else determines its weights."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more

@@ -1,0 +1,1 @@
+"""Scenes composed from known and generated parts: inpainting, outpainting, extension, seams."""

@@ -1,0 +1,1 @@
+"""Exact geometry of boxes: IoU3D, the Cholesky parametrisation and other encodings."""

@@ -1,0 +1,1 @@
+"""Parts of the layout VAE: ground and object branches, matching and losses."""

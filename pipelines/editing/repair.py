@@ -1,0 +1,148 @@
+"""Repair of a scene's faults by as little as it takes: onto the ground, apart, and only what neither helps is taken out.
+
+What a fault is says metrics/validity.py. A repair never makes another fault of the same kind worse: a push that would put
+a primitive into a third one is not made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from models.geometry.iou3d import Boxes, boxes_of, iou3d_matrix, iou3d_pairs
+from models.scene import Scene
+from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, faults
+
+# A little less than what is a fault: rounded as tables store it, what was none would else become one.
+GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
+GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
+ROUNDS = 4
+DIRECTIONS = 24
+STEPS = 20  # lengths of a push that are tried
+PAIRS_AT_ONCE = 256  # that are looked at together: some 50 MB
+CANDIDATES = 6  # directions of the shortest pushes that are tried against everything around
+
+
+GroundFaults = Literal["both", "floating", "sunken", "none"]
+
+
+def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
+    """Chosen (n,) primitives that float or are sunken, with their lowest point on the surface."""
+    found = faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
+    wrong = np.zeros(len(scene), bool)
+    for name in ("floating", "sunken"):
+        wrong |= chosen & found[name][0] & (which in ("both", name))
+    height_m, _ = scene.ground_under()
+    center_m = scene.center_m.astype(float)
+    center_m[wrong, 2] += (height_m - slab_offset_m - scene.bottom_m)[wrong]
+    return replace(scene, center_m=center_m.astype(np.float32))
+
+
+def overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
+    """(p, 2) indices i < j of solid boxes that overlap by more than validity allows, the least overlap first."""
+    index = np.flatnonzero(solid)
+    part = boxes.take(index)
+    iou = np.triu(iou3d_matrix(part, part), 1)
+    i, j = np.nonzero(iou > OVERLAP_IOU3D)
+    order = np.argsort(iou[i, j], kind="stable")
+    return np.stack([index[i], index[j]], axis=1)[order]
+
+
+def apart(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
+    """Chosen (n,) solid primitives that overlap, pushed apart sideways by at most most_m each.
+
+    Of all ways to part two the shortest that puts neither into a third; the smaller one goes farther. Where that is not
+    enough both shrink about their centres, to no less than `shrink` of their size.
+    """
+    parting = _Parting(scene, chosen, most_m, shrink)
+    for _ in range(ROUNDS):
+        if not parting.round():
+            break
+    center_m, _, size_m = parting.now
+    return replace(scene, center_m=center_m.astype(np.float32), size_m=size_m.astype(np.float32))
+
+
+class _Parting:
+    """Boxes being pushed: where they are now, where they were given, and who may be moved."""
+
+    def __init__(self, scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> None:
+        self.given, self.now = boxes_of(scene), boxes_of(scene)
+        self.chosen, self.solid = chosen, np.isin(scene.category, SOLID)
+        self.most_m, self.shrink = most_m, shrink
+
+    def round(self) -> bool:
+        """Part what can be parted, each box once; did anything move?"""
+        pairs = overlapping_pairs(self.now, self.solid)
+        moved = np.zeros(len(self.solid), bool)
+        for scale in (1.0, self.shrink):
+            pairs = pairs[~moved[pairs].any(axis=1)]
+            for start in range(0, len(pairs), PAIRS_AT_ONCE):
+                some = pairs[start : start + PAIRS_AT_ONCE]
+                for pair, ways in zip(some, self.ways(some, scale), strict=True):
+                    if not moved[pair].any() and len(free := np.flatnonzero(~self.hit(pair, ways))):
+                        self.now.center_m[pair], self.now.size_m[pair] = ways.center_m[free[0]], ways.size_m[free[0]]
+                        moved[pair] = True
+        return bool(moved.any())
+
+    def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
+        """For each pair up to CANDIDATES places (k, 2) where its boxes do not overlap, the shortest push first.
+
+        Two boxes that overlap at both ends of a straight way overlap all along it (Brunn-Minkowski: their common volume is
+        log-concave), so a direction whose longest push does not part them is given up at once.
+        """
+        start = self.now.take(pairs)  # (p, 2, ...)
+        share = self.chosen[pairs] * start.size_m.prod(axis=2)[:, ::-1]
+        share /= np.maximum(share.max(axis=1, keepdims=True), 1e-300)
+        least_m = self.shrink * self.given.size_m[pairs]
+        size_m = np.where(self.chosen[pairs][..., None], np.maximum(scale * start.size_m, least_m), start.size_m)
+        angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+        directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(DIRECTIONS)], axis=1)
+        pushes_m = directions[:, None] * (np.arange(1, STEPS + 1) * (self.most_m / STEPS))[:, None]
+        to_m = share[:, None, None, :, None] * [[-1.0], [1.0]] * pushes_m[:, :, None]  # (p, directions, steps, 2, 3)
+        center_m = start.center_m[:, None, None] + to_m
+        moved_m = np.linalg.norm((center_m - self.given.center_m[pairs][:, None, None])[..., :2], axis=-1)
+        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): so far, and no farther
+        within &= share.any(axis=1)[:, None, None]
+
+        def parted(where: np.ndarray) -> np.ndarray:
+            """(p, directions, steps) bool: of the pushes in the mask `where` those that part their pair."""
+            pair, *_ = np.nonzero(where)
+            a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
+            found = where.copy()
+            found[where] = iou3d_pairs(a, b) < GOAL_IOU3D
+            return found
+
+        longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
+        found = parted(within & parted(longest).any(axis=2, keepdims=True))
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions), STEPS: none
+        result = []
+        for k, steps in enumerate(first):
+            best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]
+            always = np.full(len(best), k)
+            result.append(Boxes(center_m[k, best, steps[best]], start.rotation[always], size_m[always]))
+        return result
+
+    def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
+        """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
+        others = self.solid.copy()
+        others[pair] = False
+        around = self.now.take(others)
+        then = iou3d_matrix(Boxes(*(part.reshape(-1, *part.shape[2:]) for part in ways)), around)
+        then = then.reshape(len(ways.center_m), 2, len(around.center_m))
+        over = then > GOAL_IOU3D
+        if over.any():
+            over &= then > iou3d_matrix(self.now.take(pair), around)
+        return over.any(axis=(1, 2))
+
+
+def superfluous(scene: Scene, chosen: np.ndarray) -> np.ndarray:
+    """(n,) bool: as few chosen primitives as parting all overlaps takes; of two, the less certain, then the smaller."""
+    gone = np.zeros(len(scene), bool)
+    pairs = overlapping_pairs(boxes_of(scene), np.isin(scene.category, SOLID))
+    while len(pairs := pairs[(chosen[pairs] & ~gone[pairs]).any(axis=1) & ~gone[pairs].any(axis=1)]):
+        often = np.bincount(pairs.ravel(), minlength=len(scene))
+        candidates = np.flatnonzero(chosen & (often == often[chosen].max()))
+        gone[candidates[np.lexsort((scene.volume_m3[candidates], scene.existence[candidates]))[0]]] = True
+    return gone

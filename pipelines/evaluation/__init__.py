@@ -1,0 +1,1 @@
+"""Scores of datasets, reconstructions, seams and samplers."""

@@ -1,0 +1,241 @@
+"""Scenes, or pictures of an .npz -> what scores are made of: a Ray Data graph with a Parquet file per part; finished
+parts are kept.
+
+Files hold a row per scene (DESCRIBED names the columns), so that a long description goes on where it stopped and can be
+read by anyone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import pyarrow as pa
+import torch
+
+from models.scene import Scene
+from models.tensors import ground_on_grid
+from pipelines.metrics import distributions, inception, statistics, validity
+from pipelines.metrics.adm_npz import pictures_in_npz
+from pipelines.rendering.render import bev_picture
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import fan_out, numbered, per_row
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import Shard
+
+READER_CPUS = 0.5
+PICTURES_PER_PART = 512
+VERSION = 1  # of what a description holds; another one is made anew
+PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
+# The columns besides scene_id: rows of numbers, of these types.
+DESCRIBED = {
+    "statistics": np.float64,
+    "histograms": np.uint32,
+    "validity": np.float64,
+    "fidelity": np.float64,
+    "random": np.float32,
+    "pool3": np.float32,
+    "spatial": np.float32,
+    "logits": np.float32,
+}
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How pictures are made and seen: mean of supersample^2 points a pixel; Inception weights of this file, if any."""
+
+    supersample: int = 1
+    inception: str = ""
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """The first `limit` pictures of an .npz in ADM's form."""
+
+    path: str
+    limit: int
+
+    @property
+    def root(self) -> str:
+        return self.path
+
+
+Side = Selection | PictureFile  # of a comparison
+
+
+def features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
+    """Features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and with a network Inception's."""
+    named = {"random": inception.random_features(pictures)}
+    if network is not None:
+        named |= inception.inception_features(network, pictures)._asdict()
+    return named
+
+
+def scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
+    """Statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes, over the dataset's ground classes."""
+    slab_offset_m = validity.slab_offset_m(dataset.spec.surface)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
+    for scene in scenes:
+        classes = dataset.spec.ground_classes
+        height, occupied = ground_on_grid(scene, classes, scene.grid)
+        scene = replace(scene, ground_classes=classes, height_m=height, occupied=occupied)
+        rows["statistics"].append(statistics.layout_statistics(scene))
+        rows["histograms"].append(distributions.scene_histograms(scene))
+        rows["validity"].append(validity.scene_validity(scene, slab_offset_m).ravel())
+        rows["fidelity"].append(label_fidelity(scene, dataset).ravel())
+    return {name: np.stack(values) for name, values in rows.items()}
+
+
+def label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
+    """(3, 2) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels, or without a dataset."""
+    if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
+        return np.zeros((len(validity.LABEL_MEASURES), 2))
+    return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle)
+
+
+def describe_part(
+    number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: Looks, directory: str
+) -> dict:
+    """Ray task. Number of a part, a shard with rows, in; the number of its scenes out. Writes the part's file."""
+    torch.set_num_threads(1)
+    shard, rows = parts[number]
+    scenes = shard.scenes(rows)
+    pictures = np.stack([bev_picture(scene, PICTURE_PX, looks.supersample) for scene in scenes])
+    columns = features(pictures, network_of(looks))
+    if dataset:
+        columns = scene_rows(scenes, dataset) | columns
+    write_part(directory, number, [scene.scene_id for scene in scenes], columns)
+    return {"scenes": len(scenes)}
+
+
+def network_of(looks: Looks) -> inception.Inception | None:
+    """Loaded once a process, until the file changes."""
+    return loaded_inception(*storage.fingerprint(looks.inception)) if looks.inception else None
+
+
+@lru_cache(maxsize=1)
+def loaded_inception(path: str, *_: str | int) -> inception.Inception:
+    return inception.load_inception(path)
+
+
+class PictureDescriber:
+    """Actor. Row in: number of a part, a range of pictures of an .npz. Row out: their number. Writes the part's file.
+
+    The file is read forward, past what other actors describe; a part before the last one begins it anew.
+    """
+
+    def __init__(self, path: str, parts: list[range], looks: Looks, directory: str) -> None:
+        torch.set_num_threads(1)
+        self.path, self.parts, self.directory = path, parts, directory
+        self.network = network_of(looks)
+        self.batches, self.next_part = iter(()), len(parts)
+
+    def __call__(self, row: dict) -> dict:
+        number = row["id"]
+        if number < self.next_part:
+            self.batches, self.next_part = pictures_in_npz(self.path, PICTURES_PER_PART), 0
+        while self.next_part <= number:
+            pictures = next(self.batches)
+            self.next_part += 1
+        part = self.parts[number]
+        names = [f"{index:07d}" for index in part]
+        write_part(self.directory, number, names, features(pictures[: len(part)], self.network))
+        return {"scenes": len(part)}
+
+
+def part_path(directory: str, number: int) -> str:
+    return storage.join(directory, f"part-{number:05d}.parquet")
+
+
+def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
+    """One row per scene: its id and lists of numbers."""
+    arrays = {"scene_id": pa.array(scene_ids, pa.string())}
+    for name, values in columns.items():
+        flat = pa.array(np.ascontiguousarray(values, DESCRIBED[name]).ravel())
+        arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    storage.write_parquet(pa.table(arrays), part_path(directory, number))
+
+
+def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
+    """All parts, in order: scene_id (n,) and the columns (n, width)."""
+    table = pa.concat_tables([storage.read_parquet(part_path(directory, number)) for number in range(count)])
+    described = {"scene_id": table["scene_id"].to_numpy()}
+    for name in table.column_names[1:]:
+        column = table[name].combine_chunks()
+        described[name] = column.flatten().to_numpy().reshape(len(table), -1)
+    return described
+
+
+def describe(
+    side: Side,
+    dataset: Dataset | None,
+    looks: Looks,
+    directory: str,
+    num_actors: int = 1,
+    on_scenes: Callable[[int], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Per-scene arrays of a side, in the order of its shards or pictures; fidelity and validity flat, see DESCRIBED.
+
+    Pictures have features only; so have scenes without a dataset, whose ground classes and label thresholds they are
+    judged by. Parts that DIRECTORY holds of the same side and looks are read, the rest is made. Row in: number of a part.
+    Row out: number of scenes. Fan-out: one task per shard, or per PICTURES_PER_PART.
+    """
+    if isinstance(side, PictureFile):
+        parts = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
+        counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint(side.path)], None
+    else:
+        parts = side.shards()
+        counts = [len(rows) for _, rows in parts]
+        tables = ("scenes", "primitives", "rasters")
+        files = [storage.fingerprint(shard.path(table)) for shard, _ in parts for table in tables]
+        judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
+    claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | digest(looks))
+    missing = [number for number in range(len(parts)) if not storage.exists(part_path(directory, number))]
+    if on_scenes:
+        on_scenes(sum(counts) - sum(counts[number] for number in missing))
+
+    def describe_scenes(row: dict) -> dict:
+        return describe_part(row["id"], parts, dataset, looks, directory)
+
+    if isinstance(side, PictureFile):
+        arguments = side.path, parts, looks, directory
+        rows = fan_out(missing, PictureDescriber, arguments, num_actors, num_cpus=READER_CPUS)
+    else:
+        rows = per_row(numbered(missing), describe_scenes, READER_CPUS, num_actors).iter_rows() if missing else ()
+    for row in rows:
+        if on_scenes:
+            on_scenes(row["scenes"])
+    return read_parts(directory, len(parts))
+
+
+def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
+    """Scenes by their number within the described selection, in the order asked for."""
+    counts = np.array([len(rows) for _, rows in parts])
+    starts = np.cumsum(counts) - counts
+    scenes = {}
+    for number in np.unique(np.searchsorted(starts, indices, side="right") - 1):
+        shard, rows = parts[number]
+        wanted = np.unique(indices[(indices >= starts[number]) & (indices < starts[number] + len(rows))])
+        for index, scene in zip(wanted, shard.scenes([rows[i - starts[number]] for i in wanted]), strict=True):
+            scenes[index] = scene
+    return [scenes[index] for index in indices]
+
+
+def digest(looks: Looks) -> dict:
+    """What tells one description from another; weights count by content, not by name."""
+    return asdict(looks) | {
+        "version": VERSION,
+        "inception": inception.weights_sha256(looks.inception) if looks.inception else "",
+    }
+
+
+def claim(directory: str, options: dict) -> None:
+    """Empty a directory of parts unless they were made with the same options."""
+    record = storage.join(directory, "described.json")
+    if storage.exists(record) and storage.read_json(record) == options:
+        return
+    storage.delete_directory(directory)
+    storage.write_json(options, record)

@@ -1,0 +1,376 @@
+"""Scenes through a layout VAE and back, scored: one Ray Data graph, models in actors, scores in tasks behind them.
+
+What comes out of the graph is one record per scene; records add up, and one function turns their sum into scores.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import reduce
+
+import numpy as np
+import pyarrow as pa
+import ray.data
+import torch
+
+from models.layout import LayoutSpec
+from models.scene import CATEGORIES, Scene
+from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
+from pipelines.evaluation.features import READER_CPUS, label_fidelity
+from pipelines.geometry.voxels import NUM_CLASSES, Outside, VoxelGrid, outside, voxelise
+from pipelines.metrics.reconstruction import (
+    MAX_DETECTIONS,
+    MEMORY,
+    SCORED,
+    THRESHOLDS,
+    GroundSums,
+    Matches,
+    PairSums,
+    detection_scores,
+    ground_scores,
+    ground_sums,
+    join_matches,
+    match_scene,
+    memory_bytes,
+    pair_scores,
+    pair_sums,
+    voxel_confusion,
+    voxel_scores,
+)
+from pipelines.metrics.validity import LABEL_MEASURES, validity_rates
+from pipelines.rendering.render import bev_picture, picture_3d
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import gpus_per_actor
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import Shard
+from pipelines.training.latents import load_lvae
+
+Chunk = tuple[Shard, list[int]]  # scenes of one shard, by row
+AP_VARIANTS = {
+    "ranked": {},  # every proposal, by existence
+    "ranked_100": {"max_detections": MAX_DETECTIONS},
+    "threshold": {"min_score": EXISTENCE_THRESHOLD},
+    "threshold_100": {"min_score": EXISTENCE_THRESHOLD, "max_detections": MAX_DETECTIONS},
+}
+VOXEL_PX = 256  # paper, Tab. 1
+VOXEL_RANGE_M = (VoxelGrid.bottom_m, VoxelGrid.top_m)
+PICTURE_PX = 480
+SCENE_SCORES = pa.schema(
+    [("scene_id", pa.string()), ("primitives", pa.int64()), ("rebuilt_primitives", pa.int64())]
+    + [
+        (name, pa.float64())
+        for name in (
+            "ground_iou",
+            "height_mae_m",
+            "height_rmse_m",
+            "mean_iou3d",
+            "found",
+            "right",
+            "voxel_iou",
+            "voxel_miou",
+        )
+    ]
+)
+
+
+def voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
+    """The paper's 256 x 256 x 32 over the crop, whatever the rasters' resolution."""
+    return VoxelGrid(spec.with_resolution(VOXEL_PX).grid, *range_m)
+
+
+def chunks_of(selection: Selection, size: int) -> list[Chunk]:
+    """A selection in pieces of at most `size` scenes."""
+    return [(shard, rows[k : k + size]) for shard, rows in selection.shards() for k in range(0, len(rows), size)]
+
+
+class Rebuilder:
+    """Actor. Row in: number of a chunk. Row out: the chunk's latent means and what they are decoded to, stacked."""
+
+    def __init__(self, chunks: list[Chunk], lvae: str) -> None:
+        self.chunks, self.model = chunks, load_lvae(lvae)
+        self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.model.to(self.device)
+
+    @torch.no_grad()
+    def __call__(self, row: dict) -> dict:
+        shard, rows = self.chunks[row["id"]]
+        latent = self.model.encode(layout_batch(shard.scenes(rows), self.model.spec).to(self.device)).mean
+        layouts = self.model.decode(latent).layouts()
+        fields = DecodedLayout.__dataclass_fields__
+        stacked = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in fields}
+        return {"id": row["id"], "latent": latent.float().cpu().numpy()} | stacked
+
+
+def unstacked(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
+    """Row of the shard, true scene, decoded layout and latent, scene by scene, of what a Rebuilder put out."""
+    shard, rows = chunks[row["id"]]
+    for k, (number, scene) in enumerate(zip(rows, shard.scenes(rows), strict=True)):
+        layout = DecodedLayout(**{name: row[name][k] for name in DecodedLayout.__dataclass_fields__})
+        yield number, scene, layout, row["latent"][k]
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """Everything that reconstruction scores are made of, of one scene."""
+
+    ground: GroundSums  # on the truth's pixels
+    raster: GroundSums  # on the model's own, to which the truth is resampled
+    matches: Matches
+    pairs: PairSums
+    confusion: np.ndarray  # (classes, classes) voxels
+    outside: Outside
+    memory: np.ndarray  # bytes of each of MEMORY
+    labels: np.ndarray  # (measures, 2) label fidelity: is the reconstruction's own label the truth's? Zeros: not known
+
+    def to_row(self) -> dict:
+        """Flat arrays, for Arrow."""
+        out = {"confusion": self.confusion.ravel(), "memory": self.memory, "labels": self.labels.ravel()}
+        for part in ("ground", "raster", "matches", "pairs", "outside"):
+            value = getattr(self, part)
+            out |= {f"{part}_{name}": np.ravel(getattr(value, name)) for name in value.__dataclass_fields__}
+        return out
+
+    @classmethod
+    def from_row(cls, row: dict) -> SceneRecord:
+        def part(name: str, kind: type, **shapes: tuple[int, ...]):
+            values = {field: np.asarray(row[f"{name}_{field}"]) for field in kind.__dataclass_fields__}
+            return kind(**{field: value.reshape(shapes.get(field, -1)) for field, value in values.items()})
+
+        return cls(
+            ground=part("ground", GroundSums),
+            raster=part("raster", GroundSums),
+            matches=part("matches", Matches, hit=(-1, len(THRESHOLDS))),
+            pairs=part("pairs", PairSums),
+            confusion=np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES),
+            outside=part("outside", Outside, objects=(-1, 3)),
+            memory=np.asarray(row["memory"]),
+            labels=np.asarray(row["labels"]).reshape(-1, 2),
+        )
+
+
+def scene_record(
+    truth: Scene,
+    layout: DecodedLayout,
+    latent: np.ndarray,
+    spec: LayoutSpec,
+    voxels: VoxelGrid,
+    dataset: Dataset | None = None,
+) -> SceneRecord:
+    """A scene against its reconstruction; the ground on the truth's pixels and on the model's.
+
+    Every true primitive counts, those too that had no slot. AP3D ranks every proposal; pairs and voxels are those of
+    the scene that the decoder means, above the existence threshold.
+    """
+    decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
+    rebuilt = scene_from_layout(layout, spec, truth)
+    everywhere = replace(rebuilt, height_m=decoded_m, occupied=np.ones_like(rebuilt.occupied))
+    true_height_m, true_occupied = ground_on_grid(truth, spec.ground_classes, truth.grid)
+    _, occupied = ground_on_grid(rebuilt, spec.ground_classes, truth.grid)
+    height_m, _ = ground_on_grid(everywhere, spec.ground_classes, truth.grid)
+    coarse_height_m, coarse_occupied = ground_on_grid(truth, spec.ground_classes, spec.grid)
+    true_voxels = voxelise(truth, voxels)
+    return SceneRecord(
+        ground=ground_sums(true_occupied, true_height_m, occupied, height_m),
+        raster=ground_sums(coarse_occupied, coarse_height_m, rebuilt.occupied, decoded_m),
+        matches=match_scene(truth, scene_from_layout(layout, spec, truth, threshold=-1.0)),
+        pairs=pair_sums(truth, rebuilt),
+        confusion=voxel_confusion(true_voxels, voxelise(rebuilt, voxels)),
+        outside=outside(truth, voxels),
+        memory=memory_bytes(layout_batch([truth], spec), latent, true_voxels),
+        labels=label_fidelity(rebuilt, dataset),
+    )
+
+
+def score_chunk(
+    row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
+) -> list[dict]:
+    """Row in: what a Rebuilder put out. Rows out: one record per scene."""
+    return [
+        {"id": row["id"], "row": number, "scene_id": scene.scene_id}
+        | scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
+        for number, scene, layout, latent in unstacked(row, chunks)
+    ]
+
+
+def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
+    """Row in: what a Rebuilder put out. Rows out: per scene its pictures, (H, W, 3) uint8, all of one size."""
+    out = []
+    for _, scene, layout, _ in unstacked(row, chunks):
+        sides = {"truth": scene, "rebuilt": scene_from_layout(layout, spec, scene)}
+        above = {f"{name}_above": bev_picture(side, PICTURE_PX, supersample=2) for name, side in sides.items()}
+        oblique = {f"{name}_oblique": picture_3d(side, PICTURE_PX, PICTURE_PX) for name, side in sides.items()}
+        out.append({"scene_id": scene.scene_id} | above | oblique)
+    return out
+
+
+def rebuilt_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
+    """Graph: chunks through the LVAE, by one actor per GPU, or by actors that leave half of the CPUs to what follows."""
+    per_actor, cluster = gpus_per_actor(), ray.cluster_resources()
+    room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
+    return ray.data.range(len(chunks), override_num_blocks=len(chunks)).map(
+        Rebuilder,
+        fn_constructor_args=(chunks, lvae),
+        compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chunks), room)),
+        num_gpus=per_actor,
+        num_cpus=READER_CPUS,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Rebuilt:
+    """Reconstruction scores of a dataset, and of each scene."""
+
+    scores: dict  # nested plain numbers
+    scenes: pa.Table  # a row per scene, best first: by voxel mIoU
+    places: list[Chunk]  # where each of them lies, a chunk of one
+
+
+def rebuild(
+    selection: Selection,
+    lvae: str,
+    num_actors: int = 1,
+    batch_size: int = 8,
+    voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
+    dataset: Dataset | None = None,
+    on_scene: Callable[[], None] | None = None,
+) -> Rebuilt:
+    """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
+
+    With a dataset, whose thresholds labels go by, also whether reconstructions keep their density labels.
+    """
+    spec, chunks = load_lvae(lvae).spec, chunks_of(selection, batch_size)
+    voxels = voxel_grid(spec, voxel_range_m)
+    graph = rebuilt_chunks(chunks, lvae, num_actors).flat_map(
+        score_chunk,
+        fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset},
+        num_cpus=READER_CPUS,
+    )
+    rows = []
+    for row in graph.iter_rows():
+        rows.append(row)
+        if on_scene:
+            on_scene()
+    rows.sort(key=lambda row: (row["id"], row["row"]))
+    records = [SceneRecord.from_row(row) for row in rows]
+    scores = reconstruction_scores(records, spec, voxels)
+    scores["memory_bytes"]["tables"] = table_bytes(chunks)
+    table = scene_scores([row["scene_id"] for row in rows], records)
+    order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")  # NaN, where all is empty, last
+    return Rebuilt(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
+
+
+def draw(places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None) -> list[dict]:
+    """Pictures of scenes and of their reconstructions, in order: truth and rebuilt, above and oblique."""
+    graph = rebuilt_chunks(places, lvae, num_actors).flat_map(
+        draw_chunk, fn_kwargs={"chunks": places, "spec": load_lvae(lvae).spec}, num_cpus=READER_CPUS
+    )
+    drawn = {}
+    for row in graph.iter_rows():
+        drawn[row["scene_id"]] = row
+        if on_scene:
+            on_scene()
+    return [drawn[shard.scenes(rows)[0].scene_id] for shard, rows in places]
+
+
+def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
+    """Scores of all scenes together, as nested plain numbers; per class or category under names that say so."""
+    low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
+    ground, raster = (
+        ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
+        for parts in ((r.ground for r in records), (r.raster for r in records))
+    )
+    matches = join_matches([r.matches for r in records])
+    detection = {name: detection_scores(matches, **options) for name, options in AP_VARIANTS.items()}
+    left_out = _sum(r.outside for r in records)
+    num_objects, num_partly, num_wholly = left_out.objects.T
+    present = np.flatnonzero(num_objects)
+    return {
+        "scenes": len(records),
+        "raster_px": spec.grid.rows,
+        "raster_ground_iou": raster.iou,
+        "raster_height_rmse_m": raster.height_rmse_m,
+        "ground_iou": ground.iou,
+        "ground_mean_iou": ground.mean_iou,
+        "height_mae_m": ground.height_mae_m,
+        "height_rmse_m": ground.height_rmse_m,
+        "height_mse_normalised": ground.height_mse,
+        "height_bounds_m": {"low": low[0], "high": high[0]},
+        "ground_class_iou": ground.class_iou,
+        "class_height_mae_m": ground.class_height_mae_m,
+        "class_height_rmse_m": ground.class_height_rmse_m,
+        "class_height_mse_normalised": ground.class_height_mse,
+        "ap3d": detection["ranked"].ap3d,
+        "ap3d_50": detection["ranked"].ap3d_50,
+        "detection": {
+            name: {
+                "ap3d": found.ap3d,
+                "ap3d_50": found.ap3d_50,
+                "ap3d_at": found.at_threshold,
+                "category_ap3d": found.category_ap3d,
+                "category_ap3d_50": found.category_ap3d_50,
+            }
+            for name, found in detection.items()
+        },
+        "matched": asdict(pair_scores(_sum(r.pairs for r in records))),
+        "voxels": asdict(voxel_scores(np.sum([r.confusion for r in records], axis=0)))
+        | {
+            "bottom_m": voxels.bottom_m,
+            "top_m": voxels.top_m,
+            "ground_outside": float(left_out.ground[1] / max(left_out.ground[0], 1)),
+            "objects_partly_outside": float(num_partly.sum() / max(num_objects.sum(), 1)),
+            "objects_outside": float(num_wholly.sum() / max(num_objects.sum(), 1)),
+            "category_partly_outside": {CATEGORIES[c]: float(num_partly[c] / num_objects[c]) for c in present},
+            "category_outside": {CATEGORIES[c]: float(num_wholly[c] / num_objects[c]) for c in present},
+        },
+        "memory_bytes": dict(zip(MEMORY, np.mean([r.memory for r in records], axis=0).tolist(), strict=True)),
+        "label_fidelity": validity_rates(np.stack([r.labels for r in records]), LABEL_MEASURES),
+        "truths": {CATEGORIES[c]: int(num_objects[c]) for c in present},
+    }
+
+
+def _sum(parts: Iterable):
+    return reduce(operator.add, parts)
+
+
+def scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
+    """A row per scene; null where a score is undefined, as a height error without ground."""
+
+    def share(part: float, whole: float) -> float | None:
+        return float(part / whole) if whole else None
+
+    rows = []
+    for scene_id, r in zip(scene_ids, records, strict=True):
+        ground, boxes = r.ground, list(SCORED)
+        pairs, iou = r.pairs.pairs[boxes].sum(), r.pairs.iou[boxes].sum()
+        filled = r.confusion.sum() > r.confusion[0, 0]
+        voxel = voxel_scores(r.confusion) if filled else None
+        mean_square_m2 = share(ground.squared_m2.sum(), ground.pixels.sum())
+        rows.append(
+            {
+                "scene_id": scene_id,
+                "primitives": int(r.pairs.truths.sum()),
+                "rebuilt_primitives": int(r.pairs.predictions.sum()),
+                "ground_iou": share(ground.intersection.sum(), ground.union.sum()),
+                "height_mae_m": share(ground.absolute_m.sum(), ground.pixels.sum()),
+                "height_rmse_m": mean_square_m2 and mean_square_m2**0.5,
+                "mean_iou3d": share(iou, pairs),
+                "found": share(pairs, r.pairs.truths[boxes].sum()),
+                "right": share(pairs, r.pairs.predictions[boxes].sum()),
+                "voxel_iou": voxel and voxel.iou,
+                "voxel_miou": voxel and voxel.miou,
+            }
+        )
+    return pa.Table.from_pylist(rows, schema=SCENE_SCORES)
+
+
+def table_bytes(chunks: list[Chunk]) -> float:
+    """Mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
+    total, scenes = 0.0, 0
+    for shard, rows in chunks:
+        written = sum(storage.file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))
+        total += written / shard.read("scenes", ["scene_id"]).num_rows * len(rows)
+        scenes += len(rows)
+    return total / scenes

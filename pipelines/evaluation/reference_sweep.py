@@ -1,0 +1,112 @@
+"""How precision and recall depend on the reference: many scenes or few, chosen by pose in two ways (paper, supplement,
+Precision and Recall Metrics, and its figure on sampling strategies)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.evaluation.evaluate import neighbourhood_scores
+from pipelines.reporting.chart import Chart
+from pipelines.reporting.report import Charts, Table, Text, report_html
+from pipelines.schema.scene_subset import apart, balanced, farthest
+
+MEASURES = ("precision", "recall", "density", "coverage")
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Real scenes, by row (n,), and how they were chosen."""
+
+    strategy: str  # "farthest" or "apart"
+    setting: float  # number of scenes, or metres
+    rows: np.ndarray
+
+
+def references(
+    xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
+) -> Iterator[Reference]:
+    """Choices among poses (n, 2) of `least` to `most` scenes; sizes beyond what there is are left out."""
+    fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
+    order = farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
+    for size in fitting:
+        yield Reference("farthest", size, order[:size])
+    for distance_m in sorted(distances_m, reverse=True):
+        rows = apart(xy_m, world, distance_m)
+        if least <= len(rows) <= most:
+            yield Reference("apart", distance_m, rows)
+
+
+def score_reference(
+    reference: Reference, real: np.ndarray, generated: np.ndarray, labels: np.ndarray, k: Sequence[int]
+) -> list[dict]:
+    """A row for each k: features (n, d) of the reference against as many generated ones, labels (m,) in equal parts."""
+    count = len(reference.rows)
+    found = neighbourhood_scores(real[reference.rows], generated[balanced(labels, count)], k)
+    rows = []
+    for size in k:
+        row = {"strategy": reference.strategy, "setting": float(reference.setting), "samples": count, "k": size}
+        for name in MEASURES:
+            value = found[f"{name}_k{size}"]
+            row |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
+        rows.append(row)
+    return rows
+
+
+def sweep_charts(rows: Sequence[dict]) -> list[Chart]:
+    """Precision and recall over the number of scenes, a chart per strategy, as in the paper's figure."""
+    charts = []
+    for strategy, title in (("apart", "Poses apart by a distance"), ("farthest", "Farthest poses")):
+        series = {}
+        for name in ("precision", "recall"):
+            for k in sorted({row["k"] for row in rows}):
+                points = [(r["samples"], r[name]) for r in rows if (r["strategy"], r["k"]) == (strategy, k)]
+                points.sort()
+                series[f"{name}, k = {k}"] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
+        charts.append(Chart(title, series, "scenes on each side", "share"))
+    return charts
+
+
+def sweep_table(rows: Sequence[dict]) -> Table:
+    def shown(row: dict, name: str) -> str:
+        return f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
+
+    how = {"farthest": "farthest", "apart": "at least {:g} m apart"}
+    cells = [
+        (
+            how[row["strategy"]].format(row["setting"]),
+            row["samples"],
+            row["k"],
+            *(shown(row, name) for name in MEASURES),
+        )
+        for row in rows
+    ]
+    return Table("Scores by reference", ("real scenes", "on each side", "k", *MEASURES), cells)
+
+
+def sweep_html(rows: Sequence[dict], how: Sequence[str]) -> str:
+    sections = [Charts("Precision and recall", sweep_charts(rows)), sweep_table(rows), Text("How", how)]
+    return report_html("Precision and recall by reference", sections)
+
+
+def sweep(
+    real: np.ndarray,
+    generated: np.ndarray,
+    labels: np.ndarray,
+    chosen: Sequence[Reference],
+    k: Sequence[int],
+    on_reference: Callable[[], None] = lambda: None,
+) -> list[dict]:
+    """`score_reference` of all; ValueError if there is none."""
+    if not chosen:
+        raise ValueError(
+            f"no reference fits {len(real)} real and {len(generated)} generated scenes; "
+            "give smaller --sizes or greater --apart-m, or generate more"
+        )
+    rows = []
+    for reference in chosen:
+        rows += score_reference(reference, real, generated, labels, k)
+        on_reference()
+    return rows

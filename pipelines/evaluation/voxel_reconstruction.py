@@ -1,0 +1,170 @@
+"""Any method's reconstructed voxels against the truth, on the full grid (paper, Sec. 4.1, Tab. 1): one Ray Data graph.
+
+The truth is voxel files or a dataset's own scenes, voxelised here. One confusion matrix is summed over all scenes before
+anything is divided; every voxel of every scene counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import pyarrow as pa
+import ray.data
+
+from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelise
+from pipelines.io.voxel_import import read_voxels
+from pipelines.metrics.reconstruction import voxel_confusion, voxel_scores
+from pipelines.preprocess.import_external import find_files, scene_id
+from pipelines.runtime import storage
+from pipelines.schema.axis_convention import Axes
+from pipelines.schema.palette import EMPTY
+from pipelines.schema.tables import Shard, find_shards
+
+CHUNK_SCENES = 16
+SHOWN = 5  # names in an error
+SCENE_SCORES = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("voxel_iou", pa.float64()),  # null where both sides are empty
+        ("voxel_miou", pa.float64()),
+        ("rebuilt_bytes", pa.int64()),  # of the reconstruction's file
+        ("stored_bytes", pa.int64()),  # of what the method keeps of the scene; null if not given
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where the true voxels of a scene are: in a file, or in a row of a shard."""
+
+    uri: str = ""
+    shard: Shard | None = None
+    row: int = 0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One scene to score."""
+
+    name: str
+    truth: Truth
+    rebuilt: str
+    stored: str = ""
+
+
+def true_scenes(root: str, split: str = "") -> dict[str, Truth]:
+    """Name -> place, of a dataset directory's scenes (of one split, or all) or of the .npz files in a directory."""
+    if storage.list_files(storage.join(root, "scenes"), ".parquet"):
+        shards = find_shards(root, split=split or None)
+        ids = [shard.read("scenes", ["scene_id"])["scene_id"].to_pylist() for shard in shards]
+        return {
+            name: Truth("", shard, k) for shard, names in zip(shards, ids, strict=True) for k, name in enumerate(names)
+        }
+    if split:
+        raise ValueError(f"{root}: split {split!r} asked for, but no dataset here; leave it out to score .npz files")
+    return {name: Truth(uri) for name, uri in files_by_scene(root, ".npz").items()}
+
+
+def files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
+    """Scene name -> URI of the files that a directory or a pattern names."""
+    base, files = find_files(pattern, suffix)
+    return {scene_id(file): storage.join(base, file) for file in files}
+
+
+def paired(
+    truth: dict[str, Truth], rebuilt: dict[str, str], stored: dict[str, str] | None, partial: bool
+) -> list[Pair]:
+    """The scenes that all sides have, by name. Unless `partial`, each side must have them all.
+
+    Raises ValueError that lists what has no counterpart, or if nothing has.
+    """
+    sides = {"truth": truth, "reconstructions": rebuilt} | ({} if stored is None else {"stored files": stored})
+    every, common = set().union(*sides.values()), set(truth).intersection(*sides.values())
+    missing = {side: sorted(every - set(names)) for side, names in sides.items() if every - set(names)}
+    if missing and not (partial and common):
+        told = "; ".join(
+            f"{side} lack {len(names)} of {len(every)} names: {', '.join(names[:SHOWN])}{' ...' * (len(names) > SHOWN)}"
+            for side, names in missing.items()
+        )
+        raise ValueError(f"{told}; name files by scene, or score what there is on all sides by --partial")
+    return [Pair(name, truth[name], rebuilt[name], stored[name] if stored else "") for name in sorted(common)]
+
+
+def chunked(pairs: list[Pair]) -> list[list[Pair]]:
+    """Pairs in chunks of at most CHUNK_SCENES whose truths lie in one shard."""
+    by_shard: dict[Shard | None, list[Pair]] = {}
+    for pair in pairs:
+        by_shard.setdefault(pair.truth.shard, []).append(pair)
+    return [group[k : k + CHUNK_SCENES] for group in by_shard.values() for k in range(0, len(group), CHUNK_SCENES)]
+
+
+def true_voxels(chunk: list[Pair], grid: VoxelGrid, axes: Axes) -> list[np.ndarray]:
+    """(256, 256, 32) class ids of each truth of a chunk."""
+    shard = chunk[0].truth.shard
+    if shard is None:
+        return [read_voxels(pair.truth.uri, axes) for pair in chunk]
+    return [voxelise(scene, grid) for scene in shard.scenes([pair.truth.row for pair in chunk])]
+
+
+def score_chunk(row: dict, chunks: list[list[Pair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
+    """Row in: number of a chunk. Rows out: per scene its confusion matrix, flat, and bytes on disk."""
+    chunk = chunks[row["id"]]
+    return [
+        {
+            "scene_id": pair.name,
+            "confusion": voxel_confusion(truth, read_voxels(pair.rebuilt, axes)).ravel(),
+            "rebuilt_bytes": storage.file_bytes(pair.rebuilt),
+            "stored_bytes": storage.file_bytes(pair.stored) if pair.stored else -1,
+        }
+        for pair, truth in zip(chunk, true_voxels(chunk, grid, truth_axes), strict=True)
+    ]
+
+
+def score_voxels(
+    pairs: list[Pair],
+    grid: VoxelGrid,
+    axes: Axes,
+    truth_axes: Axes,
+    on_scene: Callable[[], None] | None = None,
+) -> tuple[dict, pa.Table]:
+    """Scores of all scenes together, as nested plain numbers, and a row per scene, by name."""
+    chunks = chunked(pairs)
+    graph = ray.data.range(len(chunks), override_num_blocks=len(chunks)).flat_map(
+        score_chunk, fn_args=(chunks, grid, axes, truth_axes), num_cpus=1
+    )
+    rows = []
+    for row in graph.iter_rows():
+        rows.append(row)
+        if on_scene:
+            on_scene()
+    rows.sort(key=lambda row: row["scene_id"])
+    confusions = [np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES) for row in rows]
+    scores = {
+        "scenes": len(rows),
+        "grid": {"rows": grid.shape[0], "cols": grid.shape[1], "levels": grid.shape[2]},
+        "voxels": asdict(voxel_scores(np.sum(confusions, axis=0))),
+        "rebuilt_bytes": spread([row["rebuilt_bytes"] for row in rows]),
+    }
+    if pairs[0].stored:
+        scores["stored_bytes"] = spread([row["stored_bytes"] for row in rows])
+    table = [
+        {name: row[name] for name in ("scene_id", "rebuilt_bytes")}
+        | {"stored_bytes": row["stored_bytes"] if pairs[0].stored else None}
+        | scene_scores(confusion)
+        for row, confusion in zip(rows, confusions, strict=True)
+    ]
+    return scores, pa.Table.from_pylist(table, schema=SCENE_SCORES)
+
+
+def scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
+    if confusion.sum() == confusion[EMPTY, EMPTY]:
+        return {"voxel_iou": None, "voxel_miou": None}
+    scores = voxel_scores(confusion)
+    return {"voxel_iou": scores.iou, "voxel_miou": scores.miou}
+
+
+def spread(sizes: list[int]) -> dict[str, float]:
+    """Mean, standard deviation, least and most of sizes in bytes."""
+    return {name: float(getattr(np, name)(sizes)) for name in ("mean", "std", "min", "max")}

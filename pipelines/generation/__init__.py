@@ -1,0 +1,1 @@
+"""Ray graphs that sample, inpaint, outpaint and edit scenes."""

@@ -1,0 +1,215 @@
+"""Scenes made anew inside a region: one Ray Data graph, a pipeline per actor, all results of a scene per task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from models.composition.extend import inpainting, region_blocks
+from models.composition.inpaint import Contents, half_plane_region, object_region, polygon_region
+from models.labels import require_labels
+from models.pipeline import PrITTIPipeline, Resampling
+from models.scene import Scene, merge
+from pipelines.generation.sample import Request, at_model_resolution, claim_run, label_of, load_pipeline
+from pipelines.io.mesh_export import scene_glb
+from pipelines.metrics.reconstruction import pair_sums
+from pipelines.rendering.render import outlined_picture
+from pipelines.reporting.report import Picture, Pictures, Table, report_html
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import fan_out
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import Shard
+
+PICTURE_PX = 512
+PER_ROW = 4  # pictures of a scene: as given, and its first results
+
+
+@dataclass(frozen=True)
+class Where:
+    """The region: all that is named, together, or with `outside` all but that."""
+
+    polygon_m: tuple[float, ...] = ()  # x, y, x, y, ...
+    half_plane: tuple[float, ...] = ()  # direction x, y, and the metres along it where it begins
+    objects: tuple[int, ...] = ()  # primitives of a scene by number
+    margin_m: float = 1.0  # around objects
+    outside: bool = False
+
+    def region(self, scene: Scene) -> np.ndarray:
+        """(rows, cols) pixels of a scene, True = make anew. Raises ValueError for a region that is none."""
+        found = np.zeros((scene.grid.rows, scene.grid.cols), bool)
+        if self.polygon_m:
+            if len(self.polygon_m) % 2:
+                raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
+            found |= polygon_region(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
+        if self.half_plane:
+            if len(self.half_plane) != 3:
+                raise ValueError(f"a half plane of {len(self.half_plane)} numbers: expected direction x y, and metres")
+            found |= half_plane_region(scene.grid, self.half_plane[:2], self.half_plane[2])
+        if self.objects:
+            if not -1 < min(self.objects) <= max(self.objects) < len(scene):
+                raise ValueError(f"scene {scene.scene_id} has primitives 0 to {len(scene) - 1}, not {self.objects}")
+            found |= object_region(scene, self.objects, self.margin_m)
+        found = found != self.outside
+        if not found.any():
+            raise ValueError(f"scene {scene.scene_id}: the region holds no pixel of its {scene.grid}")
+        return found
+
+
+@dataclass(frozen=True)
+class InpaintRequest(Request):
+    """What to make anew in scenes, `variants` times each; `label` None means each scene's own."""
+
+    where: Where
+    contents: Contents
+    variants: int
+    label: str | None
+    seed: int
+    resampling: Resampling
+    guidance_scale: float
+
+
+def drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
+    """How far a raw decode is off outside the region, as sums: pixels and squared metres, primitives and their IoU3D."""
+    given, made = (merge([s], [~region], s) for s in (scene, raw))
+    both = given.occupied & made.occupied
+    sums = pair_sums(given, made)
+    return {
+        "pixels_both": float(both.sum()),
+        "pixels_either": float((given.occupied | made.occupied).sum()),
+        "squared_m2": float(np.square((given.height_m - made.height_m)[both], dtype=np.float64).sum()),
+        "objects": float(sums.truths.sum()),
+        "found": float(sums.pairs.sum()),
+        "iou3d": float(sums.iou.sum()),
+    }
+
+
+def drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """Of all sums together: ground IoU, height RMSE, share of the objects found again, their mean IoU3D; None for 0 / 0."""
+    total = {name: sum(row[name] for row in sums) for name in sums[0]}
+
+    def share(above: str, below: str) -> float | None:
+        return total[above] / total[below] if total[below] else None
+
+    squared_m2 = share("squared_m2", "pixels_both")
+    return {
+        "ground_iou": share("pixels_both", "pixels_either"),
+        "height_rmse_m": None if squared_m2 is None else squared_m2**0.5,
+        "objects_found": share("found", "objects"),
+        "mean_iou3d": share("iou3d", "found"),
+    }
+
+
+def inpaint_one(
+    pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
+) -> tuple[list[Scene], list[dict[str, float]]]:
+    """All variants of scene `number` of a run, and the drift of each raw decode of a block."""
+    scene, count = at_model_resolution(scene, pipeline.spec), request.variants
+    drifts: list[dict[str, float]] = []
+    for step in inpainting(
+        pipeline,
+        scene,
+        request.where.region(scene),
+        request.label or label_of(scene, pipeline.dit.config.label),
+        request.contents,
+        request.seed,
+        range(number * count, (number + 1) * count),
+        request.resampling,
+        request.guidance_scale,
+    ):
+        drifts += [drift(known, raw, step.region) for known, raw in zip(step.known, step.made, strict=True)]
+    made = [
+        replace(
+            canvas,
+            scene_id=f"{request.source}-{request.seed}-{number:07d}-{k}",
+            source=request.source,
+            split="generated",
+            frame=number,
+        )
+        for k, canvas in enumerate(step.canvases)
+    ]
+    return made, drifts
+
+
+def made_anew(pipeline: PrITTIPipeline, scene: Scene, where: Where) -> np.ndarray:
+    """(rows, cols) pixels of a scene's region, grown to whole cells."""
+    region = where.region(scene)
+    for window, part in region_blocks(pipeline, scene, region):
+        region[scene.grid.shared(window)[0]] |= part
+    return region
+
+
+class Inpainter:
+    """Actor. Row in: number of a scene. Row out: its drift. Makes its variants, writes their shard and GLB files."""
+
+    def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
+        self.request, self.chosen = request, chosen
+        self.pipeline = load_pipeline(request.model)
+
+    def __call__(self, row: dict) -> dict:
+        request, shard = self.request, self.request.shard(row["id"])
+        record = storage.join(request.output, "drift", request.run, f"{row['id']:07d}.json")
+        if not (shard.is_written() and storage.exists(record)):
+            source, position = self.chosen[row["id"]]
+            made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
+            for scene in made:
+                path = storage.join(request.output, "glb", request.run, f"{scene.scene_id}.glb")
+                storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
+            storage.write_json(drifts, record)
+            shard.write(made)
+        return {"id": row["id"], "drift": storage.read_json(record)}
+
+
+def inpaint_scenes(
+    request: InpaintRequest,
+    selection: Selection,
+    num_actors: int = 1,
+    pictures: int = 8,
+    on_scene: Callable[[], None] | None = None,
+) -> dict[str, float | None]:
+    """Make the selected scenes anew, write tables, GLB files and a page; returns the drift. Goes on where it stopped.
+
+    Raises ValueError if the output holds a run made with other options, or for a region that a scene does not have.
+    """
+    chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
+    pipeline = load_pipeline(request.model)
+    first, row = chosen[0]
+    request.where.region(at_model_resolution(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
+    if request.label:
+        require_labels(pipeline.dit.config.label, [request.label])
+    claim_run(
+        request,
+        pipeline,
+        [storage.join(request.output, "drift", request.run)],
+        input=asdict(selection),
+        scenes=selection.files(),
+    )
+    drifts = []
+    for row in fan_out(range(len(chosen)), Inpainter, (request, chosen), num_actors):
+        drifts += row["drift"]
+        if on_scene:
+            on_scene()
+    scores = drift_scores(drifts)
+    shown = []
+    for number, (source, position) in enumerate(chosen[:pictures]):
+        given = at_model_resolution(source.scenes([position])[0], pipeline.spec)
+        new = made_anew(pipeline, given, request.where)
+        made = request.shard(number).scenes()[: PER_ROW - 1]
+        shown.append(Picture(given.scene_id, outlined_picture(given, new, PICTURE_PX), "given"))
+        shown += [Picture(scene.scene_id, outlined_picture(scene, new, PICTURE_PX), "made anew") for scene in made]
+    columns = min(PER_ROW, 1 + request.variants)
+    note = f"Inside the red line {described(request.contents)} made anew; the rest is the given scene's."
+    how = (
+        "The latent outside the region is the given scene's, bit for bit, but decoders see all of it: the table says how "
+        "far their raw output is off there. The scenes above and in the tables take that part from the given scene."
+    )
+    table = Table("Drift outside the region", tuple(scores), [tuple(scores.values())], note=how)
+    html = report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
+    page = storage.join(request.output, f"{request.run}.html")
+    storage.write_text(html, page)
+    return scores
+
+
+def described(contents: Contents) -> str:
+    return {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}[contents]

@@ -1,0 +1,178 @@
+"""Labels and seeds -> scenes: one Ray Data graph, a pipeline per actor, one output shard per task."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import chain
+
+import numpy as np
+import torch
+from diffusers.utils.logging import disable_progress_bar
+
+from models.labels import LABELS, require_labels
+from models.layout import LayoutSpec
+from models.pipeline import PrITTIPipeline
+from models.scene import Grid, Scene
+from models.tensors import ground_on_grid
+from pipelines.editing.edit import Repair
+from pipelines.metrics.validity import slab_offset_m
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import fan_out
+from pipelines.schema.run_guard import claim
+from pipelines.schema.tables import Shard
+from pipelines.training.latents import weights_digest
+
+
+@dataclass(frozen=True)
+class Request:
+    """A run of a pipeline: where its scenes go, as source generated-<run>."""
+
+    model: str  # directory of a PrITTIPipeline
+    output: str
+    run: str
+
+    @property
+    def source(self) -> str:
+        return f"generated-{self.run}"
+
+    def shard(self, number: int) -> Shard:
+        return Shard(self.output, self.source, "generated", number)
+
+
+@dataclass(frozen=True)
+class SampleRequest(Request):
+    """What to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+
+    num_scenes: int
+    labels: tuple[str, ...]
+    seed: int
+    num_inference_steps: int
+    guidance_scale: float
+    sampler: str = "ddpm"
+    noise_scaling: float | None = None  # None: the model's own
+    existence_threshold: float | None = None  # None: the model's own
+    repair: bool = False  # onto the ground and apart, nothing taken out (scenes/edit.py)
+    shard_scenes: int = 64
+
+    def shards(self) -> list[Shard]:
+        return [self.shard(k) for k in range(-(-self.num_scenes // self.shard_scenes))]
+
+    def indices(self, shard: Shard) -> range:
+        start = shard.number * self.shard_scenes
+        return range(start, min(start + self.shard_scenes, self.num_scenes))
+
+
+def load_pipeline(directory: str) -> PrITTIPipeline:
+    """Raises ValueError if the directory holds no complete pipeline."""
+    disable_progress_bar()  # of three files
+    try:
+        pipeline = PrITTIPipeline.from_pretrained(directory)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{directory}: no PrITTI pipeline here ({error}); run jobs/train_dit.py first") from error
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
+    """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
+    options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
+    del options["model"]  # the same weights in another directory are the same model
+    options.setdefault("existence_threshold", pipeline.config.existence_threshold)
+    if not options.get("repair"):  # runs of before it could be asked for go on
+        options.pop("repair", None)
+    if "resampling" in options and options["resampling"]["eta"] != 1:  # then the pipeline's own scaling matters
+        options["noise_scaling"] = pipeline.config.noise_scaling
+    claim(options.pop("output"), request.source, request.run, options, parts)
+
+
+def on_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
+    """The scene with the model's ground classes, on the model's grid or another that covers the same ground."""
+    grid = grid or spec.grid
+    height, occupied = ground_on_grid(scene, spec.ground_classes, grid)
+    return replace(scene, ground_classes=spec.ground_classes, grid=grid, height_m=height, occupied=occupied)
+
+
+def at_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
+    """The scene with the model's ground classes and resolution, over all the ground that it covers.
+
+    Raises ValueError for a resolution that does not divide by the model's, nor the other way about.
+    """
+    own, wanted_m = scene.grid, spec.grid.resolution_m
+    sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
+    return on_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
+
+
+def label_of(scene: Scene, kind: str) -> str:
+    """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
+    names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
+    names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
+    if names[kind] not in LABELS[kind]:
+        raise ValueError(
+            f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
+        )
+    return names[kind]
+
+
+class Sampler:
+    """Actor. Row in: number of a shard. Row out: that, its size and time. Generates and writes the shard's scenes."""
+
+    def __init__(self, request: SampleRequest, batch_size: int) -> None:
+        self.request, self.batch_size = request, batch_size
+        self.pipeline = load_pipeline(request.model)
+        self.pipeline.use_sampler(request.sampler)
+        self.repair = Repair(slab_offset_m=slab_offset_m(self.pipeline.spec.surface), drop=False)
+
+    def __call__(self, row: dict) -> dict:
+        request, started = self.request, time.perf_counter()
+        shard = request.shards()[row["id"]]
+        indices = request.indices(shard)
+        scenes = []
+        for start in range(0, len(indices), self.batch_size):
+            chosen = indices[start : start + self.batch_size]
+            scenes += self.pipeline.generate(
+                labels=[request.labels[i % len(request.labels)] for i in chosen],
+                seed=request.seed,
+                indices=chosen,
+                num_inference_steps=request.num_inference_steps,
+                guidance_scale=request.guidance_scale,
+                noise_scaling=request.noise_scaling,
+                existence_threshold=request.existence_threshold,
+                run=request.run,
+            )
+        if request.repair:
+            scenes = [self.repair.applied(scene, np.ones(len(scene), bool))[0] for scene in scenes]
+        shard.write(scenes)
+        return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
+
+
+def sample_scenes(
+    request: SampleRequest, num_actors: int = 1, batch_size: int = 8, on_shard: Callable[[dict], None] | None = None
+) -> int:
+    """Write the requested scenes as tables; how many there are. Goes on where it stopped.
+
+    Raises ValueError for labels the model does not know, or if the output holds a run made with other options.
+    """
+    pipeline = load_pipeline(request.model)
+    require_labels(pipeline.dit.config.label, request.labels)
+    pipeline.use_sampler(request.sampler)
+    request = replace(
+        request,
+        noise_scaling=pipeline.scaling(request.noise_scaling),
+        existence_threshold=pipeline.threshold(request.existence_threshold),
+    )
+    claim_run(request, pipeline)
+    for shard in request.shards()[:1]:
+        for table in ("scenes", "primitives", "rasters"):
+            storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])
+    shards = request.shards()
+    missing = [shard.number for shard in shards if not shard.is_written()]
+    written = [shard for shard in shards if shard.number not in missing]
+    rows = ({"id": shard.number, "scenes": len(request.indices(shard)), "seconds": 0.0} for shard in written)
+    total = 0
+    for row in chain(rows, fan_out(missing, Sampler, (request, batch_size), num_actors)):
+        total += row["scenes"]
+        if on_shard:
+            on_shard(row)
+    return total

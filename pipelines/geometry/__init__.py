@@ -1,0 +1,1 @@
+"""Geometry of whole scenes: rasterisation, voxels, centrelines, shape fitting."""

@@ -1,0 +1,137 @@
+"""What a parallel camera sees of a Scene: triangles by the one rasteriser, ellipsoids exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from models.scene import ELLIPSOID, Grid, Scene
+from pipelines.geometry.rasterize import draw, integers_between, ranges
+
+FILL = 0.95  # of the picture's width or height, whichever is tighter
+ROUNDING_M = 1e-6  # far more than rounding adds to a depth
+BELOW_M, ABOVE_M = 2.0, 14.0  # what a camera frames below and above the ego vehicle's ground
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A parallel camera. Its frame: x up and y left in the picture, z towards the viewer; metres."""
+
+    camera_from_scene: np.ndarray  # (3, 3) rotation
+    view: Grid  # the pixels, in the camera frame
+
+    def turned(self, points_m: np.ndarray) -> np.ndarray:
+        """Scene points (..., 3) in the camera frame."""
+        return points_m @ self.camera_from_scene.T
+
+
+def looking_down(view: Grid) -> Camera:
+    """The camera of the picture from above: its frame is the scene's."""
+    return Camera(np.eye(3), view)
+
+
+def looking_at(grid: Grid, width: int, height: int, azimuth_deg: float, elevation_deg: float) -> Camera:
+    """The camera that has all of the grid in a picture of width x height pixels, as large as it fits.
+
+    It looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg, above 0 and at most 90.
+    """
+    if not 0 < elevation_deg <= 90:
+        raise ValueError(f"elevation_deg is {elevation_deg}, must be above 0 and at most 90")
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    ahead, left = (
+        np.array([np.cos(azimuth), np.sin(azimuth), 0]),
+        np.array([-np.sin(azimuth), np.cos(azimuth), 0]),
+    )
+    up = np.sin(elevation) * ahead + np.array([0, 0, np.cos(elevation)])
+    camera_from_scene = np.stack([up, left, np.cross(up, left)])
+
+    box = [grid.back_m, grid.front_m], [grid.right_m, grid.left_m], [-BELOW_M, ABOVE_M]
+    x, y, _ = camera_from_scene @ np.array(np.meshgrid(*box)).reshape(3, -1)
+    resolution_m = max(np.ptp(x) / height, np.ptp(y) / width) / FILL
+    front_m = (x.min() + x.max() + height * resolution_m) / 2
+    left_m = (y.min() + y.max() + width * resolution_m) / 2
+    return Camera(camera_from_scene, Grid(front_m, left_m, resolution_m, height, width))
+
+
+def facing(corners_m: np.ndarray) -> np.ndarray:
+    """Indices of the triangles (t, 3, 3), counter-clockwise from outside, whose outside is seen from +z."""
+    x, y, _ = corners_m.T  # (3, t) each
+    return np.flatnonzero((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]) > 1e-9)
+
+
+def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest hit of the ray through each pixel centre with the scene's ellipsoids; exact.
+
+    Returns depth_m (H, W) float64, z in the camera frame, -inf where nothing is hit, and primitive (H, W)
+    int64, its index in the scene, -1 for none.
+    """
+    pixel, chord, chords = _chords(scene, camera)
+    shape = camera.view.rows, camera.view.cols
+    depth, primitive = np.full(shape, -np.inf), np.full(shape, -1, np.int64)
+    value = _depth_m(pixel, chord, chords, camera.view)
+    draw(pixel, chords.primitive.take(chord), value, depth.reshape(-1), primitive.reshape(-1))
+    return depth, primitive
+
+
+def ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
+    """Flat indices of the pixels where `cast_ellipsoids` has more than depth_m (H, W), some more than once.
+
+    The least depth of an ellipsoid decides most of its hits; the depths of the others are worked out.
+    """
+    pixel, chord, chords = _chords(scene, camera)
+    there_m = depth_m.reshape(-1).take(pixel)
+    over = chords.least_m.take(chord) > there_m
+    unsure = np.flatnonzero(~over)
+    over[unsure] = _depth_m(pixel.take(unsure), chord.take(unsure), chords, camera.view) > there_m.take(unsure)
+    return pixel[over]
+
+
+class _Chords(NamedTuple):
+    """Rows of pixel centres across ellipsoids, seen from a camera; m chords, by ellipsoid."""
+
+    primitive: np.ndarray  # (m,) index into the scene
+    row_start: np.ndarray  # (m,) flat index of the row's first pixel
+    least_m: np.ndarray  # (m,) less than the depth of any hit
+    terms: tuple[np.ndarray, ...]  # (m,) each, of `_depth_m`
+
+
+def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
+    """Every pixel centre over every ellipsoid: flat pixel index and chord (k,), and the chords.
+
+    With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| = 1. L is lower
+    triangular: x gives the first entry of s, y then the second, and the positive root the third.
+    """
+    view = camera.view
+    primitive = np.flatnonzero(scene.category == ELLIPSOID)
+    half = camera.camera_from_scene @ (scene.rotation[primitive] * (scene.size_m[primitive, None, :] / 2.0))
+    lower = np.linalg.cholesky(half @ half.transpose(0, 2, 1))
+    x, y, z = camera.turned(scene.center_m[primitive].astype(np.float64)).T
+    row_middle = (view.front_m - x) / view.resolution_m - 0.5
+    col_middle = (view.left_m - y) / view.resolution_m - 0.5
+
+    reach = lower[:, 0, 0] / view.resolution_m
+    first, count = integers_between(row_middle - reach, row_middle + reach, view.rows)
+    row, primitive = ranges(first, count), np.repeat(primitive, count)
+    least_m = z - np.hypot(lower[:, 2, 0], lower[:, 2, 1]) - ROUNDING_M
+    x, y, z, col_middle, least_m, l00, _, _, l10, l11, _, l20, l21, l22 = np.repeat(
+        [x, y, z, col_middle, least_m, *lower.reshape(-1, 9).T], count, axis=1
+    )
+    s0 = (view.x_m()[row] - x) / l00
+    shift, rest = l10 * s0, 1 - s0**2
+    middle, reach = col_middle - shift / view.resolution_m, l11 * np.sqrt(np.maximum(rest, 0)) / view.resolution_m
+    first, count = integers_between(middle - reach, middle + reach, view.cols)
+    terms = y, shift, l11, rest, z + l20 * s0, l21, l22
+    row_start = row * view.cols
+    chord = np.repeat(np.arange(len(count)), count)
+    return ranges(row_start + first, count), chord, _Chords(primitive, row_start, least_m, terms)
+
+
+def _depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
+    """(k,) depth of the ellipsoids at flat pixels on their chords."""
+    y, shift, l11, rest, middle, l21, l22 = chords.terms
+    col = pixel - chords.row_start.take(chord)
+    s1 = (view.y_m().take(col) - y.take(chord) - shift.take(chord)) / l11.take(chord)
+    s2 = np.sqrt(np.maximum(rest.take(chord) - s1**2, 0))
+    return middle.take(chord) + l21.take(chord) * s1 + l22.take(chord) * s2

@@ -1,0 +1,66 @@
+"""Scenes as files for other programs: GLB, PLY, voxels, OpenDRIVE; one Ray task per shard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from models.scene import Scene
+from pipelines.io.mesh_export import scene_glb, scene_ply
+from pipelines.io.opendrive import scene_opendrive
+from pipelines.io.voxel_import import scene_voxels_npz
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import numbered, per_row
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import Shard, rejects_table
+
+Format = Literal["glb", "ply", "npz", "xodr"]
+WRITERS: dict[str, Callable[[Scene], bytes]] = {
+    "glb": scene_glb,
+    "ply": scene_ply,
+    "npz": scene_voxels_npz,
+    "xodr": scene_opendrive,
+}
+
+
+def export_scenes(
+    selection: Selection,
+    formats: Sequence[Format],
+    output: str,
+    overwrite: bool = False,
+    on_scene: Callable[[int], None] | None = None,
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Write output/<format>/<scene_id>.<format>; files per format, and why which were not written.
+
+    Files that are there stay as they are unless `overwrite`. A scene that a format cannot hold, such as one without roads,
+    is listed in `rejects` of the output; the others go on.
+    """
+    parts = selection.shards()
+
+    def write(row: dict) -> dict:
+        shard, rows = parts[row["id"]]
+        written, rejects = [], []
+        for scene in shard.scenes(rows):
+            for kind in formats:
+                path = storage.join(output, kind, f"{scene.scene_id}.{kind}")
+                try:
+                    if overwrite or not storage.exists(path):
+                        content = WRITERS[kind](scene)
+                        storage.write_whole(path, lambda stream, content=content: stream.write(content))
+                    written.append(kind)
+                except ValueError as error:
+                    about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
+                    rejects.append(about | {"reason": f"{kind}: {error}"})
+        if rejects:
+            target = Shard(output, shard.source, shard.split, shard.number)
+            storage.write_parquet(rejects_table(rejects), target.path("rejects"))
+        return {"scenes": len(rows), "written": written, "rejects": [(r["scene_id"], r["reason"]) for r in rejects]}
+
+    counts, refused = dict.fromkeys(formats, 0), {}
+    for row in per_row(numbered(range(len(parts))), write).iter_rows():
+        for kind in row["written"]:
+            counts[kind] += 1
+        refused |= {scene_id: reason for scene_id, reason in row["rejects"]}
+        if on_scene:
+            on_scene(row["scenes"])
+    return counts, refused

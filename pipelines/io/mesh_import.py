@@ -1,0 +1,183 @@
+"""Binary glTF meshes -> Scenes: our own export, and meshes in class colours as the paper's authors publish theirs.
+
+Our own export (`mesh.scene_glb`) says itself what it is. Its nodes are the primitives: transforms give centre,
+rotation and size, extras the rest, so that a scene moved about in a mesh editor comes back as it was left.
+
+Any other mesh is taken for the authors' form (FORMATS.md, section 4). What is assumed:
+
+* x forward, y right, z down, metres (`axes` says otherwise). The frame is taken as it is, pitch and roll of the
+  authors' IMU included.
+* A class is a colour of palette.py within COLOR_TOLERANCE (mesh_pieces.py), of vertices or of materials. Whether a file stores sRGB or,
+  as glTF asks, linear light is read off its colours, all together. Textures are not read.
+* Ground: one vertex per occupied pixel, with or without triangles. Pixel (i, j) has its vertex at its corner
+  x = 64 - .25 i, y = -32 + .25 j (y right), the authors' grid, or at its centre, ours. Where face colours were averaged
+  on the border of two classes, a vertex has the class of the nearest vertex that has one.
+* Primitives: connected pieces of one class, any number per mesh; pieces that repeat vertices along edges are sewn
+  together first. Eight vertices are a box, found from its edges; more lie on an ellipsoid, found as the one quadric
+  through them, whatever the sphere was cut into. Boxes of vegetation are vegetation_cuboid.
+
+A box comes back with its corners; an ellipsoid with its shape, not with a yaw that its shape does not show. Pieces
+that fit neither within FIT_M (shapes.py) are refused.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from models.scene import (
+    CATEGORY_INDEX,
+    DENSITIES,
+    ELLIPSOID,
+    GROUND_CLASSES,
+    KITTI_GROUND_CLASSES,
+    Grid,
+    Scene,
+    canonical_boxes,
+    yaw_of,
+)
+from pipelines.geometry.shape_fitting import boxes_of_corners, boxes_of_edges, ellipsoids_of_points
+from pipelines.io.gltf_reader import Glb, read_glb
+from pipelines.io.mesh_export import GLTF_FROM_SCENE
+from pipelines.io.mesh_segmentation import COLOR_TOLERANCE, nearest_class, pieces_of, rasters, stored_linear
+from pipelines.runtime import storage
+from pipelines.schema.axis_convention import Axes, scene_from_axes
+from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
+
+AUTHORS_AXES: Axes = ("x+", "y-", "z-")
+UNMOVED = 1e-4  # change of a size, relative, and of a yaw, in rad, that is rounding and not an edit
+MAX_PIXELS = 2**24  # of a grid that a file names
+
+
+def scene_from_glb(
+    source: bytes | str | os.PathLike, scene_id: str = "", axes: Axes = AUTHORS_AXES, grid: Grid | None = None
+) -> Scene:
+    """The Scene that a .glb shows, given as its bytes or its path.
+
+    Our own export brings its ids, grid and ground classes, and the fused ground: one class per pixel. Other meshes lie
+    on `grid` (default: the paper's), in a frame of `axes`, and get source "imported", split "generated" and the ids of
+    their file. Raises ValueError that names the file, what was found and what to do.
+    """
+    name = "GLB" if isinstance(source, bytes) else os.fspath(source)
+    orientation = scene_from_axes(axes)
+    glb_bytes = source if isinstance(source, bytes) else storage.read_bytes(name)
+    try:
+        glb = read_glb(glb_bytes)
+        if "grid" in glb.extras and "ground_classes" in glb.extras:
+            return _own_scene(glb, scene_id)
+        return _foreign_scene(
+            glb, scene_id or name.rsplit("/", 1)[-1].removesuffix(".glb"), orientation, grid or Grid()
+        )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _own_scene(glb: Glb, scene_id: str) -> Scene:
+    nodes = [part for part in glb.parts if "category" in part.extras]
+    try:
+        about = _about(glb.extras)
+        category = np.array([CATEGORY_INDEX[part.extras["category"]] for part in nodes], np.int8)
+        size_said_m, yaw_said, heading, existence, instance_id, label = (
+            np.array([part.extras[name] for part in nodes], kind)
+            for name, kind in (
+                ("size_m", float),
+                ("yaw_rad", float),
+                ("heading_rad", float),
+                ("existence", float),
+                ("instance_id", np.int64),
+                ("label", str),
+            )
+        )
+    except (LookupError, TypeError, OverflowError) as error:
+        raise ValueError(f"is our export, but its extras are incomplete ({error!r}); export it again") from error
+    if not ((existence >= 0) & (existence <= 1)).all() or (np.abs(heading) > 2 * np.pi).any():
+        raise ValueError("existence lies outside 0 to 1, or heading_rad outside ±2π; export it again")
+    scene_from_gltf = np.linalg.inv(GLTF_FROM_SCENE)
+    scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
+    center_m = scene_from_unit[:, :3, 3]
+    rotation, size_m = boxes_of_edges(scene_from_unit[:, :3, :3], center_m)
+    # A square's length and width must not change places by rounding.
+    size_said_m = size_said_m.reshape(-1, 3)
+    size_m = np.where(np.isclose(size_m, size_said_m, rtol=UNMOVED, atol=0), size_said_m, size_m)
+    rotation, size_m = canonical_boxes(rotation, size_m)
+    turned = ~np.isclose(yaw_of(rotation), yaw_said, rtol=0, atol=UNMOVED)
+
+    ground = [part for part in glb.parts if "classes" in part.extras]
+    vertices_m = _joined([part.vertices @ scene_from_gltf[:3, :3].T for part in ground], (0, 3))
+    ids = np.array([GROUND_CLASS_ID[name] for name in about["ground_classes"]])
+    class_id, off = nearest_class(_joined([part.color for part in ground], (0, 3)), True, ids)
+    if (off > COLOR_TOLERANCE).any():
+        raise ValueError(f"{(off > COLOR_TOLERANCE).sum()} ground vertices have the colour of none of its classes")
+    height_m, occupied = rasters(vertices_m, class_id, about["ground_classes"], about["grid"])
+    return Scene(
+        **about | ({"scene_id": scene_id} if scene_id else {}),
+        category=category,
+        center_m=center_m.astype(np.float32),
+        rotation=rotation.astype(np.float32),
+        size_m=size_m.astype(np.float32),
+        existence=existence.astype(np.float32),
+        heading_rad=np.where(turned, np.nan, heading).astype(np.float32),
+        instance_id=instance_id,
+        label=label.astype(object),
+        height_m=height_m,
+        occupied=occupied,
+    )
+
+
+def _about(extras: dict) -> dict:
+    """What a Scene says of itself as a whole, checked. Raises LookupError, TypeError or ValueError."""
+    said, classes = extras["grid"], tuple(extras["ground_classes"])
+    lengths = [float(said[name]) for name in ("front_m", "left_m", "resolution_m")]
+    grid = Grid(*lengths, int(said["rows"]), int(said["cols"]))
+    sound = np.isfinite(lengths).all() and grid.resolution_m > 0 < min(grid.rows, grid.cols)
+    if not sound or grid.rows * grid.cols > MAX_PIXELS:
+        raise ValueError(f"its grid is {said}; export it again")
+    if not set(classes) <= set(GROUND_CLASSES) or len(set(classes)) < len(classes):
+        raise ValueError(f"its ground classes are {classes}, expected some of {', '.join(GROUND_CLASSES)}")
+    densities = {name: extras[name] for name in ("vegetation_density", "vehicle_density")}
+    if not set(densities.values()) <= {*DENSITIES, None}:
+        raise ValueError(f"its densities are {densities}, expected some of {', '.join(DENSITIES)}; export it again")
+    x, y, z = extras["world_xyz_m"]
+    return densities | {
+        **{name: str(extras[name]) for name in ("scene_id", "source", "sequence", "split")},
+        "frame": int(extras["frame"]),
+        "world_xyz_m": (float(x), float(y), float(z)),
+        "world_yaw_rad": float(extras["world_yaw_rad"]),
+        "grid": grid,
+        "ground_classes": classes,
+    }
+
+
+def _foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: Grid) -> Scene:
+    if not glb.parts:
+        raise ValueError("holds no mesh; export the scene's meshes with it")
+    linear = stored_linear(np.concatenate([part.color for part in glb.parts]))
+    found = [pieces_of(part.vertices @ scene_from_file.T, part.triangles, part.color, linear) for part in glb.parts]
+    ground_m, ground_id, corners_m, box_id = (np.concatenate([part[k] for part in found]) for k in range(4))
+    clouds = [cloud for part in found for cloud in part.clouds]
+    classes = tuple(n for n in GROUND_CLASSES if n in KITTI_GROUND_CLASSES or (ground_id == GROUND_CLASS_ID[n]).any())
+    height_m, occupied = rasters(ground_m, ground_id, classes, grid)
+    shapes = zip(boxes_of_corners(corners_m), ellipsoids_of_points(clouds), strict=True)
+    center_m, rotation, size_m = (np.concatenate(pair) for pair in shapes)
+    rotation, size_m = canonical_boxes(rotation, size_m)
+    category = np.append(np.searchsorted(CATEGORY_IDS, box_id), np.full(len(clouds), ELLIPSOID))
+    return Scene(
+        scene_id=scene_id,
+        source="imported",
+        sequence="imported",
+        frame=0,
+        split="generated",
+        category=category.astype(np.int8),
+        center_m=center_m.astype(np.float32),
+        rotation=rotation.astype(np.float32),
+        size_m=size_m.astype(np.float32),
+        ground_classes=classes,
+        height_m=height_m,
+        occupied=occupied,
+        grid=grid,
+    )
+
+
+def _joined(arrays: list[np.ndarray], empty: tuple[int, ...]) -> np.ndarray:
+    return np.concatenate(arrays) if arrays else np.zeros(empty)

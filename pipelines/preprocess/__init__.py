@@ -1,0 +1,1 @@
+"""Raw drives to Parquet tables."""

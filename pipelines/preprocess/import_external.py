@@ -1,0 +1,193 @@
+"""Other methods' files -> what the evaluator reads: one Ray Data graph, one task per batch of files.
+
+GLB meshes become scene tables, source=imported-<name>; voxel grids, which no primitives can be had from, pictures from
+above. A file that cannot be read becomes a row of `rejects`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+import ray.data
+
+from pipelines.io.mesh_import import scene_from_glb
+from pipelines.io.voxel_import import read_voxels, voxel_picture
+from pipelines.metrics.adm_npz import write_npz
+from pipelines.preprocess.shard_writer import joined_tables
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import per_row
+from pipelines.schema.axis_convention import Axes
+from pipelines.schema.tables import Shard, rejects_table, scene_tables
+
+MAX_FILES_PER_SHARD = 64
+WANTED_SHARDS = 8
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """What to import: `files` below `base`, sorted, into `output` under a name."""
+
+    base: str
+    files: tuple[str, ...]
+    kind: Literal["glb", "npz"]
+    axes: Axes
+    output: str
+    name: str
+
+    def shards(self) -> list[Shard]:
+        count = -(-len(self.files) // self.files_per_shard)
+        return [Shard(self.output, f"imported-{self.name}", "generated", k) for k in range(count)]
+
+    @property
+    def files_per_shard(self) -> int:
+        return min(MAX_FILES_PER_SHARD, -(-len(self.files) // WANTED_SHARDS))
+
+    def files_of(self, shard: Shard) -> Iterator[tuple[int, str, str]]:
+        """Index, scene id and URI of each of a shard's files."""
+        start = shard.number * self.files_per_shard
+        for index, file in enumerate(self.files[start : start + self.files_per_shard], start):
+            yield index, scene_id(file), storage.join(self.base, file)
+
+    def pictures_path(self, shard: Shard) -> str:
+        return storage.join(self.output, f".pictures-{self.name}", f"part-{shard.number:05d}.npz")
+
+    @property
+    def target(self) -> str:
+        return storage.join(self.output, f"{self.name}.npz")
+
+
+def scene_id(file: str) -> str:
+    """Name of a scene by its file: "night/007.glb" is night-007."""
+    return file.rsplit(".", 1)[0].replace("/", "-")
+
+
+def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
+    """Directory and sorted relative names of the files that a directory or a glob names.
+
+    Raises ValueError if there is none, or if two would give scenes of one name.
+    """
+    fixed = pattern
+    while any(sign in fixed for sign in "*?[") or (suffix and fixed.endswith(suffix)):
+        fixed = fixed.rsplit("/", 1)[0]
+    files = [f[len(fixed.rstrip("/")) + 1 :] for f in storage.list_files(fixed, suffix)]
+    if fixed != pattern:
+        files = [file for file in files if fnmatch(storage.join(fixed, file), pattern)]
+    if not files:
+        raise ValueError(
+            f"{pattern}: no {suffix} files there; give a directory or a quoted pattern such as 'DIR/*{suffix}'"
+        )
+    names = [scene_id(file) for file in files]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{pattern}: two files would both be scene {twice!r}; rename one")
+    return fixed, tuple(files)
+
+
+# --------------------------------------------------------------------------------------------------------- shards
+
+
+def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, str], object]) -> tuple[list[str], list]:
+    """Scene ids of a shard's files and what `read(index, scene id, uri)` makes of them; writes its rejects, if any."""
+    names, contents, rejects = [], [], []
+    for index, name, uri in request.files_of(shard):
+        try:
+            contents.append(read(index, name, uri))
+            names.append(name)
+        except ValueError as error:
+            rejects.append({"scene_id": name, "sequence": request.name, "frame": index, "reason": str(error)})
+    if rejects:
+        storage.write_parquet(rejects_table(rejects), shard.path("rejects"))
+    return names, contents
+
+
+# Rejects are written before the shard and deleted after it: a shard without rejects is done, whenever its writer dies.
+
+
+def write_tables(row: dict, request: ImportRequest) -> dict:
+    """Row in: number of a shard. Row out: its scene ids. Writes the shard's tables."""
+    shard = request.shards()[row["shard"]]
+
+    def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
+        scene = scene_from_glb(uri, name, request.axes)
+        about = {"source": shard.source, "split": shard.split, "sequence": request.name, "frame": index}
+        return scene_tables([replace(scene, **about)])
+
+    if shard.is_written() and not storage.exists(shard.path("rejects")):
+        return {"shard": row["shard"], "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
+    names, parts = read_files(request, shard, tables)
+    for table, content in joined_tables(parts).items() if parts else ():
+        storage.write_parquet(content, shard.path(table))
+    if len(names) == len(list(request.files_of(shard))):
+        storage.delete_file(shard.path("rejects"))
+    return {"shard": row["shard"], "scenes": names}
+
+
+def write_pictures(row: dict, request: ImportRequest) -> dict:
+    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures beside the final file."""
+    shard = request.shards()[row["shard"]]
+    path = request.pictures_path(shard)
+    if storage.exists(path) and not storage.exists(shard.path("rejects")):
+        return {"shard": row["shard"], "scenes": np.load(io.BytesIO(storage.read_bytes(path)))["names"].tolist()}
+    names, pictures = read_files(request, shard, lambda _, __, uri: voxel_picture(read_voxels(uri, request.axes)))
+    content = io.BytesIO()
+    np.savez_compressed(content, names=np.array(names, str), pictures=np.array(pictures, np.uint8))
+    storage.write_whole(path, lambda stream: stream.write(content.getvalue()))
+    if len(names) == len(list(request.files_of(shard))):
+        storage.delete_file(shard.path("rejects"))
+    return {"shard": row["shard"], "scenes": names}
+
+
+def shard_pictures(path: str) -> np.ndarray:
+    """(n, 256, 256, 3) uint8, as `write_pictures` left them."""
+    return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
+
+
+# ------------------------------------------------------------------------------------------------------------ run
+
+
+def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
+    """Import everything: ids of the scenes, in order, and how many files were rejected, as in imported-<name>.json.
+
+    Goes on where it stopped; shards with rejects are read again, for files get repaired. Raises ValueError if the output
+    holds an import of other files under this name, or if no file could be read.
+    """
+    record = storage.join(request.output, f"imported-{request.name}.json")
+    options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}
+    shards = request.shards()
+    if storage.exists(record):
+        made = storage.read_json(record)
+        if differing := [name for name in options if made.get(name) != options[name]]:
+            raise ValueError(
+                f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose another"
+                " --name or --output"
+            )
+        there = storage.exists(request.target) if request.kind == "npz" else all(shard.is_written() for shard in shards)
+        if made.get("rejects") == 0 and there:
+            return made
+    storage.write_json(options, record)
+    write = {"glb": write_tables, "npz": write_pictures}[request.kind]
+    rows = ray.data.from_items([{"shard": k} for k in range(len(shards))], override_num_blocks=len(shards))
+    found = {}
+    for row in per_row(rows, lambda row: write(row, request)).iter_rows():
+        found[row["shard"]] = list(row["scenes"])
+        if on_shard:
+            on_shard(len(list(request.files_of(shards[row["shard"]]))))
+    scenes = [name for k in range(len(shards)) for name in found[k]]
+    rejects = len(request.files) - len(scenes)
+    if not scenes:
+        reason = shards[0].read("rejects")["reason"][0]
+        raise ValueError(f"none of the {rejects} files could be read; the first: {reason}")
+    if request.kind == "npz":
+        parts = (shard_pictures(request.pictures_path(shard)) for shard in shards)
+        write_npz(request.target, (part for part in parts if len(part)), len(scenes))
+    made = options | {"scenes": scenes, "rejects": rejects}
+    storage.write_json(made, record)
+    if not rejects:
+        storage.delete_directory(storage.join(request.output, f".pictures-{request.name}"))
+    return made

@@ -1,0 +1,181 @@
+"""Raw drives -> Parquet tables: one Ray Data graph a pass, two passes (paper, supplement A).
+
+Pass 1 cuts scenes: one task per shard writes its own files to a staging directory, by temporary name and move, so
+that a killed task leaves nothing and a finished shard is never redone. Pass 2 knows the whole training split: it
+fixes density thresholds, slot counts and bounds, labels the scenes, and moves everything into place; dataset.json
+comes last and means "complete". The driver sees manifests only, never a scene.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+
+import ray
+import ray.data
+
+from models.scene import Grid
+from pipelines.preprocess.shard_writer import manifest_path, read_drive, write_shard
+from pipelines.preprocess.sharding import Task
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import MAX_RETRIES, per_row
+from pipelines.schema.dataset import DESCRIPTION, Statistics, label_scenes, training_statistics
+from pipelines.schema.tables import SCHEMA_VERSION, Shard
+
+STAGING = ".staging"
+
+
+# ------------------------------------------------------------------------------------------------------- pass 1
+
+
+def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
+    """Ray task. A drive into the object store, once for all its shards; or why it cannot be read."""
+    try:
+        return read_drive(source, key)
+    except ValueError as error:
+        return str(error)
+
+
+def write_shards(tasks: list[Task], staging: str, grid: Grid) -> Iterator[dict]:
+    """Manifests as they are done, in any order; one Ray task per shard, one more per drive that has several."""
+    finished = set(storage.list_files(storage.join(staging, "manifest"), ".json"))
+    todo = [task for task in tasks if manifest_path(staging, task) not in finished]
+    shards_of = Counter((task.source, part.key) for task in todo for part in task.parts)
+    load = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_drive_or_reason)
+    shared = {drive: load.remote(*drive) for drive, shards in shards_of.items() if shards > 1}
+
+    def read(source: str, key: tuple) -> tuple[Drive, dict]:
+        if (source, key) not in shared:
+            return read_drive(source, key)
+        found = ray.get(shared[source, key])
+        if isinstance(found, str):
+            raise ValueError(found)
+        return found
+
+    def write(row: dict) -> dict:
+        """Row in: number of a task. Row out: its manifest."""
+        return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
+
+    dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
+    for row in per_row(dataset, write).iter_rows():
+        yield json.loads(row["manifest"])
+
+
+# ------------------------------------------------------------------------------------------------------- pass 2
+
+
+def publish(root: str, staging: str, manifests: list[dict], statistics: Statistics) -> None:
+    """Label the scenes and move every staged file into place. Safe to repeat after a crash at any point."""
+
+    def move(row: dict) -> dict:
+        """Row in: a shard. Row out: the same, now visible. Its scenes come last: they name the shard."""
+        staged, final = (Shard(base, row["source"], row["split"], row["number"]) for base in (staging, root))
+        moved = ["primitives", "rasters"] * bool(row["scenes"]) + ["rejects"] * bool(row["rejects"])
+        for table in moved:
+            if storage.exists(staged.path(table)):
+                storage.move(staged.path(table), final.path(table))
+        if row["scenes"]:
+            storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
+        return row
+
+    rows = [
+        {k: m[k] for k in ("source", "split", "number", "scenes")} | {"rejects": len(m["rejects"])} for m in manifests
+    ]
+    blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
+    per_row(ray.data.from_items(rows, override_num_blocks=blocks), move).materialize()
+
+
+# ---------------------------------------------------------------------------------------------------------- run
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """What a run of `ingest` did."""
+
+    scenes: dict[str, int]  # split -> scenes
+    rejects: dict[str, int]  # reason -> scenes
+    duplicates: int
+    seconds: float
+    already_complete: bool = False
+
+
+def ingest(
+    tasks: list[Task],
+    root: str,
+    options: dict,
+    slots: tuple[int, ...] | None = None,
+    grid: Grid | None = None,
+    skip_unreadable: bool = False,
+    on_shard: Callable[[dict], None] | None = None,
+) -> IngestResult:
+    """Write the dataset directory `root`. The same call again goes on where it stopped.
+
+    `options` is what the user asked for; it is kept in dataset.json, and a directory made with other options is
+    refused. A drive that cannot be read stops the run after everything else is staged (ValueError), unless
+    `skip_unreadable`.
+    """
+    started = time.perf_counter()
+    grid = grid or Grid()
+    description, staging = storage.join(root, DESCRIPTION), storage.join(root, STAGING)
+    _refuse_other_options(root, options)
+    if storage.exists(description):
+        storage.delete_directory(staging)  # of a run that was killed while it tidied up
+        made = storage.read_json(description)
+        rejects, duplicates = made.get("rejects", {}), made.get("duplicates", 0)
+        return IngestResult(made["scenes"], rejects, duplicates, time.perf_counter() - started, already_complete=True)
+    if not tasks:
+        raise ValueError("there is nothing to preprocess: no drive was found")
+    storage.clean_temporaries(root)
+    storage.write_json(options, storage.join(staging, "options.json"))
+
+    manifests = []
+    for manifest in write_shards(tasks, staging, grid):
+        manifests.append(manifest)
+        if on_shard:
+            on_shard(manifest)
+    manifests.sort(key=lambda m: (m["source"], m["split"], m["number"]))
+    unreadable = sorted({reason for m in manifests for reason in m["unreadable"]})
+    if unreadable and not skip_unreadable:
+        more = f" (and {len(unreadable) - 1} more)" if len(unreadable) > 1 else ""
+        raise ValueError(
+            f"{unreadable[0]}{more}. All other drives are staged: repair the file and run the same command again, "
+            "or add --skip-unreadable to leave it out"
+        )
+    statistics = ray.get(ray.remote(training_statistics).remote(manifests, staging, grid, slots))
+    publish(root, staging, manifests, statistics)
+
+    totals, reasons = Counter(), Counter()
+    for manifest in manifests:
+        totals[manifest["split"]] += manifest["scenes"]
+        reasons.update(manifest["rejects"])
+    reports = {sequence: report for m in manifests for sequence, report in m["reports"].items() if report}
+    duplicates = sum(report["duplicates"] for report in reports.values())
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "source": tasks[0].source,
+        "options": options,
+        "scenes": totals,
+        "rejects": reasons,
+        "duplicates": duplicates,
+        "layout": statistics.spec.to_dict(),
+        "vegetation_thresholds": asdict(statistics.vegetation),
+        "vehicle_thresholds": asdict(statistics.vehicle),
+        "reports": reports,
+    }
+    storage.write_json(content, description)
+    storage.delete_directory(staging)
+    return IngestResult(totals, reasons, duplicates, time.perf_counter() - started)
+
+
+def _refuse_other_options(root: str, options: dict) -> None:
+    """Raises ValueError if `root` was made, or begun, with other options."""
+    for path in (storage.join(root, DESCRIPTION), storage.join(root, STAGING, "options.json")):
+        if storage.exists(path):
+            made = storage.read_json(path)
+            made = made["options"] if path.endswith(DESCRIPTION) else made
+            if made != options:
+                raise ValueError(f"{root} was made with {made}, asked for {options}; choose another --output")

@@ -1,0 +1,133 @@
+"""Which shards a dataset is made of: a plan is known before anything is cut, so runs resume and scale by shard."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.town import generator
+from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, no_split, split_poses
+from pipelines.schema.tables import Shard
+
+SHARD_SCENES = 256
+LOGS_PER_SHARD = 2  # Argoverse 2: about 160 sweeps each
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some poses of one drive. `key` is what its source needs to read it (`pipelines.preprocess.shard_writer.read_drive`)."""
+
+    key: tuple
+    sequence: str
+    poses: tuple[int, ...] | None = None  # None: all
+    frames: tuple[int, ...] | None = None  # of those poses, for the rejects of a drive that cannot be read
+
+
+@dataclass(frozen=True)
+class Task:
+    """One shard to write: its source, split and number, and the parts it is cut from."""
+
+    source: str
+    split: str
+    number: int
+    parts: tuple[Part, ...]
+
+    def shard(self, root: str) -> Shard:
+        return Shard(root, self.source, self.split, self.number)
+
+
+def plan_town(num_train: int, num_test: int, seed: int) -> list[Task]:
+    """A task per town."""
+    plan = [
+        (split, Part((town_seed, count), f"{town_seed:05d}"))
+        for town_seed, split, count in generator.town_plan(num_train, num_test, seed)
+    ]
+    return _numbered("town", [(split, (part,)) for split, part in plan])
+
+
+def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) -> list[Task]:
+    """Tasks of at most SHARD_SCENES poses of one sequence and one side of the paper's split.
+
+    Raises ValueError for missing or broken poses, unless `skip_unreadable`: then the sequence becomes a reject.
+    """
+    poses, unreadable = _read_poses(
+        kitti360.sequences(root), lambda name: kitti360.read_poses(root, name), skip_unreadable
+    )
+    labels = (split_poses if split else no_split)({name: matrix[:, :, 3] for name, (_, matrix) in poses.items()})
+    keys = {name: (root, name) for name in [*poses, *unreadable]}
+    return _plan_drives("kitti360", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
+
+
+def plan_own(root: str, split: bool = True, skip_unreadable: bool = False) -> list[Task]:
+    """Tasks of at most SHARD_SCENES poses of one own drive and one side of splits.json, or of the paper's split."""
+    poses, unreadable = _read_poses(custom.drives(root), lambda name: custom.read_poses(root, name), skip_unreadable)
+    given = custom.read_splits(root)
+    if given is not None:
+        labels = {name: np.full(len(frame), given[name], object) for name, (frame, _) in poses.items()}
+    else:
+        labels = (split_poses if split else no_split)({name: matrix[:, :, 3] for name, (_, matrix) in poses.items()})
+    classes = custom.ground_classes(root)
+    keys = {name: (root, name, classes) for name in [*poses, *unreadable]}
+    return _plan_drives("own", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
+
+
+def plan_argoverse2(root: str) -> list[Task]:
+    """Tasks of a few logs each; AV2's own train is train, its val is test."""
+    plan = []
+    for theirs, side in ARGOVERSE2_SPLIT.items():
+        logs = [log for split, log in argoverse2.logs(root) if split == theirs]
+        for start in range(0, len(logs), LOGS_PER_SHARD):
+            plan.append((side, tuple(Part((root, theirs, log), log) for log in logs[start : start + LOGS_PER_SHARD])))
+    return _numbered("av2", plan)
+
+
+Poses = tuple[np.ndarray, np.ndarray]  # frame (p,), world_from_imu (p, 3, 4)
+
+
+def _read_poses(
+    names: list[str], read: Callable[[str], Poses], skip_unreadable: bool
+) -> tuple[dict[str, Poses], list[str]]:
+    """Poses of the drives that have them, and the names of those that have not."""
+    poses, unreadable = {}, []
+    for name in names:
+        try:
+            poses[name] = read(name)
+        except ValueError as error:
+            if not skip_unreadable:
+                raise ValueError(f"{error}. Or add --skip-unreadable to leave this drive out") from error
+            logger.warning("left out: %s", error)
+            unreadable.append(name)
+    return poses, unreadable
+
+
+def _plan_drives(
+    source: str, keys: dict[str, tuple], frames: dict[str, np.ndarray], labels: dict[str, np.ndarray]
+) -> list[Task]:
+    """Tasks drive after drive, so that neighbours in the plan share what they read.
+
+    A drive without frames could not be read: reading it fails again and gives its one reject.
+    """
+    plan = [(UNUSED, (Part(key, name),)) for name, key in keys.items() if name not in frames]
+    for name, frame in frames.items():
+        for side in (TRAIN, TEST, UNUSED):
+            members = np.flatnonzero(labels[name] == side)
+            for start in range(0, len(members), SHARD_SCENES):
+                poses = members[start : start + SHARD_SCENES]
+                part = Part(keys[name], name, tuple(poses.tolist()), tuple(frame[poses].tolist()))
+                plan.append((side, (part,)))
+    return _numbered(source, plan)
+
+
+def _numbered(source: str, plan: list[tuple[str, tuple[Part, ...]]]) -> list[Task]:
+    """Tasks from (split, parts): shards are counted within their split."""
+    tasks, numbers = [], dict.fromkeys((TRAIN, TEST, UNUSED), 0)
+    for split, parts in plan:
+        tasks.append(Task(source, split, numbers[split], parts))
+        numbers[split] += 1
+    return tasks

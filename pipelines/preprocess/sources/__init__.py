@@ -1,0 +1,1 @@
+"""Readers of raw drives, one module or package per dataset."""

@@ -1,0 +1,354 @@
+"""Argoverse 2's sensor dataset -> Drive: one pose, so one Scene, per annotated sweep (10 Hz) of a log.
+
+    ROOT/{train,val}/LOG/annotations.feather              boxes in the ego frame of their sweep
+    ROOT/{train,val}/LOG/city_SE3_egovehicle.feather      city from ego, 200 Hz
+    ROOT/{train,val}/LOG/map/                             polygons (city frame) and a raster of ground heights
+
+The ego frame is x forward, y left, z up, its origin on the rear axle. The world is the city frame.
+A log that is broken anywhere is a ValueError that names file, value and fix.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.feather
+from scipy.spatial.transform import Rotation
+
+from models.scene import CATEGORY_INDEX
+from pipelines.preprocess.sources.drive import Drive, MapGround
+
+SOURCE = "av2"
+SPLITS = ("train", "val")
+GROUND_CLASSES = ("road", "crossing")
+
+# The paper leaves open: it names the seven groups only, not which of the 30 categories falls where.
+CATEGORY_LABELS = {
+    "vehicle_big": (
+        "BUS",
+        "SCHOOL_BUS",
+        "ARTICULATED_BUS",
+        "TRUCK",
+        "BOX_TRUCK",
+        "TRUCK_CAB",
+        "LARGE_VEHICLE",
+        "RAILED_VEHICLE",
+    ),
+    "vehicle_small": ("REGULAR_VEHICLE", "VEHICULAR_TRAILER"),
+    "two_wheelers": ("BICYCLE", "MOTORCYCLE", "WHEELED_DEVICE"),
+    "human": ("PEDESTRIAN", "BICYCLIST", "MOTORCYCLIST", "WHEELED_RIDER", "OFFICIAL_SIGNALER"),
+    "pole": ("BOLLARD",),
+    "traffic_control": (
+        "SIGN",
+        "STOP_SIGN",
+        "MOBILE_PEDESTRIAN_CROSSING_SIGN",
+        "TRAFFIC_LIGHT_TRAILER",
+        "MESSAGE_BOARD_TRAILER",
+    ),
+    "object": ("CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STROLLER", "WHEELCHAIR", "ANIMAL", "DOG"),
+}
+CATEGORY_OF = {label: CATEGORY_INDEX[name] for name, labels in CATEGORY_LABELS.items() for label in labels}
+EGO_LABEL = "EGO_VEHICLE"  # some logs annotate the recording car itself
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+TRANSLATION = ("tx_m", "ty_m", "tz_m")
+SIZE = ("length_m", "width_m", "height_m")
+MAX_BOX_DISTANCE_M = 1e3  # real boxes reach 220 m
+MAX_BOX_SIZE_M = 1e2
+MIN_BOX_SIZE_M = 1e-3
+MAX_COORDINATE_M = 1e6
+MAX_HEIGHT_M = 1e4
+
+
+def logs(root: str | Path) -> list[tuple[str, str]]:
+    """(split, log id) of every annotated log under ROOT: train, then val. The test split has no annotations.
+
+    Raises ValueError if there is none.
+    """
+    found = [
+        (split, folder.name)
+        for split in SPLITS
+        for folder in sorted(Path(root, split).glob("*/"))
+        if not folder.name.startswith(".")
+    ]
+    if not found:
+        raise ValueError(
+            f"{root}: no train/LOG or val/LOG folder here (the test split has no annotations); --input must"
+            " name the folder that holds Argoverse 2's sensor logs by split"
+        )
+    return found
+
+
+def read_drive(root: str | Path, split: str, log: str) -> Drive:
+    """The annotated sweeps of one log, city frame, float64.
+
+    `frame` and `timestamp` are a sweep's time in ns, `instance_id` a hash of the track's uuid, equal on every
+    machine, `heading_rad` the yaw of the box's x axis.
+    Raises ValueError, naming the file, for anything missing, of the wrong type, or no finite sensible value.
+    """
+    if split == "test":
+        raise ValueError(f"{Path(root, split, log)}: Argoverse 2's test split has no annotations; use train or val")
+    folder = Path(root, split, log)
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such log; check --input and that the log is unpacked")
+    boxes = _read_annotations(folder / "annotations.feather")
+    frame, box_sweep = np.unique(boxes["timestamp_ns"], return_inverse=True)
+    city_from_ego = _read_poses(folder / "city_SE3_egovehicle.feather", frame)
+
+    others = boxes["category"] != EGO_LABEL
+    boxes, box_sweep = {name: column[others] for name, column in boxes.items()}, box_sweep[others]
+    city_from_ego_of_box = city_from_ego[box_sweep]
+    center_ego_m = _columns(boxes, TRANSLATION)
+    rotation = city_from_ego_of_box[:, :, :3] @ _rotation(_columns(boxes, QUATERNION))
+    return Drive(
+        source=SOURCE,
+        sequence=log,
+        category=np.array([CATEGORY_OF[label] for label in boxes["category"]], np.int8),
+        center_m=np.einsum("nij,nj->ni", city_from_ego_of_box[:, :, :3], center_ego_m) + city_from_ego_of_box[:, :, 3],
+        rotation=rotation,
+        size_m=_columns(boxes, SIZE),
+        heading_rad=np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
+        instance_id=_hash_ids(boxes["track_uuid"]),
+        label=boxes["category"],
+        timestamp=boxes["timestamp_ns"],
+        ground_classes=GROUND_CLASSES,
+        ground=_read_ground(folder / "map"),
+        frame=frame,
+        world_from_imu=city_from_ego,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- feather
+
+
+def _read_annotations(path: Path) -> dict[str, np.ndarray]:
+    """The columns this reader needs, (n,) each, checked."""
+    numbers = (*SIZE, *QUATERNION, *TRANSLATION)
+    columns = _read_feather(path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers)
+    if len(columns["category"]) == 0:
+        raise ValueError(f"{path}: holds no box; download the log again")
+    unknown = sorted(set(columns["category"]) - set(CATEGORY_OF) - {EGO_LABEL})
+    if unknown:
+        raise ValueError(f"{path}: unknown category {unknown[0][:40]!r}; add it to CATEGORY_LABELS of {__name__}")
+    for name in SIZE:
+        _check_range(path, name, columns[name], MIN_BOX_SIZE_M, MAX_BOX_SIZE_M)
+    for name in TRANSLATION:
+        _check_range(path, name, columns[name], -MAX_BOX_DISTANCE_M, MAX_BOX_DISTANCE_M)
+    _check_quaternion(path, columns)
+    return columns
+
+
+def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
+    """city_from_ego (p, 3, 4) at the sorted timestamps frame (p,); metres."""
+    columns = _read_feather(path, integers=("timestamp_ns",), texts=(), numbers=(*QUATERNION, *TRANSLATION))
+    for name in TRANSLATION:
+        _check_range(path, name, columns[name], -MAX_COORDINATE_M, MAX_COORDINATE_M)
+    _check_quaternion(path, columns)
+    time, first = np.unique(columns["timestamp_ns"], return_index=True)
+    missing = np.setdiff1d(frame, time)
+    if len(missing):
+        raise ValueError(f"{path}: no pose at the annotated timestamp {missing[0]}; download the log again")
+    row = first[np.searchsorted(time, frame)]
+    rotation = _rotation(_columns(columns, QUATERNION)[row])
+    return np.concatenate([rotation, _columns(columns, TRANSLATION)[row][:, :, None]], axis=2)
+
+
+def _read_feather(
+    path: Path, integers: tuple[str, ...], texts: tuple[str, ...], numbers: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Columns of a feather file: int64, str objects, float64. No nulls, every number finite."""
+    _check_file(path)
+    try:
+        table = pyarrow.feather.read_table(path, memory_map=False)
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: broken feather file ({reason}); download the log again") from error
+    kinds = [
+        (integers, pa.types.is_int64, "int64"),
+        (texts, _is_text, "text"),
+        (numbers, pa.types.is_floating, "float"),
+    ]
+    columns = {}
+    for names, is_kind, kind in kinds:
+        for name in names:
+            if table.schema.get_field_index(name) < 0:
+                raise ValueError(f"{path}: column {name} is missing (or there twice); download the log again")
+            column = table[name]
+            if not is_kind(column.type):
+                raise ValueError(f"{path}: column {name} is {column.type}, expected {kind}; download the log again")
+            if column.null_count:
+                raise ValueError(f"{path}: column {name} has {column.null_count} nulls; download the log again")
+            if kind == "text":
+                columns[name] = np.array(pc.cast(column, pa.string()).to_pylist(), object)
+            else:
+                columns[name] = column.to_numpy().astype(np.int64 if kind == "int64" else np.float64)
+    for name in numbers:
+        bad = np.flatnonzero(~np.isfinite(columns[name]))
+        if len(bad):
+            raise ValueError(f"{path}: {name} of row {bad[0]} is {columns[name][bad[0]]}; fix or drop the row")
+    return columns
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
+
+
+def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: float) -> None:
+    bad = np.flatnonzero((values < low) | (values > high))
+    if len(bad):
+        raise ValueError(
+            f"{path}: {name} of row {bad[0]} is {values[bad[0]]:g}, expected {low:g}..{high:g}; fix or drop the row"
+        )
+
+
+def _check_quaternion(path: Path, columns: dict[str, np.ndarray]) -> None:
+    for name in QUATERNION:
+        _check_range(path, name, columns[name], -2, 2)
+    norm = np.linalg.norm(_columns(columns, QUATERNION), axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
+    if len(bad):
+        raise ValueError(
+            f"{path}: quaternion of row {bad[0]} has norm {norm[bad[0]]:g}, expected 1; fix or drop the row"
+        )
+
+
+def _columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+    """(n, len(names)) float64."""
+    return np.stack([columns[name] for name in names], axis=1)
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of (n, 4) quaternions, scalar first."""
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
+
+
+def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
+    """(n,) int64 >= 0 of the uuids (n,): the first 63 bits of their BLAKE2 hash."""
+    hashes = {
+        uuid: int.from_bytes(hashlib.blake2b(uuid.encode(), digest_size=8).digest(), "big") >> 1
+        for uuid in set(track_uuid)
+    }
+    return np.array([hashes[uuid] for uuid in track_uuid], np.int64)
+
+
+# -------------------------------------------------------------------------------------------------------- map
+
+
+def _read_ground(folder: Path) -> MapGround:
+    """Drivable areas as road, pedestrian crossings as crossing, over the log's height raster."""
+    path = _only(folder, "log_map_archive_*.json")
+    content = _read_json(path)
+    areas, crossings = (_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
+    roads = [_points(path, area, "area_boundary", 3) for area in areas]
+    quads = [_quad(_points(path, c, "edge1", 2, 2), _points(path, c, "edge2", 2, 2)) for c in crossings]
+    return MapGround(
+        polygon_class=[GROUND_CLASSES.index("road")] * len(roads) + [GROUND_CLASSES.index("crossing")] * len(quads),
+        polygons_m=roads + quads,
+        raster_m=_read_heights(_only(folder, "*_ground_height_surface____*.npy")),
+        raster_from_world=_read_sim2(_only(folder, "*___img_Sim2_city.json")),
+    )
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    paths = sorted(folder.glob(pattern))
+    if len(paths) != 1:
+        raise ValueError(f"{folder / pattern}: {len(paths)} such files, expected 1; download the log again")
+    return paths[0]
+
+
+def _read_json(path: Path) -> dict:
+    _check_file(path)
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: broken JSON ({str(error)[:120]}); download the log again") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object; download the log again")
+    return content
+
+
+def _section(path: Path, content: dict, name: str) -> list[dict]:
+    """The entries of one section of the map file."""
+    section = content.get(name)
+    if not isinstance(section, dict) or not all(isinstance(entry, dict) for entry in section.values()):
+        raise ValueError(f"{path}: {name} is missing or no object of objects; download the log again")
+    return list(section.values())
+
+
+def _points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
+    """(n, 2) x and y of the points entry[name], metres, city frame."""
+    points = entry.get(name)
+    if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
+        raise ValueError(
+            f"{path}: {name} of {ascii(entry.get('id'))[:40]} is no list of {least} points; download the log again"
+        )
+    values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
+    if not _all_numbers(values, MAX_COORDINATE_M):
+        raise ValueError(
+            f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without sensible x, y; fix or drop it"
+        )
+    return np.array(values, np.float64).reshape(-1, 2)
+
+
+def _all_numbers(values: list, largest: float) -> bool:
+    """Whether these JSON values are numbers in [-largest, largest]; NaN and true are not."""
+    return all(type(value) in (int, float) and abs(value) <= largest for value in values)
+
+
+def _quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
+    """(4, 2) outline between two edges (2, 2); they may run the same way or against each other."""
+    if (edge1_m[1] - edge1_m[0]) @ (edge2_m[1] - edge2_m[0]) < 0:
+        edge2_m = edge2_m[::-1]
+    return np.concatenate([edge1_m, edge2_m[::-1]])
+
+
+def _read_heights(path: Path) -> np.ndarray:
+    """(rows, cols) float heights in metres, city frame, NaN where unknown."""
+    _check_file(path)
+    try:
+        # Mapped, so that a header that promises too much asks for no memory.
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # numpy evaluates the header as Python, and a broken one fails in as many ways
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: broken npy file ({reason}); download the log again") from error
+    if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
+        kind = f"{mapped.dtype} {mapped.shape}" if isinstance(mapped, np.ndarray) else type(mapped).__name__
+        raise ValueError(f"{path}: is {kind}, expected a 2D float array; download the log again")
+    with np.errstate(over="ignore"):  # infinite, so refused below
+        height_m = np.array(mapped, np.float32)
+    known = height_m[~np.isnan(height_m)]
+    if len(known) == 0 or np.abs(known).max() > MAX_HEIGHT_M:
+        raise ValueError(f"{path}: {len(known)} heights, not all sensible; download the log again")
+    return height_m
+
+
+def _read_sim2(path: Path) -> np.ndarray:
+    """raster_from_city (3, 3): (column, row, 1) of a city point (x, y, 1), from p = s (R p_city + t)."""
+    content = _read_json(path)
+    rotation, translation, scale = content.get("R"), content.get("t"), content.get("s")
+    if not (
+        isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
+    ):
+        raise ValueError(f"{path}: R or t is missing or not of 4 and 2 numbers; download the log again")
+    if not _all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
+        raise ValueError(f"{path}: R, t or s is no sensible number; download the log again")
+    matrix = np.array(rotation, np.float64).reshape(2, 2)
+    if np.abs(matrix @ matrix.T - np.eye(2)).max() > 1e-3:
+        raise ValueError(f"{path}: R is {rotation}, no rotation; download the log again")
+    raster_from_city = np.eye(3)
+    raster_from_city[:2, :2] = scale * matrix
+    raster_from_city[:2, 2] = scale * np.array(translation)
+    return raster_from_city
+
+
+def _check_file(path: Path) -> None:
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; download the log again")

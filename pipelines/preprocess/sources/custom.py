@@ -1,0 +1,534 @@
+"""One's own drives -> Drive: boxes, ground polygons and poses as plain Parquet or JSON (docs/own_drives.md).
+
+    ROOT/DRIVE/boxes.parquet       or boxes.json: a row per box
+    ROOT/DRIVE/polygons.parquet    or polygons.json: a row per ground polygon
+    ROOT/DRIVE/poses.parquet       or poses.json: a row per pose, so per scene
+    ROOT/splits.json               optional: {"DRIVE": "train" or "test"}
+
+One world frame per drive, right-handed, z up; ego frame x forward, y left, z up; metres and radians.
+JSON is a list of objects with the Parquet's column names as keys; a key left out is a null. Rows count from 0.
+Anything that makes no sense is a ValueError that names file, row, value and fix.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+from scipy.spatial.transform import Rotation
+
+from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, yaw_rotation
+from pipelines.preprocess.sources.drive import STATIC, Drive, SurfaceGround
+from pipelines.schema.splits import TEST, TRAIN
+
+SOURCE = "own"
+
+PLACE = ("x_m", "y_m", "z_m")
+SIZE = ("length_m", "width_m", "height_m")
+QUATERNION = ("qw", "qx", "qy", "qz")
+BOX_COLUMNS = (
+    "category",
+    *PLACE,
+    *SIZE,
+    "yaw_rad",
+    *QUATERNION,
+    "frame",
+    "instance_id",
+    "label",
+    "heading_known",
+)
+POLYGON_COLUMNS = ("class", "outline")
+POSE_COLUMNS = ("frame", *PLACE, "yaw_rad", *QUATERNION, "world_from_ego")
+PANDAS_INDEX = "__index_level_0__"  # pandas writes it behind one's back
+
+# Whose x axis is taken for the direction of travel, unless heading_known says otherwise.
+HEADED = tuple(CATEGORY_INDEX[name] for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human"))
+
+MAX_COORDINATE_M = 1e7  # UTM northings reach it
+MAX_HEIGHT_M = 1e4
+MIN_SIZE_M = 1e-3
+MAX_SIZE_M = 1e3
+MAX_YAW_RAD = 6.2832  # one turn either way; more is degrees
+MAX_WHOLE = 2**63 - 1
+MAX_EXACT_FLOAT = 2**53
+MIN_UP = 0.5  # cosine between the ego's up and the world's: no road is steeper, no camera frame as upright
+SIGHT_M = 100.0  # a crop reaches 72 m
+
+
+# ----------------------------------------------------------------------------------------------------- the root
+
+
+def drives(root: str | Path) -> list[str]:
+    """The drives under ROOT, sorted: every folder whose name does not begin with a dot.
+
+    Raises ValueError if there is none, or one whose name could not go into a scene's id.
+    """
+    names = sorted(path.name for path in Path(root).glob("*/") if not path.name.startswith("."))
+    if not names:
+        raise ValueError(
+            f"{root}: no folder here; --input must name the folder of all drives, with DRIVE/boxes.parquet,"
+            " DRIVE/polygons.parquet and DRIVE/poses.parquet (or .json) in it"
+        )
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9._-]+", name):
+            raise ValueError(
+                f"{Path(root, name)}: a drive's name goes into file names; rename the folder to letters, digits,"
+                " '.', '_' and '-'"
+            )
+    return names
+
+
+def read_splits(root: str | Path) -> dict[str, str] | None:
+    """Drive -> train or test for every drive, as ROOT/splits.json says; None if there is no such file.
+
+    Raises ValueError for a broken file, a drive it forgets or does not have, and any other side.
+    """
+    path = Path(root, "splits.json")
+    if not path.exists():
+        return None
+    sides = _load_json(path)
+    if not isinstance(sides, dict):
+        raise ValueError(f'{path}: holds a {type(sides).__name__}, expected {{"drive": "train" or "test"}}')
+    names = drives(root)
+    for name, side in sides.items():
+        if name not in names:
+            raise ValueError(f"{path}: {_show(name)} is no folder beside it; remove the entry or add the drive")
+        if side not in (TRAIN, TEST):
+            raise ValueError(f"{path}: {name} is {_show(side)}, expected {TRAIN!r} or {TEST!r}")
+    for name in names:
+        if name not in sides:
+            raise ValueError(f"{path}: has no entry for the folder {name}; add one or take the folder away")
+    return sides
+
+
+def ground_classes(root: str | Path) -> tuple[str, ...]:
+    """The ground classes that any drive under ROOT has, in the order of GROUND_CLASSES.
+
+    A polygons file that cannot be read is left for `read_drive` to report. Raises ValueError if no drive has ground.
+    """
+    found, errors = set(), []
+    for name in drives(root):
+        try:
+            found |= set(_read_polygons(Path(root, name)).texts("class"))
+        except ValueError as error:
+            errors.append(error)
+    if not found:
+        raise errors[0] if errors else ValueError(f"{root}: no drive has a ground polygon; draw at least the road")
+    return tuple(name for name in GROUND_CLASSES if name in found)
+
+
+def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = None) -> Drive:
+    """All boxes, the ground and the poses of one drive, world frame, float64.
+
+    `classes` are the ground classes of the whole dataset (`ground_classes`), None those of this drive alone.
+    `timestamp` is the frame of a moving box, else STATIC; `instance_id` the given number, of a text a hash that is
+    equal on every machine, -1 where there is none; `heading_rad` the yaw of the x axis where that is known.
+    Raises ValueError, naming file and row, for whatever is missing or makes no sense.
+    """
+    folder = Path(root, name)
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such drive; there are {', '.join(drives(root))[:200]}")
+    frame, world_from_ego = read_poses(root, name)
+    boxes, polygons = _read_boxes(folder), _read_polygons(folder)
+    classes = classes or tuple(c for c in GROUND_CLASSES if c in polygons.texts("class"))
+    drive = Drive(
+        source=SOURCE,
+        sequence=name,
+        **_boxes(boxes),
+        ground_classes=classes,
+        ground=_ground(polygons, classes),
+        frame=frame,
+        world_from_imu=world_from_ego,
+    )
+    _check_in_sight(boxes.path, drive.center_m, world_from_ego)
+    _check_in_sight(polygons.path, drive.ground.triangles_m.reshape(-1, 3), world_from_ego)
+    moving = drive.timestamp[drive.timestamp != STATIC]
+    if len(moving) and not np.isin(moving, frame).any():
+        raise ValueError(
+            f"{boxes.path}: no box's frame is a frame of the poses, e.g. {moving[0]} (poses: {frame[0]}.."
+            f"{frame[-1]}); count frames in one way, or write null for what stands still"
+        )
+    return drive
+
+
+# ----------------------------------------------------------------------------------------------------- a table
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A file as columns of Python values; what it hands out is checked value by value."""
+
+    path: Path
+    rows: int
+    columns: dict[str, list]  # those with a value anywhere
+
+    def numbers(self, names: Sequence[str], low: float, high: float, unit: str = "") -> np.ndarray:
+        """(rows, len(names)) float64 within low..high."""
+        for name in names:
+            for row, value in enumerate(self.columns[name]):
+                if type(value) not in (int, float) or not low <= value <= high:
+                    raise ValueError(
+                        f"{self.path}: {name} of row {row} is {_show(value)}, expected a number of"
+                        f" {low:g}..{high:g}{unit}; fix or drop the row"
+                    )
+        return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
+
+    def frames(self, missing: int | None = None) -> np.ndarray:
+        """(rows,) int64 >= 0; `missing` where there is none, unless that is None."""
+        values = self._optional("frame")
+        for row, value in enumerate(values):
+            if value is None and missing is not None:
+                continue
+            if not _is_whole(value):
+                static = "" if missing is None else "; null means that a box stands still"
+                raise ValueError(
+                    f"{self.path}: frame of row {row} is {_show(value)}, expected a whole number of 0 or more{static}"
+                )
+            if type(value) is float and value >= MAX_EXACT_FLOAT:
+                raise ValueError(
+                    f"{self.path}: frame of row {row} is {value!r}, a float that has lost its last digits; write"
+                    " whole numbers (in pandas: astype('Int64'))"
+                )
+        return np.array([missing if value is None else int(value) for value in values], np.int64)
+
+    def texts(self, name: str, allowed: Sequence[str] = (), optional: bool = False) -> list:
+        """(rows) str, each one of `allowed` if that is given; None where `optional` and absent."""
+        values = self._optional(name)
+        for row, value in enumerate(values):
+            if value is None and optional:
+                continue
+            if not _is_text(value):
+                raise ValueError(f"{self.path}: {name} of row {row} is {_show(value)}, expected a text")
+            if allowed and value not in allowed:
+                raise ValueError(
+                    f"{self.path}: {name} of row {row} is {_show(value)}, expected one of {', '.join(allowed)};"
+                    " map your labels to these"
+                )
+        return values
+
+    def flags(self, name: str) -> list:
+        """(rows) True, False or None."""
+        values = self._optional(name)
+        for row, value in enumerate(values):
+            if value is not None and type(value) is not bool:
+                raise ValueError(f"{self.path}: {name} of row {row} is {_show(value)}, expected true, false or null")
+        return values
+
+    def rotations(self) -> np.ndarray:
+        """(rows, 3, 3) from yaw_rad or a quaternion, whichever there is."""
+        given = [form for form in (("yaw_rad",), QUATERNION) if any(name in self.columns for name in form)]
+        if self.rows and len(given) != 1:
+            raise ValueError(
+                f"{self.path}: {'both yaw_rad and a quaternion' if given else 'no orientation'}; give either"
+                " yaw_rad or qw, qx, qy, qz in every row"
+            )
+        if not self.rows:
+            return np.zeros((0, 3, 3))
+        self.require(given[0])
+        if given[0] == ("yaw_rad",):
+            yaw_rad = self.numbers(("yaw_rad",), -MAX_YAW_RAD, MAX_YAW_RAD, " (radians)")
+            return yaw_rotation(yaw_rad[:, 0])
+        quaternion = self.numbers(QUATERNION, -2, 2)
+        norm = np.linalg.norm(quaternion, axis=1)
+        bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
+        if len(bad):
+            raise ValueError(
+                f"{self.path}: quaternion of row {bad[0]} has norm {norm[bad[0]]:g}, expected 1; normalise it"
+            )
+        return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
+
+    def places(self) -> np.ndarray:
+        """(rows, 3) world points."""
+        xy_m = self.numbers(PLACE[:2], -MAX_COORDINATE_M, MAX_COORDINATE_M, " m")
+        return np.hstack([xy_m, self.numbers(PLACE[2:], -MAX_HEIGHT_M, MAX_HEIGHT_M, " m (z up)")])
+
+    def require(self, names: Sequence[str]) -> None:
+        for name in names:
+            if name not in self.columns and self.rows:
+                raise ValueError(f"{self.path}: column {name} is missing or all null; see docs/own_drives.md")
+
+    def _optional(self, name: str) -> list:
+        return self.columns.get(name, [None] * self.rows)
+
+
+def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequence[str]) -> _Table:
+    """FOLDER/NAME.parquet or .json with its columns by name, none of them unknown."""
+    paths = [folder / f"{name}.parquet", folder / f"{name}.json"]
+    found = [path for path in paths if path.is_file()]
+    if not found:
+        empty = "; if there are none, write [] into the .json" if name != "poses" else ""
+        raise ValueError(f"{paths[0]}: missing, and so is {paths[1].name}; see docs/own_drives.md{empty}")
+    if len(found) > 1:
+        raise ValueError(f"{paths[0]}: {paths[1].name} lies beside it; keep one of the two")
+    path = found[0]
+    rows, columns = _load_parquet(path) if path.suffix == ".parquet" else _load_records(path)
+    for column in columns:
+        if column not in known and column != PANDAS_INDEX:
+            meant = difflib.get_close_matches(str(column), known, 1)
+            raise ValueError(
+                f"{path}: column {_show(column)} means nothing here{f' (meant {meant[0]}?)' if meant else ''}; drop"
+                f" it, or rename it to one of {', '.join(known)}"
+            )
+    filled = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    table = _Table(path, rows, filled if rows else {name: [] for name in known})
+    table.require(required)
+    return table
+
+
+def _load_parquet(path: Path) -> tuple[int, dict[str, list]]:
+    try:
+        with pq.ParquetFile(path) as file:
+            table = file.read()
+        table.validate(full=True)
+        columns = [column.to_pylist() for column in table.columns]
+    except (pa.ArrowException, OSError, ValueError, OverflowError, KeyError) as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: broken Parquet file ({reason}); write it again") from error
+    twice = [name for name in table.column_names if table.column_names.count(name) > 1]
+    if twice:
+        raise ValueError(f"{path}: column {_show(twice[0])} is there twice; drop one of them")
+    return len(table), dict(zip(table.column_names, columns, strict=True))
+
+
+def _load_records(path: Path) -> tuple[int, dict[str, list]]:
+    records = _load_json(path)
+    if not isinstance(records, list):
+        raise ValueError(f"{path}: holds a {type(records).__name__}, expected a list of objects, one per row")
+    for row, record in enumerate(records):
+        if not isinstance(record, dict):
+            raise ValueError(f"{path}: row {row} is {_show(record)}, expected an object of columns")
+    names = dict.fromkeys(name for record in records for name in record)
+    return len(records), {name: [record.get(name) for record in records] for name in names}
+
+
+def _load_json(path: Path) -> object:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: broken JSON ({str(error)[:120]}); write it again") from error
+
+
+def _show(value: object) -> str:
+    """The value as an error names it."""
+    if value is None:
+        return "null"
+    # Python refuses to write out an integer of thousands of digits.
+    shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of over 40 digits"
+    return shown if len(shown) <= 40 else f"{shown[:37]}..."
+
+
+# ------------------------------------------------------------------------------------------------------- poses
+
+
+def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """frame (p,) int64, ascending, and world_from_ego (p, 3, 4) float64, x forward, y left, z up, of one drive.
+
+    Raises ValueError, naming file and row, for anything else than poses of an upright vehicle in driving order.
+    """
+    table = _read_table(Path(root, name), "poses", POSE_COLUMNS, ("frame",))
+    if not table.rows:
+        raise ValueError(f"{table.path}: holds no pose; every pose becomes a scene, give at least one")
+    frame = table.frames()
+    late = np.flatnonzero(np.diff(frame) <= 0)
+    if len(late):
+        row = late[0] + 1
+        raise ValueError(
+            f"{table.path}: frame of row {row} is {frame[row]} after {frame[row - 1]}; sort the poses by frame,"
+            " each frame once"
+        )
+    if "world_from_ego" in table.columns:
+        world_from_ego = _matrices(table)
+    else:
+        table.require(PLACE)
+        world_from_ego = np.concatenate([table.rotations(), table.places()[:, :, None]], axis=2)
+    fallen = np.flatnonzero(world_from_ego[:, 2, 2] < MIN_UP)
+    if len(fallen):
+        raise ValueError(
+            f"{table.path}: the z axis of row {fallen[0]} points {_direction(world_from_ego[fallen[0], 2, 2])}; give"
+            " the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other axes)"
+        )
+    return frame, world_from_ego
+
+
+def _direction(up: float) -> str:
+    return "down" if up < -MIN_UP else "sideways"
+
+
+def _matrices(table: _Table) -> np.ndarray:
+    """(rows, 3, 4) of the column world_from_ego: 12 numbers, row-major."""
+    others = [name for name in (*PLACE, "yaw_rad", *QUATERNION) if name in table.columns]
+    if others:
+        raise ValueError(f"{table.path}: has world_from_ego and {others[0]}; give the pose in one way only")
+    for row, matrix in enumerate(table.columns["world_from_ego"]):
+        if type(matrix) is not list or len(matrix) != 12 or not _all_numbers(matrix, MAX_COORDINATE_M):
+            raise ValueError(
+                f"{table.path}: world_from_ego of row {row} is {_show(matrix)}, expected 12 numbers (3 x 4, row by"
+                " row), metres"
+            )
+    world_from_ego = np.array(table.columns["world_from_ego"], np.float64).reshape(-1, 3, 4)
+    rotation = world_from_ego[:, :, :3]
+    skew = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotation) < 0))
+    if len(bad):
+        raise ValueError(
+            f"{table.path}: world_from_ego of row {bad[0]} holds no rotation in its first three columns; write 3 x 4"
+            " matrices row by row, right-handed, not transposed"
+        )
+    high = np.flatnonzero(np.abs(world_from_ego[:, 2, 3]) > MAX_HEIGHT_M)
+    if len(high):
+        raise ValueError(
+            f"{table.path}: z of row {high[0]} is {world_from_ego[high[0], 2, 3]:g} m, expected"
+            f" {-MAX_HEIGHT_M:g}..{MAX_HEIGHT_M:g}; use a world frame with z up"
+        )
+    return world_from_ego
+
+
+def _is_text(value: object) -> bool:
+    """Whether this is a str that files can hold: JSON may escape half a character."""
+    return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
+
+
+def _is_whole(value: object) -> bool:
+    """Whether this is an integer of 0 or more; a float will do, pandas makes them of integers beside a null."""
+    return type(value) in (int, float) and 0 <= value <= MAX_WHOLE and value == value // 1
+
+
+def _all_numbers(values: list, largest: float) -> bool:
+    """Whether these are numbers in [-largest, largest]; NaN and true are not."""
+    return all(type(value) in (int, float) and abs(value) <= largest for value in values)
+
+
+# ------------------------------------------------------------------------------------------------------- boxes
+
+
+def _read_boxes(folder: Path) -> _Table:
+    return _read_table(folder, "boxes", BOX_COLUMNS, ("category", *PLACE, *SIZE))
+
+
+def _boxes(table: _Table) -> dict[str, np.ndarray]:
+    """The per-box arrays of a Drive."""
+    names = table.texts("category", CATEGORIES)
+    category = np.array([CATEGORY_INDEX[name] for name in names], np.int8)
+    rotation = table.rotations()
+    known = [
+        index in HEADED if flag is None else flag
+        for index, flag in zip(category.tolist(), table.flags("heading_known"), strict=True)
+    ]
+    lies_flat = np.abs(rotation[:, 2, 0]) < np.sqrt(0.5)
+    label = table.texts("label", optional=True)
+    return {
+        "category": category,
+        "center_m": table.places(),
+        "rotation": rotation,
+        "size_m": table.numbers(SIZE, MIN_SIZE_M, MAX_SIZE_M, " m"),
+        "heading_rad": np.where(
+            np.array(known, bool) & lies_flat, np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]), np.nan
+        ),
+        "instance_id": _instance_ids(table),
+        "label": np.array([own or name for own, name in zip(label, names, strict=True)], object),
+        "timestamp": table.frames(missing=STATIC),
+    }
+
+
+def _instance_ids(table: _Table) -> np.ndarray:
+    """(rows,) int64: numbers as they are, texts by the first 63 bits of their BLAKE2 hash, -1 where there is none."""
+    ids = []
+    for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
+        if _is_text(value):
+            value = int.from_bytes(hashlib.blake2b(value.encode(), digest_size=8).digest(), "big") >> 1
+        elif value is not None and not _is_whole(value):
+            raise ValueError(
+                f"{table.path}: instance_id of row {row} is {_show(value)}, expected a whole number of 0 or more, a"
+                " text or null"
+            )
+        ids.append(-1 if value is None else int(value))
+    return np.array(ids, np.int64)
+
+
+def _check_in_sight(path: Path, points_m: np.ndarray, world_from_ego: np.ndarray) -> None:
+    """ValueError if the poses are all farther than SIGHT_M from the bounding box of these points (n, 3)."""
+    if len(points_m) == 0:
+        return
+    low, high, position_m = points_m.min(axis=0), points_m.max(axis=0), world_from_ego[:, :, 3]
+    if not ((position_m >= low - SIGHT_M) & (position_m <= high + SIGHT_M)).all(axis=1).any():
+        raise ValueError(
+            f"{path}: all of it lies more than {SIGHT_M:g} m from every pose: x, y, z of {_point(low)}..{_point(high)},"
+            f" the first pose {_point(position_m[0])}; bring all three files into one world frame"
+        )
+
+
+def _point(point_m: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.1f}' for value in point_m)})"
+
+
+# ------------------------------------------------------------------------------------------------------ ground
+
+
+def _read_polygons(folder: Path) -> _Table:
+    table = _read_table(folder, "polygons", POLYGON_COLUMNS, POLYGON_COLUMNS)
+    table.texts("class", GROUND_CLASSES)
+    return table
+
+
+def _ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
+    """Every outline cut into triangles between its own vertices."""
+    of_row = [classes.index(name) for name in table.texts("class", classes)]
+    parts = [_triangles(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
+    return SurfaceGround(
+        triangles_m=np.concatenate([np.zeros((0, 3, 3)), *parts]),
+        triangle_class=np.repeat(np.array(of_row, np.int64), [len(part) for part in parts]),
+    )
+
+
+def _triangles(path: Path, row: int, value: object) -> np.ndarray:
+    """(t, 3, 3) corners of the constrained Delaunay triangulation of one outline, world."""
+    outline_m = _outline(path, row, value)
+    flat = outline_m[:, :2] - outline_m[0, :2]
+    reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
+    if reason != "Valid Geometry":
+        raise ValueError(
+            f"{path}: outline of row {row} is no simple polygon, {reason[:80]} (x y); draw it without crossing or"
+            " touching itself, and cut a polygon with a hole in two"
+        )
+    triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(flat))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]  # each a closed ring
+    vertex = {tuple(point): k for k, point in enumerate(flat.tolist())}
+    return outline_m[[[vertex[tuple(corner)] for corner in triangle] for triangle in corners.tolist()]]
+
+
+def _outline(path: Path, row: int, value: object) -> np.ndarray:
+    """(n, 3) float64, not closed, no point twice in succession."""
+    if type(value) is not list:
+        raise ValueError(f"{path}: outline of row {row} is {_show(value)}, expected a list of points [x, y, z]")
+    for k, point in enumerate(value):
+        if type(point) is not list or len(point) != 3 or not _all_numbers(point, MAX_COORDINATE_M):
+            raise ValueError(
+                f"{path}: point {k} of the outline of row {row} is {_show(point)}, expected [x, y, z] in metres"
+            )
+        if abs(point[2]) > MAX_HEIGHT_M:
+            raise ValueError(
+                f"{path}: point {k} of the outline of row {row} is {point[2]:g} m high, expected"
+                f" {-MAX_HEIGHT_M:g}..{MAX_HEIGHT_M:g}; use a world frame with z up"
+            )
+    outline_m = np.array(value, np.float64).reshape(-1, 3)
+    following = np.roll(outline_m, -1, axis=0)
+    repeated = (outline_m[:, :2] == following[:, :2]).all(axis=1)
+    steps = np.flatnonzero(repeated & (outline_m[:, 2] != following[:, 2]))
+    if len(steps) and len(value) > 1:
+        raise ValueError(
+            f"{path}: point {steps[0]} of the outline of row {row} has the next one right above or below it; a"
+            " surface has one height at a point"
+        )
+    outline_m = outline_m[~repeated]
+    if len(outline_m) < 3:
+        raise ValueError(f"{path}: outline of row {row} has {len(outline_m)} different points, expected 3 or more")
+    return outline_m

@@ -1,0 +1,248 @@
+"""A Drive: everything annotated along one sequence, in the world frame. Every source becomes one, and every Scene
+is cut out of one by the same code (paper, supplement A, Dataset Construction).
+
+numpy only: the town is usable without ray or pyarrow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from models.scene import Grid, Scene, canonical_boxes, yaw_rotation
+from pipelines.geometry.rasterize import fill_polygon, height_map
+
+STATIC = -1
+EXTRUSION_M = 1e-3  # how far a slab's underside may be from a shifted copy of its top
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Gravity-aligned ego pose: position and yaw of the vehicle in the world, z up."""
+
+    xyz_m: np.ndarray  # (3,) float64
+    yaw_rad: float
+
+    def to_ego(self, points_m: np.ndarray) -> np.ndarray:
+        """World points (..., 3) in the ego frame. Subtracts in float64 before anything else."""
+        return (np.asarray(points_m, np.float64) - self.xyz_m) @ yaw_rotation(self.yaw_rad)
+
+    def to_world(self, points_m: np.ndarray) -> np.ndarray:
+        return np.asarray(points_m, np.float64) @ yaw_rotation(self.yaw_rad).T + self.xyz_m
+
+
+@dataclass(frozen=True, eq=False)
+class SlabGround:
+    """Ground as extruded polygons (KITTI-360, the town): closed triangle meshes, one class per slab."""
+
+    slab_class: np.ndarray  # (s,) index into the drive's ground_classes
+    vertices_m: np.ndarray  # (v, 3) float64, world
+    vertex_slab: np.ndarray  # (v,)
+    triangles: np.ndarray  # (t, 3) indices into vertices_m
+    # a triangle's slab is its first vertex's
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SlabGround:
+        """The slabs with a vertex in a rectangle of the world, low_m (2,) to high_m (2,)."""
+        xy = self.vertices_m[:, :2]
+        kept = np.zeros(len(self.slab_class), bool)
+        kept[self.vertex_slab[((xy >= low_m) & (xy <= high_m)).all(axis=1)]] = True
+        vertex, triangle = kept[self.vertex_slab], kept[self.vertex_slab[self.triangles[:, 0]]]
+        return SlabGround(
+            slab_class=self.slab_class[kept],
+            vertices_m=self.vertices_m[vertex],
+            vertex_slab=(np.cumsum(kept) - 1)[self.vertex_slab[vertex]],
+            triangles=(np.cumsum(vertex) - 1)[self.triangles[triangle]],
+        )
+
+    @cached_property
+    def _upper(self) -> tuple[np.ndarray, np.ndarray]:
+        """The triangles without undersides, and the slab of each.
+
+        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
+        """
+        count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
+        place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
+        half = (count // 2)[self.vertex_slab]
+        lower = place >= half
+        down_m = self.vertices_m[lower] - self.vertices_m[np.flatnonzero(lower) - half[lower]]
+        owner = self.vertex_slab[lower]
+        first_m = down_m[np.unique(owner, return_index=True)[1]]
+        same = np.abs(down_m - first_m[np.cumsum(np.diff(owner, prepend=owner[:1]) > 0)]).max(axis=1) < EXTRUSION_M
+        extruded = count % 2 == 0
+        extruded[owner[~same | (down_m[:, 2] >= 0)]] = False
+        slab = self.vertex_slab[self.triangles[:, 0]]
+        upper = ~(lower[self.triangles].all(axis=1) & extruded[slab])
+        return self.triangles[upper], slab[upper]
+
+    def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """height_m and occupied (G, H, W): slab tops seen from above, of slabs with a vertex inside the grid.
+
+        The paper keeps a ground polygon if at least one of its vertices lies in the crop (supplement A).
+        """
+        local = pose.to_ego(self.vertices_m)
+        inside = np.zeros(len(self.slab_class), bool)
+        inside[self.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
+        triangles, slab = self._upper
+        kept = np.flatnonzero(inside[slab])
+        return _heights(height_map(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes))
+
+
+@dataclass(frozen=True, eq=False)
+class MapGround:
+    """Ground as map polygons over a height raster (Argoverse 2)."""
+
+    polygon_class: list[int]
+    polygons_m: list[np.ndarray]  # (n, 2) outlines, world (city frame)
+    raster_m: np.ndarray  # (rows, cols) heights, NaN where unknown
+    raster_from_world: np.ndarray  # (3, 3) similarity: pixel coordinates (column, row) of a world point
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> MapGround:
+        """The polygons that reach into a rectangle of the world, low_m (2,) to high_m (2,); the raster whole."""
+        reach = [(p.max(axis=0) >= low_m).all() and (p.min(axis=0) <= high_m).all() for p in self.polygons_m]
+        return replace(
+            self,
+            polygon_class=[k for k, keep in zip(self.polygon_class, reach, strict=True) if keep],
+            polygons_m=[p for p, keep in zip(self.polygons_m, reach, strict=True) if keep],
+        )
+
+    def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """height_m and occupied (G, H, W): polygon interiors at pixel centres, heights where the raster knows them."""
+        x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
+        world = pose.to_world(np.stack([x, y, np.zeros_like(x)], axis=-1))[..., :2]
+        pixel = world @ self.raster_from_world[:2, :2].T + self.raster_from_world[:2, 2]
+        col, row = np.floor(pixel[..., 0]).astype(np.int64), np.floor(pixel[..., 1]).astype(np.int64)
+        rows, cols = self.raster_m.shape
+        on_map = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        surface = np.full(x.shape, np.nan)
+        surface[on_map] = self.raster_m[row[on_map], col[on_map]]
+        surface -= pose.xyz_m[2]
+        height = np.full((num_classes, *x.shape), -np.inf, np.float32)
+        for index, outline in zip(self.polygon_class, self.polygons_m, strict=True):
+            local = pose.to_ego(np.column_stack([outline, np.zeros(len(outline))]))[:, :2]
+            low, high = local.min(axis=0), local.max(axis=0)
+            if high[0] < grid.back_m or low[0] > grid.front_m or high[1] < grid.right_m or low[1] > grid.left_m:
+                continue
+            covered = fill_polygon(local, grid) & np.isfinite(surface)
+            height[index][covered] = surface[covered]
+        return _heights(height)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceGround:
+    """Ground as triangles of the true surface (own drives), one class each."""
+
+    triangles_m: np.ndarray  # (t, 3, 3) float64 corners, world
+    triangle_class: np.ndarray  # (t,) index into the drive's ground_classes
+
+    def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SurfaceGround:
+        """The triangles that reach into a rectangle of the world, low_m (2,) to high_m (2,)."""
+        xy = self.triangles_m[..., :2]
+        kept = ((xy.max(axis=1) >= low_m) & (xy.min(axis=1) <= high_m)).all(axis=1)
+        return SurfaceGround(self.triangles_m[kept], self.triangle_class[kept])
+
+    def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """height_m and occupied (G, H, W): the surface at pixel centres; where a class lies twice, its upper one.
+
+        Unlike a slab, a polygon counts wherever it covers a pixel, even if none of its vertices lies in the crop:
+        it may be a road of a kilometre.
+        """
+        middle_m = np.array([(grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2, 0.0])
+        center_m, reach_m = pose.to_world(middle_m)[:2], np.hypot(grid.rows, grid.cols) * grid.resolution_m / 2
+        seen = self.near(center_m - reach_m, center_m + reach_m)
+        return _heights(height_map(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes))
+
+
+def _heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """float32 heights, zero where there is none (-inf, which is overwritten), and where there is one."""
+    occupied = height_m > -np.inf
+    height_m[~occupied] = 0.0
+    return height_m.astype(np.float32, copy=False), occupied
+
+
+def _reach_m(grid: Grid) -> float:
+    """Distance from the ego vehicle to the farthest corner of its crop."""
+    return float(np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m))))
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """All primitives, the ground and the poses of one sequence; n boxes, p poses; world frame, z up, float64.
+
+    `rotation` may be any proper rotation: scenes canonicalise it. `heading_rad` is the world yaw of the direction
+    of travel, NaN where unknown. `timestamp` is STATIC or the frame in which a moving box is where it is.
+    """
+
+    source: str
+    sequence: str
+    category: np.ndarray  # (n,) int8
+    center_m: np.ndarray  # (n, 3)
+    rotation: np.ndarray  # (n, 3, 3)
+    size_m: np.ndarray  # (n, 3) full extents along rotation's columns
+    heading_rad: np.ndarray  # (n,)
+    instance_id: np.ndarray  # (n,) int64
+    label: np.ndarray  # (n,) str objects
+    timestamp: np.ndarray  # (n,) int64
+    ground_classes: tuple[str, ...]
+    ground: SlabGround | MapGround | SurfaceGround
+    frame: np.ndarray  # (p,) int64
+    world_from_imu: np.ndarray  # (p, 3, 4), x forward
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def at(self, poses: np.ndarray, grid: Grid | None = None) -> Drive:
+        """The drive with these poses only, and of its content what their crops can hold: scenes are cut faster."""
+        xy = self.world_from_imu[poses, :2, 3]
+        reach_m = _reach_m(grid or Grid())
+        low_m, high_m = xy.min(axis=0) - reach_m, xy.max(axis=0) + reach_m
+        near = ((self.center_m[:, :2] >= low_m) & (self.center_m[:, :2] <= high_m)).all(axis=1)
+        near &= (self.timestamp == STATIC) | np.isin(self.timestamp, self.frame[poses])
+        per_box = ("category", "center_m", "rotation", "size_m", "heading_rad", "instance_id", "label", "timestamp")
+        return replace(
+            self,
+            **{name: getattr(self, name)[near] for name in per_box},
+            ground=self.ground.near(low_m, high_m),
+            frame=self.frame[poses],
+            world_from_imu=self.world_from_imu[poses],
+        )
+
+    def pose(self, index: int) -> Pose:
+        """Position and yaw of pose `index`: differs from the paper, which keeps pitch and roll."""
+        matrix = self.world_from_imu[index]
+        return Pose(matrix[:, 3], float(np.arctan2(matrix[1, 0], matrix[0, 0])))
+
+    def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
+        """The Scene ahead of pose `index`: primitives whose centre lies in the crop, static or of this very frame."""
+        grid = grid or Grid()
+        pose, frame = self.pose(index), int(self.frame[index])
+        near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= _reach_m(grid)
+        near = np.flatnonzero(near & ((self.timestamp == STATIC) | (self.timestamp == frame)))
+        center = pose.to_ego(self.center_m[near])
+        inside = grid.contains(center[:, 0], center[:, 1])
+        near, center = near[inside], center[inside]
+        rotation, size = canonical_boxes(yaw_rotation(-pose.yaw_rad) @ self.rotation[near], self.size_m[near])
+        heading = (self.heading_rad[near] - pose.yaw_rad + np.pi) % (2 * np.pi) - np.pi
+        height, occupied = self.ground.rasterise(pose, grid, len(self.ground_classes))
+        return Scene(
+            scene_id=f"{self.source}-{self.sequence}-{frame:010d}",
+            source=self.source,
+            sequence=self.sequence,
+            frame=frame,
+            split=split,
+            category=self.category[near],
+            center_m=center.astype(np.float32),
+            rotation=rotation.astype(np.float32),
+            size_m=size.astype(np.float32),
+            heading_rad=heading.astype(np.float32),
+            instance_id=self.instance_id[near],
+            label=self.label[near],
+            ground_classes=self.ground_classes,
+            height_m=height,
+            occupied=occupied,
+            grid=grid,
+            world_xyz_m=tuple(float(v) for v in pose.xyz_m),
+            world_yaw_rad=pose.yaw_rad,
+            world_from_imu=self.world_from_imu[index],
+        )

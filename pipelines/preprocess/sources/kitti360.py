@@ -1,0 +1,497 @@
+"""KITTI-360's own files -> Drive: 3D boxes and ground polygons of a sequence (XML), and its poses.
+
+    ROOT/data_3d_bboxes/train_full/2013_05_28_drive_0003_sync.xml
+    ROOT/data_poses/2013_05_28_drive_0003_sync/poses.txt
+
+A sequence is named by its four digits. The world is z up; the IMU's x points forward, y right, z down.
+The XML (over 100 MB for the longest drives) is streamed. One defective object is dropped and reported; a
+file that is broken as a whole is a ValueError.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from defusedxml import ElementTree
+from defusedxml.common import DefusedXmlException
+
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
+from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
+
+SOURCE = "kitti360"
+
+# Label -> category, the paper's Tab. "object categories". Labels are compared by `_plain`: without case,
+# blanks and underscores, so the XML's "trafficSign" and the development kit's "traffic sign" are one.
+CATEGORY_LABELS = {
+    "vegetation_cuboid": ("vegetation",),  # vegetation_ellipsoid if it is a sphere mesh
+    "vehicle_big": ("truck", "bus"),
+    "vehicle_small": ("car", "trailer", "unknownvehicle"),
+    "two_wheelers": ("motorcycle", "bicycle"),
+    "human": ("rider", "pedestrian", "person"),
+    "construction_big": ("building", "garage", "unknownconstruction"),
+    "construction_small": ("wall", "fence", "guardrail", "gate"),
+    "pole": ("smallpole", "bigpole", "pole", "polegroup"),
+    "traffic_control": ("trafficlight", "trafficsign", "lamp"),
+    "object": ("trashbin", "box", "unknownobject"),
+}
+# Traps: the XML says "ground" for terrain, "unknownGround" for ground and "driveway" for parking.
+GROUND_LABELS = {
+    "road": ("road",),
+    "sidewalk": ("sidewalk",),
+    "parking": ("driveway", "parking"),
+    "terrain": ("ground", "terrain"),
+    "ground": ("unknownground",),
+}
+# The first five are dropped by the paper; it says nothing of the others.
+DROPPED_LABELS = (
+    "tunnel",
+    "bridge",
+    "train",
+    "stop",
+    "caravan",
+    "vendingmachine",
+    "railtrack",
+    "sky",
+    "licenseplate",
+)
+
+CATEGORY_OF = {label: CATEGORY_INDEX[name] for name, labels in CATEGORY_LABELS.items() for label in labels}
+GROUND_CLASS_OF = {
+    label: KITTI_GROUND_CLASSES.index(name) for name, labels in GROUND_LABELS.items() for label in labels
+}
+# Local +x is the direction of travel of these.
+HEADED_LABELS = {label for name in ("vehicle_big", "vehicle_small", "two_wheelers") for label in CATEGORY_LABELS[name]}
+HEADED_LABELS |= {"rider"}
+
+SPHERE_VERTICES = 63
+# An object written twice, in two annotation windows that meet, keeps its size to micrometres, but the windows were
+# registered apart: in real data copies are shifted by up to 0.4 m and turned by up to 0.33 degrees. A copy shifted
+# further, or by more than half its size, is a neighbour.
+DUPLICATE_SIZE_M = 1e-3
+DUPLICATE_SHIFT_M = 0.5
+DUPLICATE_TURN_RAD = 0.01
+MAX_COORDINATE_M = 1e5  # the real world frame spans several km
+MAX_SIZE_M = 1e3
+MIN_SIZE_M = 1e-3
+# Of the unit axes: two of them closer than about 40 degrees make no sheared box but a broken one.
+MIN_SINGULAR = 0.5
+
+SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
+
+
+@dataclass(frozen=True)
+class Defect:
+    """An object that could not be read, and why."""
+
+    index: int  # the object's own <index>, -1 if it has none
+    label: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class ReadReport:
+    """What became of the objects of one XML file: boxes + slabs + everything dropped = objects."""
+
+    objects: int
+    boxes: int
+    slabs: int
+    dropped: dict[str, int]  # known labels without a category: label -> count
+    unknown: dict[str, int]  # labels that are in no table: label -> count
+    duplicates: int  # objects written a second time
+    defects: tuple[Defect, ...]
+
+    def summary(self) -> str:
+        """One line for a log."""
+        parts = [f"{self.objects} objects: {self.boxes} boxes, {self.slabs} ground slabs"]
+        parts += [f"{self.duplicates} duplicates dropped"] if self.duplicates else []
+        parts += [f"dropped labels {_counts(self.dropped)}"] if self.dropped else []
+        parts += [f"unknown labels {_counts(self.unknown)}"] if self.unknown else []
+        if self.defects:
+            first = self.defects[0]
+            parts += [f"{len(self.defects)} defective, first object {first.index} ({first.label}): {first.reason}"]
+        return "; ".join(parts)
+
+
+def sequences(root: str | Path) -> list[str]:
+    """The annotated sequences under ROOT, by their four digits.
+
+    Raises ValueError if there is none, or none that has poses: `read_poses` names a single one that has not.
+    """
+    folder = Path(root) / "data_3d_bboxes" / "train_full"
+    names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
+    if not names:
+        raise ValueError(
+            f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that"
+            " holds data_3d_bboxes and data_poses"
+        )
+    if not any(_poses_path(root, name).is_file() for name in names):
+        raise ValueError(
+            f"{_poses_path(root, names[0])}: missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
+            " data_poses.zip here"
+        )
+    return names
+
+
+def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
+    """Everything annotated along one sequence, world frame, float64; and what was dropped on the way.
+
+    `instance_id` is the track number (dynamicSeq) of a moving object, else the object's index in the file;
+    the two count separately. `timestamp` is the frame of a moving box, else STATIC.
+    Raises ValueError, naming the file, for a missing or broken XML or poses file.
+    """
+    frame, world_from_imu = read_poses(root, sequence)
+    boxes, slabs, report = _read_objects(_boxes_path(root, sequence))
+    drive = Drive(
+        source=SOURCE,
+        sequence=sequence,
+        **_stack_boxes(boxes),
+        ground_classes=KITTI_GROUND_CLASSES,
+        ground=_stack_slabs(slabs),
+        frame=frame,
+        world_from_imu=world_from_imu,
+    )
+    return drive, report
+
+
+def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
+    """The boxes and slabs of one XML file in its order, each once, and what was dropped."""
+    boxes: list[_Box] = []
+    slabs: list[_Slab] = []
+    seen: dict[tuple, list[np.ndarray]] = {}
+    dropped, unknown, duplicates, defects = Counter(), Counter(), 0, []
+    for fields in _stream_objects(path):
+        label = _label(fields)
+        plain = _plain(label)
+        if not plain:
+            defects.append(Defect(_index(fields), label, "no label"))
+            continue
+        if plain in DROPPED_LABELS:
+            dropped[label] += 1
+            continue
+        if plain not in CATEGORY_OF and plain not in GROUND_CLASS_OF:
+            unknown[label] += 1
+            continue
+        try:
+            parsed = _parse_slab(fields, plain) if plain in GROUND_CLASS_OF else _parse_box(fields, label)
+        except DefectiveObject as error:
+            defects.append(Defect(_index(fields), label, str(error)))
+            continue
+        if _seen_before(seen, (plain, parsed.timestamp), parsed.vertices_m):
+            duplicates += 1
+        else:
+            (boxes if isinstance(parsed, _Box) else slabs).append(parsed)
+    objects = len(boxes) + len(slabs) + dropped.total() + unknown.total() + duplicates + len(defects)
+    report = ReadReport(objects, len(boxes), len(slabs), dict(dropped), dict(unknown), duplicates, tuple(defects))
+    if objects == 0:
+        raise ValueError(f"{path}: holds no <objectN>; unpack data_3d_bboxes.zip of KITTI-360 again")
+    return boxes, slabs, report
+
+
+# ------------------------------------------------------------------------------------------------------ poses
+
+
+def _boxes_path(root: str | Path, sequence: str) -> Path:
+    return Path(root) / "data_3d_bboxes" / "train_full" / f"2013_05_28_drive_{sequence}_sync.xml"
+
+
+def _poses_path(root: str | Path, sequence: str) -> Path:
+    return Path(root) / "data_poses" / f"2013_05_28_drive_{sequence}_sync" / "poses.txt"
+
+
+def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]:
+    """frame (p,) int64, ascending, and world_from_imu (p, 3, 4) float64, metres.
+
+    Frames in which the car hardly moved are absent from the file.
+    Raises ValueError, naming file and line, for a missing file, a bad line or a matrix that is no pose.
+    """
+    path = _poses_path(root, sequence)
+    text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
+    frame, rows = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) != 13:
+            raise ValueError(f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; is it cut off?")
+        if not words[0].isdecimal() or len(words[0]) > 18:
+            raise ValueError(f"{path}, line {number}: frame {words[0]!r} is not a whole number")
+        row = _floats(words[1:])
+        if row is None or np.abs(row).max() > MAX_COORDINATE_M:
+            raise ValueError(f"{path}, line {number}: {line.strip()[:80]!r} is not a pose; restore the line")
+        if frame and int(words[0]) <= frame[-1]:
+            raise ValueError(f"{path}, line {number}: frame {words[0]} follows frame {frame[-1]}; sort the lines")
+        frame.append(int(words[0]))
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: holds no pose; unpack data_poses.zip of KITTI-360 again")
+    world_from_imu = np.array(rows).reshape(-1, 3, 4)
+    rotation = world_from_imu[:, :, :3]
+    skew = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((skew > 1e-2) | (np.linalg.det(rotation) < 0))
+    if len(bad):
+        raise ValueError(f"{path}: the matrix of frame {frame[bad[0]]} is no rotation; restore the line")
+    if not text.endswith(("\n", "\r")):  # cut off within its last number, that is a wrong pose
+        raise ValueError(f"{path}: line {number} does not end; is the file cut off? Unpack data_poses.zip again")
+    return np.array(frame, np.int64), world_from_imu
+
+
+# -------------------------------------------------------------------------------------------------------- XML
+
+
+def _stream_objects(path: Path) -> Iterator[dict]:
+    """The fields of each <objectN>, tag -> element; what was read before is freed.
+
+    Raises ValueError for a missing or malformed file, and for one with a document type, as entity bombs need.
+    """
+    again = "unpack data_3d_bboxes.zip of KITTI-360 again"
+    try:
+        with open(path, "rb") as file:
+            depth = 0
+            for event, element in ElementTree.iterparse(file, ("start", "end"), forbid_dtd=True):
+                depth += 1 if event == "start" else -1
+                if event == "start" and depth == 1:
+                    root = element
+                    if root.tag != "opencv_storage":
+                        raise ElementTree.ParseError(f"the root is <{root.tag[:40]}>, expected <opencv_storage>")
+                elif event == "end" and depth == 1:
+                    yield {child.tag: child for child in element}
+                    root.clear()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}); {again}") from error
+    except DefusedXmlException as error:
+        raise ValueError(f"{path}: declares a document type or entities, which no real file does; {again}") from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of encodings
+        raise ValueError(f"{path}: broken XML ({error}); {again}") from error
+
+
+class DefectiveObject(ValueError):
+    """One object cannot be read; the message says why."""
+
+
+def _text(fields: dict, tag: str, default: str | None = None) -> str:
+    text = (fields[tag].text or "").strip() if tag in fields else ""
+    if text:
+        return text
+    if default is None:
+        raise DefectiveObject(f"no {tag}")
+    return default
+
+
+def _label(fields: dict) -> str:
+    """The object's label as written, empty if it has none."""
+    return " ".join(_text(fields, "label", " ").split())[:40]
+
+
+def _integer(fields: dict, tag: str) -> int:
+    text = _text(fields, tag)
+    if not re.fullmatch(r"-?\d{1,18}", text):
+        raise DefectiveObject(f"{tag} is {text[:20]!r}, not a whole number")
+    return int(text)
+
+
+def _index(fields: dict) -> int:
+    """The object's own index, -1 if it has none."""
+    try:
+        return _integer(fields, "index")
+    except DefectiveObject:
+        return -1
+
+
+def _floats(words: list[str]) -> np.ndarray | None:
+    """(n,) float64, or None if a word is no finite number."""
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def _matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
+    """(rows, cols) float64 of an OpenCV matrix."""
+    if tag not in fields:
+        raise DefectiveObject(f"no {tag}")
+    parts = {child.tag: child for child in fields[tag]}
+    rows, stated_cols = _integer(parts, "rows"), _integer(parts, "cols")
+    words = _text(parts, "data", " ").split()
+    if stated_cols != cols or rows * cols != len(words):
+        raise DefectiveObject(f"{tag} is {rows} x {stated_cols} with {len(words)} numbers, expected n x {cols}")
+    values = _floats(words)
+    if values is None:
+        raise DefectiveObject(f"{tag} holds something that is not a finite number")
+    return values.reshape(rows, cols)
+
+
+def _vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Local vertices (v, 3), world_from_local (4, 4), world vertices (v, 3) in metres, all float64."""
+    world_from_local = _matrix(fields, "transform", 4)
+    if world_from_local.shape != (4, 4) or np.abs(world_from_local[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise DefectiveObject("transform is not an affine 4 x 4 matrix")
+    vertices = _matrix(fields, "vertices", 3)
+    if len(vertices) < 6:
+        raise DefectiveObject(f"{len(vertices)} vertices are no solid")
+    largest = max(np.abs(world_from_local).max(), np.abs(vertices).max())
+    if largest > MAX_COORDINATE_M:
+        raise DefectiveObject(f"transform or vertices hold {largest:.3g}")
+    vertices_m = vertices @ world_from_local[:3, :3].T + world_from_local[:3, 3]
+    if np.abs(vertices_m).max() > MAX_COORDINATE_M:
+        raise DefectiveObject(f"lies {np.abs(vertices_m).max():.3g} m from the world's origin")
+    return vertices, world_from_local, vertices_m
+
+
+# ------------------------------------------------------------------------------------------------------ boxes
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    category: int
+    label: str
+    center_m: np.ndarray
+    rotation: np.ndarray
+    size_m: np.ndarray
+    heading_rad: float
+    instance_id: int
+    timestamp: int
+    vertices_m: np.ndarray
+
+
+def _parse_box(fields: dict, label: str) -> _Box:
+    vertices, world_from_local, vertices_m = _vertices_and_transform(fields)
+    center_m, rotation, size_m = box_geometry(world_from_local, vertices)
+    category = CATEGORY_OF[_plain(label)]
+    if category == CATEGORY_INDEX["vegetation_cuboid"] and len(vertices) == SPHERE_VERTICES:
+        category = CATEGORY_INDEX["vegetation_ellipsoid"]
+    timestamp = _integer(fields, "timestamp")
+    if timestamp < STATIC:
+        raise DefectiveObject(f"timestamp is {timestamp}, expected a frame or -1")
+    instance_id = _integer(fields, "index" if timestamp == STATIC else "dynamicSeq")
+    lies_flat = np.abs(rotation[2, 0]) < np.sqrt(0.5)
+    headed = _plain(label) in HEADED_LABELS and lies_flat
+    heading_rad = float(np.arctan2(rotation[1, 0], rotation[0, 0])) if headed else np.nan
+    return _Box(category, label, center_m, rotation, size_m, heading_rad, instance_id, timestamp, vertices_m)
+
+
+def box_geometry(world_from_local: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
+
+    world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
+    sphere of radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a
+    sheared one come the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+    Raises DefectiveObject for a box without volume, of absurd size, or with axes too close to one another.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    axes_m = world_from_local[:3, :3] * (high - low)
+    center_m = world_from_local[:3, :3] @ ((low + high) / 2) + world_from_local[:3, 3]
+    size_m = np.linalg.norm(axes_m, axis=0)
+    if size_m.min() < MIN_SIZE_M or size_m.max() > MAX_SIZE_M:
+        raise DefectiveObject(f"size is {' x '.join(f'{s:.3g}' for s in size_m)} m")
+    axes = axes_m / size_m
+    if np.linalg.det(axes) < 0:
+        axes[:, 1] *= -1
+    left, singular, right = np.linalg.svd(axes)
+    if singular.min() < MIN_SINGULAR:
+        raise DefectiveObject(f"sheared flat: smallest singular value of its unit axes is {singular.min():.2g}")
+    return center_m, left @ right, size_m
+
+
+def _stack_boxes(boxes: list[_Box]) -> dict[str, np.ndarray]:
+    """The per-box arrays of a Drive."""
+    n = len(boxes)
+    return {
+        "category": np.array([box.category for box in boxes], np.int8),
+        "center_m": np.array([box.center_m for box in boxes]).reshape(n, 3),
+        "rotation": np.array([box.rotation for box in boxes]).reshape(n, 3, 3),
+        "size_m": np.array([box.size_m for box in boxes]).reshape(n, 3),
+        "heading_rad": np.array([box.heading_rad for box in boxes], np.float64),
+        "instance_id": np.array([box.instance_id for box in boxes], np.int64),
+        "label": np.array([box.label for box in boxes], object),
+        "timestamp": np.array([box.timestamp for box in boxes], np.int64),
+    }
+
+
+# ----------------------------------------------------------------------------------------------------- ground
+
+
+@dataclass(frozen=True, eq=False)
+class _Slab:
+    ground_class: int
+    timestamp: int  # the ground never moves
+    vertices_m: np.ndarray
+    triangles: np.ndarray
+
+
+def _parse_slab(fields: dict, plain: str) -> _Slab:
+    _, _, vertices_m = _vertices_and_transform(fields)
+    extent_m = np.ptp(vertices_m, axis=0).max()
+    if extent_m > MAX_SIZE_M:
+        raise DefectiveObject(f"ground slab of {extent_m:.3g} m")
+    triangles = _matrix(fields, "faces", 3)
+    if len(triangles) == 0:
+        raise DefectiveObject("no faces")
+    if (triangles % 1).any() or triangles.min() < 0 or triangles.max() >= len(vertices_m):
+        raise DefectiveObject(f"faces name vertices other than 0..{len(vertices_m) - 1}")
+    return _Slab(GROUND_CLASS_OF[plain], STATIC, vertices_m, triangles.astype(np.int64))
+
+
+def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
+    """All slabs as one set of meshes."""
+    counts = np.array([len(slab.vertices_m) for slab in slabs], np.int64)
+    first = np.cumsum(counts) - counts
+    no_triangles = np.zeros((0, 3), np.int64)
+    return SlabGround(
+        slab_class=np.array([slab.ground_class for slab in slabs], np.int64),
+        vertices_m=np.concatenate([np.zeros((0, 3)), *[slab.vertices_m for slab in slabs]]),
+        vertex_slab=np.repeat(np.arange(len(slabs)), counts),
+        triangles=np.concatenate([no_triangles, *[s.triangles + f for s, f in zip(slabs, first, strict=True)]]),
+    )
+
+
+# ---------------------------------------------------------------------------------------------- small helpers
+
+
+def _seen_before(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
+    """Whether an object of this key had this shape (v, 3) nearly here; if not, remembers it."""
+    center_m = vertices_m.mean(axis=0)
+    low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
+    for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):
+        if any(_is_copy(other_m, vertices_m) for other_m in seen.get((key, cell), ())):
+            return True
+    seen.setdefault((key, tuple(np.floor(center_m).tolist())), []).append(vertices_m)
+    return False
+
+
+def _is_copy(one_m: np.ndarray, other_m: np.ndarray) -> bool:
+    """Whether two vertex lists (v, 3) are one rigid shape, hardly moved."""
+    if one_m.shape != other_m.shape:
+        return False
+    center_m, other_center_m = one_m.mean(axis=0), other_m.mean(axis=0)
+    shift_m = other_center_m - center_m
+    one_m, other_m = one_m - center_m, other_m - other_center_m
+    radius_m, other_radius_m = np.linalg.norm(one_m, axis=1), np.linalg.norm(other_m, axis=1)
+    turn_m = np.linalg.norm(one_m - other_m, axis=1)
+    return bool(
+        (np.abs(radius_m - other_radius_m) <= DUPLICATE_SIZE_M).all()
+        and (turn_m <= DUPLICATE_TURN_RAD * radius_m + DUPLICATE_SIZE_M).all()
+        and np.linalg.norm(shift_m) <= DUPLICATE_SHIFT_M
+        and shift_m @ shift_m <= np.ptp(one_m @ shift_m) / 2
+    )
+
+
+def _plain(label: str) -> str:
+    return label.replace(" ", "").replace("_", "").lower()
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{label} {count}" for label, count in sorted(counts.items()))
+
+
+def _read_bytes(path: Path, fix: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror}); {fix}") from error

@@ -1,0 +1,295 @@
+"""A seeded procedural town: the built-in source, held to the statistics of KITTI-360 scenes (town_targets).
+
+    drive = town_drive(7)          # one town and one drive through its streets
+    scene = drive.scene(0)         # what lies ahead of the first pose
+
+numpy only. The same seed gives the same town (under one numpy); a change of what comes out raises TOWN_VERSION.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
+from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
+from pipelines.preprocess.sources.town.assets import Site, sizes
+from pipelines.preprocess.sources.town.blocks import furnish
+from pipelines.preprocess.sources.town.districts import DISTRICTS, Mood, random_mood
+from pipelines.preprocess.sources.town.kitti360_writer import write_kitti360
+from pipelines.preprocess.sources.town.land import (
+    SLAB_THICKNESS_M,
+    Frame,
+    Land,
+    Sheet,
+    clip_ears,
+    random_land,
+    subdivided,
+)
+from pipelines.preprocess.sources.town.reference_statistics import TARGETS, measure, sample_of
+from pipelines.preprocess.sources.town.streets import Route, blocks_of, drive_route, lay_streets, pave
+
+__all__ = [
+    "TARGETS",
+    "TEST_SEEDS_START",
+    "TOWN_VERSION",
+    "TRAIN_SEEDS_START",
+    "measure",
+    "sample_of",
+    "take",
+    "town_drive",
+    "town_plan",
+    "write_kitti360",
+]
+
+TOWN_VERSION = 1
+TRAIN_SEEDS_START = 0
+TEST_SEEDS_START = 1_000_000
+MAX_POSES = 256
+SCENES_PER_TOWN = 200  # every town has at least this many poses
+POSE_SPACING_M = 10.0
+IMU_HEIGHT_M = 0.93  # above the true surface of the road, as KITTI-360's
+METRES_PER_FRAME = 0.7
+
+# KITTI-360's own names (its XML spelling) -> our categories; vegetation is told apart by its shape.
+LABEL_CATEGORY = {
+    "vegetation": "vegetation_cuboid",
+    "truck": "vehicle_big",
+    "bus": "vehicle_big",
+    "car": "vehicle_small",
+    "motorcycle": "two_wheelers",
+    "bicycle": "two_wheelers",
+    "pedestrian": "human",
+    "building": "construction_big",
+    "garage": "construction_big",
+    "wall": "construction_small",
+    "fence": "construction_small",
+    "guardrail": "construction_small",
+    "gate": "construction_small",
+    "smallPole": "pole",
+    "bigPole": "pole",
+    "trafficLight": "traffic_control",
+    "trafficSign": "traffic_control",
+    "lamp": "traffic_control",
+    "trashbin": "object",
+    "box": "object",
+}
+
+# A town's main district and the one at its edge, by seed modulo 4: any four towns in a row show all of them.
+TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
+SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
+
+
+def town_drive(seed: int) -> Drive:
+    """One town and one drive of up to MAX_POSES poses through its streets, at least 10 m apart.
+
+    Frames grow along the drive; moving boxes carry the frame they belong to. Which districts a town has follows
+    from seed modulo 4; all else is drawn from a generator seeded by `seed`.
+    """
+    rng = np.random.default_rng([7301, seed])
+    main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
+    land = random_land(rng)
+    columns, rows = (4, 5) if main != "green" else (4, 4)
+    split = 3 if rng.random() < 0.5 else columns - 1
+    spacing_u = [rng.uniform(*SPACING_M[main if i < split else edge]) for i in range(columns)]
+    spacing_v = [rng.uniform(*SPACING_M[main]) for _ in range(rows)]
+    streets, cells = lay_streets(rng, spacing_u, spacing_v, missing=0.12 if main != "green" else 0.2)
+    border = streets.u_m[split]
+
+    sheet = Sheet()
+    pave(streets, sheet)
+    mood_of_town = np.exp(rng.normal(0, [0.04, 0.0, 0.1, 0.1, 0.1, 0.05, 0.08, 0.1, 0.1, 0.1, 0.15, 0.15]))
+    for block in blocks_of(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=48.0):
+        mood = random_mood(rng)
+        mood = Mood(*(np.array(list(vars(mood).values())) * mood_of_town).tolist())
+        furnish(Site(sheet, rng, DISTRICTS[block.kind], mood), block)
+
+    route = drive_route(rng, streets)
+    at = _pose_samples(rng, route, land)
+    frame = np.round(_travelled(route, land)[at] / METRES_PER_FRAME).astype(np.int64)
+    _traffic(sheet, rng, route, at, frame)
+    return Drive(
+        source="town",
+        sequence=f"{seed:05d}",
+        **_boxes(sheet, rng, land),
+        ground_classes=KITTI_GROUND_CLASSES,
+        ground=_ground(sheet, land),
+        frame=frame,
+        world_from_imu=_poses(rng, route, at, land),
+    )
+
+
+def town_plan(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> list[tuple[int, str, int]]:
+    """(town seed, split, scenes taken) of every town, exactly num_train and num_test scenes in all.
+
+    Train and test are different towns. Small requests are spread over several towns too; `take` says which poses of
+    a town are taken. `seed` moves to other towns.
+    """
+    plan = []
+    for split, wanted, start in (("train", num_train, TRAIN_SEEDS_START), ("test", num_test, TEST_SEEDS_START)):
+        if wanted < 0:
+            raise ValueError(f"number of {split} scenes is {wanted}; ask for 0 or more")
+        towns = max(-(-wanted // SCENES_PER_TOWN), min(24, -(-wanted // 6)))
+        towns = -(-towns // len(TOWN_KINDS)) * len(TOWN_KINDS) if wanted >= len(TOWN_KINDS) else wanted
+        share = np.diff(np.linspace(0, wanted, towns + 1).round().astype(int)) if towns else []
+        first = start + seed * 10_000
+        plan += [(first + k, split, int(n)) for k, n in enumerate(share)]
+    return plan
+
+
+def take(num_poses: int, num_scenes: int) -> np.ndarray:
+    """(num_scenes,) indices of the poses taken when fewer scenes than poses are wanted: spread over the drive.
+
+    Raises ValueError if the drive has too few poses.
+    """
+    if num_scenes > num_poses:
+        raise ValueError(f"{num_scenes} scenes wanted of a drive with {num_poses} poses; plan more towns")
+    return ((np.arange(num_scenes) + 0.5) * num_poses / max(1, num_scenes)).astype(np.int64)
+
+
+# ---------------------------------------------------------------- the drive
+
+
+def _travelled(route: Route, land: Land) -> np.ndarray:
+    steps = np.linalg.norm(np.diff(land.xy(route.uv), axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _pose_samples(rng: np.random.Generator, route: Route, land: Land) -> np.ndarray:
+    """Samples of the route at which a pose is kept: each at least POSE_SPACING_M from every other, even on revisits."""
+    xy = land.xy(route.uv)
+    kept: list[int] = []
+    points = np.empty((0, 2))
+    distance, wait = _travelled(route, land), 0.0
+    for k in range(len(xy)):
+        if distance[k] < wait or len(kept) == MAX_POSES:
+            continue
+        if len(kept) and np.square(points - xy[k]).sum(axis=1).min() < (POSE_SPACING_M + 0.05) ** 2:
+            continue
+        kept.append(k)
+        points = np.vstack([points, xy[k]])
+        wait = distance[k] + POSE_SPACING_M + rng.exponential(0.6)
+    return np.array(kept)
+
+
+def _poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -> np.ndarray:
+    """(p, 3, 4) world from IMU: x forward, y right, z down; tilted by about 3 degrees as a car's IMU is."""
+    xy = land.xy(route.uv[at])
+    ahead = land.direction(route.uv[at], route.heading[at])
+    z = land.surface_m(xy) + IMU_HEIGHT_M
+    mount = rng.normal(0, 0.03, 2)
+    climb = (land.grade(xy) * ahead).sum(axis=1)
+    pitch = (mount[0] + 0.01 * rng.standard_normal(len(at))).clip(-0.06, 0.06) - climb
+    roll = (mount[1] + 0.012 * rng.standard_normal(len(at))).clip(-0.06, 0.06)
+    forward = np.column_stack([ahead * np.cos(pitch)[:, None], -np.sin(pitch)])
+    level_right = np.column_stack([ahead[:, 1], -ahead[:, 0], np.zeros(len(at))])
+    level_down = np.cross(forward, level_right)
+    right = level_right * np.cos(roll)[:, None] + level_down * np.sin(roll)[:, None]
+    down = np.cross(forward, right)
+    return np.stack([forward, right, down, np.column_stack([xy, z])], axis=2)
+
+
+def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
+    """Moving boxes: cars ahead and oncoming, a truck or bicycle now and then, people on the sidewalk.
+
+    A track appears at a few successive poses; each of its boxes belongs to that pose's frame.
+    """
+    vehicles = np.array([label in ("car", "truck", "bus") for label in sheet.box_label])
+    parked = np.concatenate(sheet.box_rows)[vehicles, :2]
+    moving: dict[int, list[np.ndarray]] = {}
+    first, track = 0, 0
+    while first < len(at):
+        what = str(rng.choice(["car", "bicycle", "pedestrian", "truck"], p=[0.84, 0.05, 0.08, 0.03]))
+        oncoming = rng.random() < 0.6
+        count = int(rng.integers(1, 3) if oncoming else rng.integers(2, 6))
+        size = sizes(rng, what, 1)[0]
+        ahead = float(rng.uniform(12, 55))
+        for k in range(first, min(first + count, len(at))):
+            sample = at[k] + int(ahead)
+            if 2 < ahead < 62 and sample < len(route.uv):
+                heading, lane = route.heading[sample], route.lane_m[sample]
+                left = np.array([-heading[1], heading[0]])
+                aside = {"pedestrian": -2.4 * lane, "bicycle": -1.2 * lane}.get(what, 2 * lane * oncoming)
+                place = route.uv[sample] + aside * left
+                others = np.vstack([parked, *moving.setdefault(int(frame[k]), [])]) - place
+                if not ((np.abs(others @ heading) < 5.6) & (np.abs(others @ left) < 2.0)).any():
+                    moving[int(frame[k])].append(place[None])
+                    yaw = (np.pi if oncoming else 0.0) + rng.normal(0, 0.02)
+                    here = Frame(tuple(place.tolist()), tuple(heading.tolist()), tuple(left.tolist()))
+                    sheet.boxes(here, what, 0.0, 0.0, size, yaw, timestamp=frame[k], track=track)
+            step = at[min(k + 1, len(at) - 1)] - at[k]
+            ahead -= step * {"pedestrian": 0.85, "bicycle": 0.5}.get(what, 1.8 if oncoming else rng.uniform(-0.2, 0.2))
+        track += 1
+        first += int(rng.geometric(0.5)) - 1 + (rng.random() < 0.5)
+
+
+# ---------------------------------------------------------------- board -> world
+
+
+def _boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
+    """The Drive's arrays of primitives: placed on the surface and turned with the streets."""
+    rows, label = np.concatenate(sheet.box_rows), np.array(sheet.box_label, dtype=object)
+    category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
+    category[rows[:, 8] > 0] = CATEGORY_INDEX["vegetation_ellipsoid"]
+    xy = land.xy(rows[:, :2])
+    along = land.direction(rows[:, :2], rows[:, 2:4])
+    grade = land.grade(xy)
+
+    # Low things follow the slope; tall ones stand upright. A few are tilted, as annotators' boxes are.
+    leans = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle", "wall", "fence", "gate", "guardrail"])
+    leans |= np.isin(category, CATEGORY_INDEX["vegetation_cuboid"])
+    tilt = np.where(leans[:, None], -grade, 0.0)
+    careless = (rng.random(len(label)) < 0.015) & ~np.isin(label, ["building", "garage", "car", "truck", "bus"])
+    tilt[careless] += rng.normal(0, 0.1, (careless.sum(), 2)).clip(-0.24, 0.24)
+    normal = np.column_stack([tilt, np.ones(len(label))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    side = np.cross(normal, np.column_stack([along, np.zeros(len(label))]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    rotation = np.stack([np.cross(side, normal), side, normal], axis=2)
+
+    size = rows[:, 4:7]
+    foot = np.column_stack([xy, land.surface_m(xy) + rows[:, 7]])
+    center = foot + normal * size[:, 2:] / 2
+    directed = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle"])
+    heading = np.where(directed, np.arctan2(along[:, 1], along[:, 0]), np.nan)
+    timestamp, track = rows[:, 9].astype(np.int64), rows[:, 10].astype(np.int64)
+    static = timestamp == STATIC
+    instance = np.where(static, np.arange(len(label)) + 1, track)  # counted apart, as KITTI-360 does
+    return {
+        "category": category,
+        "center_m": center,
+        "rotation": rotation,
+        "size_m": size,
+        "heading_rad": heading,
+        "instance_id": instance.astype(np.int64),
+        "label": label,
+        "timestamp": timestamp,
+    }
+
+
+def _ground(sheet: Sheet, land: Land) -> SlabGround:
+    """Closed slabs: top SLAB_THICKNESS_M / 2 above the surface, n top vertices, then n bottom ones."""
+    outlines = [subdivided(outline) for _, outline in sheet.slabs]
+    xy = land.xy(np.concatenate(outlines))
+    middle = land.surface_m(xy)
+    vertices, owner, triangles, done, written = [], [], [], 0, 0
+    for index, outline in enumerate(outlines):
+        n = len(outline)
+        here = slice(done, done + n)
+        done += n
+        top = np.column_stack([xy[here], middle[here] + SLAB_THICKNESS_M / 2])
+        vertices += [top, top - [0.0, 0.0, SLAB_THICKNESS_M]]
+        owner.append(np.full(2 * n, index))
+        triangles.append(slab_faces(clip_ears(xy[here] - xy[here][0]), n) + written)
+        written += 2 * n
+    slab_class = np.array([KITTI_GROUND_CLASSES.index(name) for name, _ in sheet.slabs])
+    return SlabGround(slab_class, np.concatenate(vertices), np.concatenate(owner), np.concatenate(triangles))
+
+
+def slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
+    """(4 n - 4, 3) faces of a slab in KITTI-360's order: top, bottom, then two per side."""
+    top = np.array(top)
+    ring = np.arange(n - 1)
+    first = np.stack([ring, ring + 1, n + ring], axis=1)
+    second = np.stack([ring + 1, n + ring + 1, n + ring], axis=1)
+    sides = np.stack([first, second], axis=1).reshape(-1, 3)
+    return np.concatenate([top, top + n, sides, [[0, n - 1, n], [n - 1, n, 2 * n - 1]]])

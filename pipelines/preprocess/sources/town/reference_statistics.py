@@ -1,0 +1,134 @@
+"""What a 64 x 64 m scene of KITTI-360 looks like in numbers, and how scenes of ours compare."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from models.scene import CATEGORIES, DENSITIES, VEGETATION, Scene
+from pipelines.schema.density_labels import density, density_thresholds
+
+COUNT_TOLERANCE = 0.20  # relative; absolute COUNT_TOLERANCE_SMALL where the target is under 3
+COUNT_TOLERANCE_SMALL = 0.5
+AREA_TOLERANCE = 0.05
+SIZE_TOLERANCE = 0.15
+
+# Mean count per scene of low / medium / high vegetation density.
+COUNTS = {
+    "vegetation_cuboid": (14, 72, 114),
+    "vegetation_ellipsoid": (12, 71, 109),
+    "vehicle_big": (0, 0, 0),
+    "vehicle_small": (14, 12, 8),
+    "two_wheelers": (0.3, 0.7, 1.5),
+    "human": (0, 0.3, 1),
+    "construction_big": (9, 8, 5),
+    "construction_small": (14, 24, 24),
+    "pole": (5, 8, 8),
+    "traffic_control": (4, 8, 8),
+    "object": (2, 5, 6),
+}
+# Share of the scene's 4096 m2, of low / medium / high.
+AREAS = {
+    "road": (0.19, 0.19, 0.14),
+    "sidewalk": (0.12, 0.11, 0.11),
+    "parking": (0.02, 0.07, 0.05),
+    "terrain": (0.13, 0.31, 0.44),
+    "ground": (0.06, 0.06, 0.03),
+    "none": (0.48, 0.27, 0.24),
+}
+# Median length, width, height over all scenes, metres; buildings and garages apart.
+SIZES_M = {
+    "vegetation_cuboid": (5, 2.2, 2.0),
+    "vegetation_ellipsoid": (5.5, 4.8, 6),
+    "vehicle_big": (8.3, 3.2, 2.8),
+    "vehicle_small": (4.4, 2.0, 1.5),
+    "two_wheelers": (2.0, 0.75, 1.35),
+    "human": (0.9, 0.8, 1.75),
+    "building": (16, 12, 11),
+    "garage": (8, 6.4, 3.4),
+    "construction_small": (3.5, 0.75, 1.5),
+    "pole": (0.65, 0.6, 4),
+    "traffic_control": (1.0, 0.65, 0.8),
+    "object": (1.1, 0.85, 1.25),
+}
+TARGETS = {"counts": COUNTS, "areas": AREAS, "sizes_m": SIZES_M}
+
+
+class Row(NamedTuple):
+    """One line of the comparison: `label` is a vegetation density or "all"."""
+
+    what: str
+    label: str
+    target: float
+    measured: float
+    ok: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What `measure` needs to know of n scenes; `size_m[name]` holds the sizes of all boxes of a SIZES_M name."""
+
+    counts: np.ndarray  # (n, 11) per category
+    vegetation_volume_m3: np.ndarray  # (n,)
+    areas: np.ndarray  # (n, 6) shares, in the order of AREAS
+    size_m: dict[str, np.ndarray]  # (k, 3)
+
+    @property
+    def vegetation_count(self) -> np.ndarray:
+        return self.counts[:, list(VEGETATION)].sum(axis=1)
+
+    def labels(self) -> np.ndarray:
+        """(n,) vegetation density of each scene by the sample's own percentiles."""
+        thresholds = density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
+        return density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
+
+
+def sample_of(scenes: Iterable[Scene]) -> Sample:
+    """The numbers of a stream of scenes; no scene is kept."""
+    counts, volumes, areas, size_of = [], [], [], {name: [np.zeros((0, 3))] for name in SIZES_M}
+    for scene in scenes:
+        counts.append(scene.counts())
+        volumes.append(scene.volume_m3[np.isin(scene.category, VEGETATION)].sum())
+        share = dict(zip(scene.ground_classes, scene.occupied.mean(axis=(1, 2)), strict=True))
+        share["none"] = 1.0 - scene.occupied.any(axis=0).mean()
+        areas.append([share.get(name, 0.0) for name in AREAS])
+        for name in SIZES_M:
+            of_label = name in ("building", "garage")
+            which = scene.label == name if of_label else scene.category == CATEGORIES.index(name)
+            size_of[name].append(scene.size_m[which])
+    size_m = {name: np.concatenate(parts) for name, parts in size_of.items()}
+    return Sample(np.array(counts), np.array(volumes), np.array(areas), size_m)
+
+
+def measure(scenes: Iterable[Scene] | Sample) -> list[Row]:
+    """Measured beside target for every number of TARGETS; labels come from the scenes' own percentiles.
+
+    A category or label that never occurs gives nan and is not ok.
+    """
+    sample = scenes if isinstance(scenes, Sample) else sample_of(scenes)
+    label = sample.labels()
+    rows = []
+    for k, which in enumerate(DENSITIES):
+        here = label == which
+        mean = sample.counts[here].mean(axis=0) if here.any() else np.full(len(CATEGORIES), np.nan)
+        for index, name in enumerate(CATEGORIES):
+            target = float(COUNTS[name][k])
+            tolerance = COUNT_TOLERANCE_SMALL if target < 3 else COUNT_TOLERANCE * target
+            rows.append(_row(f"mean count {name}", which, target, mean[index], tolerance))
+        share = sample.areas[here].mean(axis=0) if here.any() else np.full(len(AREAS), np.nan)
+        for index, name in enumerate(AREAS):
+            rows.append(_row(f"area share {name}", which, AREAS[name][k], share[index], AREA_TOLERANCE))
+    for name, target_size in SIZES_M.items():
+        size = sample.size_m[name]
+        median = np.median(size, axis=0) if len(size) else np.full(3, np.nan)
+        for axis, extent in enumerate(("length", "width", "height")):
+            target = float(target_size[axis])
+            rows.append(_row(f"median {extent} {name}", "all", target, median[axis], SIZE_TOLERANCE * target))
+    return rows
+
+
+def _row(what: str, label: str, target: float, measured: float, tolerance: float) -> Row:
+    return Row(what, label, target, float(measured), bool(abs(measured - target) <= tolerance))

@@ -1,0 +1,1 @@
+"""Pictures of scenes from above and from the street."""

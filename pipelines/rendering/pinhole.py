@@ -1,0 +1,243 @@
+"""What a pinhole camera in a Scene sees: classes, instances, depth. Exact, without a GPU, the same on every call.
+
+In the image plane 1 / depth is linear over a flat triangle, so the kernel that casts vertical rays (rasters.py) casts
+these too, on 1 / depth instead of height. Ellipsoids are met exactly, by the quadratic of each ray. Camera frame as in
+KITTI-360: x right, y down, z ahead; metres. Pixel centres lie at whole numbers (u to the right, v down).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from models.scene import ELLIPSOID, Grid, Scene
+from pipelines.geometry.rasterize import draw, hits, integers_between, ranges
+from pipelines.io.mesh_export import GROUND, Triangles, cuboid_triangles, ground_triangles
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY
+
+NEAR_M = 0.1  # nothing nearer is seen
+CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # of a camera looking along x
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics in pixels. The default is KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
+
+    width: int = 1408
+    height: int = 376
+    fx: float = 552.554261
+    fy: float = 552.554261
+    cx: float = 682.049453
+    cy: float = 238.769549
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same view on another number of pixels."""
+        x, y = width / self.width, height / self.height
+        centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return Lens(width, height, self.fx * x, self.fy * y, *centre)
+
+
+@dataclass(frozen=True, eq=False)
+class StreetCamera:
+    """A lens somewhere in a scene."""
+
+    lens: Lens
+    position_m: np.ndarray  # (3,) scene frame
+    camera_from_scene: np.ndarray  # (3, 3) rotation
+
+    @staticmethod
+    def at(position_m: np.ndarray, yaw_rad: float, pitch_rad: float = 0.0, lens: Lens | None = None) -> StreetCamera:
+        """Level, turned left by yaw from the scene's x axis, then looking up by pitch."""
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        level_from_scene = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+        cos, sin = np.cos(pitch_rad), np.sin(pitch_rad)
+        pitched = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+        rotation = CAMERA_FROM_LEVEL @ pitched @ level_from_scene
+        return StreetCamera(lens or Lens().resized(704, 188), np.asarray(position_m, float), rotation)
+
+    def local(self, points_m: np.ndarray) -> np.ndarray:
+        """Scene points (..., 3) in the camera frame."""
+        return (points_m - self.position_m) @ self.camera_from_scene.T
+
+
+class StreetView(NamedTuple):
+    """(H, W) each."""
+
+    class_id: np.ndarray  # uint8, see palette; EMPTY where nothing is
+    primitive: np.ndarray  # int32, index into the scene; GROUND for ground and for nothing
+    depth_m: np.ndarray  # float32, z in the camera frame; inf where nothing is
+    normal: np.ndarray  # (H, W, 3) float32, outward, scene frame; 0 where nothing is
+
+    @property
+    def semantic(self) -> np.ndarray:
+        """(H, W, 3) uint8: palette colours, white where nothing is."""
+        return CLASS_COLORS[self.class_id]
+
+    def instance(self) -> np.ndarray:
+        """(H, W) uint16: 0 for ground and nothing, else the primitive's number + 1."""
+        return (self.primitive + 1).astype(np.uint16)
+
+
+class StreetRenderer:
+    """Looks at one scene from many places: what does not depend on the camera is made once."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        parts = ground_triangles(scene), cuboid_triangles(scene)
+        self.soup = Triangles(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """(t, 3) float32 unit normals."""
+        a, b, c = np.moveaxis(self.soup.corners_m, 1, 0)
+        normal = np.cross(b - a, c - a)
+        return (normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)).astype(np.float32)
+
+    def view(self, camera: StreetCamera) -> StreetView:
+        """What the camera sees."""
+        shape = camera.lens.height, camera.lens.width
+        nearness, triangle = np.zeros(shape), np.full(shape, -1, np.int64)
+        index, corners = _in_front(camera.local(self.soup.corners_m), camera.lens)
+        pixel, owner, value = hits(_on_image(corners, camera.lens), _pixels(camera.lens), index)
+        draw(pixel, owner, value, nearness.reshape(-1), triangle.reshape(-1))
+
+        flat = triangle >= 0
+        class_id = np.where(flat, self.soup.class_id[triangle], EMPTY).astype(np.uint8)
+        primitive = np.where(flat, self.soup.primitive[triangle], GROUND).astype(np.int32)
+        normal = np.where(flat[..., None], self.normals[triangle], np.float32(0))
+        pixel, ball, value = _ellipsoid_hits(self.scene, camera)
+        over = np.full(shape, GROUND, np.int64)
+        draw(pixel, ball, value, nearness.reshape(-1), over.reshape(-1))
+        row, col = np.nonzero(over != GROUND)
+        class_id[row, col], primitive[row, col] = CATEGORY_IDS[ELLIPSOID], over[row, col]
+        with np.errstate(divide="ignore"):
+            depth_m = 1 / nearness
+        normal[row, col] = self._ball_normals(camera, row, col, depth_m[row, col], over[row, col])
+        return StreetView(class_id, primitive, depth_m.astype(np.float32), normal)
+
+    def _ball_normals(
+        self, camera: StreetCamera, row: np.ndarray, col: np.ndarray, depth_m: np.ndarray, primitive: np.ndarray
+    ) -> np.ndarray:
+        rays = _rays(camera.lens, row, col) * depth_m[:, None]
+        point_m = rays @ camera.camera_from_scene + camera.position_m
+        axes = self.scene.rotation / self.scene.size_m[:, None, :] ** 2
+        gradient = (axes @ self.scene.rotation.transpose(0, 2, 1))[primitive]
+        normal = np.einsum("kij,kj->ki", gradient, point_m - self.scene.center_m[primitive])
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _pixels(lens: Lens) -> Grid:
+    """The image as a grid of rasters.py: x = -v - 1/2, y = -u - 1/2."""
+    return Grid(0.0, 0.0, 1.0, lens.height, lens.width)
+
+
+def _rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """(k, 3) directions in the camera frame of the rays through pixels, with z = 1."""
+    return np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(len(u))], axis=1)
+
+
+def _on_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
+    """Triangles (t, 3, 3) in the camera frame, z > 0, on the grid of `_pixels`; their height is 1 / z."""
+    x, y, z = np.moveaxis(corners, -1, 0)
+    u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
+    return np.stack([-v - 0.5, -u - 0.5, 1 / z], axis=-1)
+
+
+def _in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (t, 3, 3) in the camera frame that may be seen, cut at NEAR_M: their index (k,) and corners (k, 3, 3)."""
+    x, y, z = np.moveaxis(corners, -1, 0)
+    left, right = (0 - 0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx
+    top, bottom = (0 - 0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy
+    beyond = [z < NEAR_M, x < left * z, x > right * z, y < top * z, y > bottom * z]
+    index = np.flatnonzero(~np.any([side.all(axis=1) for side in beyond], axis=0))
+    corners = corners[index]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    faces_us = np.einsum("ki,ki->k", a, np.cross(b, c)) < 0  # counter-clockwise from outside
+    index, corners = index[faces_us], corners[faces_us]
+    behind = (corners[..., 2] < NEAR_M).sum(axis=1)
+    whole = np.flatnonzero(behind == 0)
+    cut_index, cut = _cut(index, corners, behind)
+    return np.concatenate([index[whole], cut_index]), np.concatenate([corners[whole], cut])
+
+
+def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What lies at z >= NEAR_M of the triangles that have 1 or 2 corners nearer: one or two triangles each."""
+    found_index, found = [], []
+    for count in (1, 2):
+        some = np.flatnonzero(behind == count)
+        near = corners[some, :, 2] < NEAR_M
+        odd = np.argmax(near if count == 1 else ~near, axis=1)  # the corner alone on its side goes first
+        turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
+        first, second, third = np.moveaxis(turned, 1, 0)
+        on_second, on_third = (_crossing(first, other) for other in (second, third))
+        if count == 1:
+            found += [np.stack([on_second, second, third], 1), np.stack([on_second, third, on_third], 1)]
+            found_index += [index[some], index[some]]
+        else:
+            found.append(np.stack([first, on_second, on_third], 1))
+            found_index.append(index[some])
+    return np.concatenate(found_index), np.concatenate(found)
+
+
+def _crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(k, 3) where the lines from a to b (k, 3) pass z = NEAR_M."""
+    share = (NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2])
+    return a + share[:, None] * (b - a)
+
+
+def _ellipsoid_hits(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every pixel centre over every ellipsoid ahead: flat pixel index, primitive and 1 / depth (m,).
+
+    A ray t d (d with z = 1) meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0, A = |M d|^2, B = d.M^T M p,
+    C = |M p|^2 - 1. It does where B^2 - A C = d^T K d >= 0: along a row of pixels between the roots of a quadratic.
+    Ellipsoids around the camera or beside it, not wholly ahead, are left out.
+    """
+    lens = camera.lens
+    primitive = np.flatnonzero(scene.category == ELLIPSOID)
+    rotation = camera.camera_from_scene @ scene.rotation[primitive].astype(float)
+    p = camera.local(scene.center_m[primitive].astype(float))
+    reach_z = np.linalg.norm(rotation[:, 2, :] * scene.size_m[primitive] / 2, axis=1)
+    ahead = p[:, 2] - reach_z > NEAR_M
+    primitive, rotation, p = primitive[ahead], rotation[ahead], p[ahead]
+    unit = rotation / (scene.size_m[primitive, None, :] / 2.0)  # M^T
+    square = unit @ unit.transpose(0, 2, 1)
+    b = np.einsum("kij,kj->ki", square, p)
+    c = np.einsum("ki,ki->k", b, p) - 1
+    cone = b[:, :, None] * b[:, None, :] - c[:, None, None] * square  # K
+    # In pixels: d = J (u, v, 1).
+    pixels = np.array([[1 / lens.fx, 0, -lens.cx / lens.fx], [0, 1 / lens.fy, -lens.cy / lens.fy], [0, 0, 1]])
+    k = pixels.T @ cone @ pixels
+    # Rows: where the discriminant in u is positive, a quadratic in v that opens downward.
+    qa = k[:, 0, 1] ** 2 - k[:, 0, 0] * k[:, 1, 1]
+    qb = k[:, 0, 1] * k[:, 0, 2] - k[:, 0, 0] * k[:, 1, 2]
+    qc = k[:, 0, 2] ** 2 - k[:, 0, 0] * k[:, 2, 2]
+    root = np.sqrt(np.maximum(qb**2 - qa * qc, 0))
+    first, count = integers_between((-qb + root) / qa, (-qb - root) / qa, lens.height)
+    row, ball = ranges(first, count), np.repeat(np.arange(len(primitive)), count)
+    half = k[ball, 0, 1] * row + k[ball, 0, 2]
+    rest = k[ball, 1, 1] * row**2 + 2 * k[ball, 1, 2] * row + k[ball, 2, 2]
+    root = np.sqrt(np.maximum(half**2 - k[ball, 0, 0] * rest, 0))
+    ends = np.sort([(-half + root) / k[ball, 0, 0], (-half - root) / k[ball, 0, 0]], axis=0)
+    first, count = integers_between(*ends, lens.width)
+    col, row, ball = ranges(first, count), np.repeat(row, count), np.repeat(ball, count)
+    d = _rays(lens, row, col)
+    of_d = np.einsum("ki,ki->k", b[ball], d)
+    square_d = np.einsum("ki,kij,kj->k", d, square[ball], d)
+    # The nearer root, as C / (B + sqrt): without a difference of large numbers.
+    inverse = (of_d + np.sqrt(np.maximum(of_d**2 - square_d * c[ball], 0))) / c[ball]
+    return row * lens.width + col, primitive[ball], inverse
+
+
+def shaded(view: StreetView) -> np.ndarray:
+    """(H, W, 3) uint8: class colours in soft light, paler with distance, under a pale sky."""
+    sun = np.array([0.35, -0.45, 0.82], np.float32)
+    light = 0.62 + 0.38 * (view.normal @ sun).clip(0)
+    haze = np.exp(-view.depth_m / 120.0)[..., None]
+    rows = np.linspace(0, 1, view.class_id.shape[0], dtype=np.float32)[:, None, None]
+    sky = np.array([188, 210, 232], np.float32) + rows * np.array([50, 34, 18], np.float32)
+    color = view.semantic * light[..., None]
+    picture = np.where(np.isfinite(view.depth_m)[..., None], haze * color + (1 - haze) * 232, sky)
+    return picture.clip(0, 255).astype(np.uint8)

@@ -1,0 +1,133 @@
+"""Street views along the roads of scenes: one Ray task per scene; images, cameras, a contact sheet and a moving picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from PIL import Image
+
+from models.scene import Scene
+from pipelines.geometry.centerlines import drive, road_network
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, StreetView, shaded
+from pipelines.rendering.render import contact_sheet, png
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import numbered, per_row
+from pipelines.schema.palette import CLASS_ID
+from pipelines.schema.run_guard import changed_option
+from pipelines.schema.scene_subset import Selection
+
+DEPTH_PER_M = 256  # of the 16 bits of a depth image, as in KITTI; 0 where nothing is or beyond 255 m
+FRAMES_PER_SECOND = 10
+ON_SHEET = 24
+
+
+@dataclass(frozen=True)
+class StreetRequest:
+    """Where the cameras stand, and where the images go: streets/<run>/<scene_id>/."""
+
+    output: str
+    run: str
+    spacing_m: float
+    height_m: float
+    pitch_deg: float
+    lens: Lens
+    right: float  # of the centreline, as a share of the road's width
+    most: int | None  # frames of a scene
+
+    def directory(self, scene: Scene) -> str:
+        return storage.join(self.output, "streets", self.run, scene.scene_id)
+
+
+def cameras_along(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
+    """Cameras on a way (k, 3) over the ground, each looking along it; the last metres only show the way."""
+    along_m = np.append(0, np.cumsum(np.linalg.norm(np.diff(way_m[:, :2], axis=0), axis=1)))
+    count = int((along_m[-1] - 1e-6) // request.spacing_m) + 1
+    at_m = np.arange(min(count, request.most or count)) * request.spacing_m
+    position_m = np.stack([np.interp(at_m, along_m, way_m[:, axis]) for axis in range(3)], axis=1)
+    ahead = np.gradient(way_m[:, :2], along_m, axis=0)
+    ahead = np.stack([np.interp(at_m, along_m, ahead[:, axis]) for axis in (0, 1)], axis=1)
+    yaw_rad, up_m = np.arctan2(ahead[:, 1], ahead[:, 0]), np.array([0, 0, request.height_m])
+    pitch_rad = np.deg2rad(request.pitch_deg)
+    return [
+        StreetCamera.at(where + up_m, yaw, pitch_rad, request.lens)
+        for where, yaw in zip(position_m, yaw_rad.tolist(), strict=True)
+    ]
+
+
+def camera_json(camera: StreetCamera) -> dict:
+    """Pose of a camera in the scene, and its intrinsics."""
+    scene_from_camera = np.eye(4)
+    scene_from_camera[:3, :3], scene_from_camera[:3, 3] = camera.camera_from_scene.T, camera.position_m
+    return {"scene_from_camera": scene_from_camera.tolist(), **asdict(camera.lens)}
+
+
+def depth_image(view: StreetView) -> np.ndarray:
+    """(H, W) uint16 of DEPTH_PER_M a metre."""
+    depth = np.round(view.depth_m * DEPTH_PER_M)
+    return np.where(depth < 2**16, depth, 0).astype(np.uint16)
+
+
+def moving_picture(frames: list[np.ndarray]) -> bytes:
+    """Frames (H, W, 3) uint8 as an animated WebP, which every browser plays."""
+    content, (first, *rest) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
+    pause_ms = 1000 // FRAMES_PER_SECOND
+    first.save(content, "WEBP", save_all=True, append_images=rest, duration=pause_ms, loop=0, quality=80)
+    return content.getvalue()
+
+
+def write_street(scene: Scene, request: StreetRequest) -> int:
+    """Render the drive through a scene; how many frames. cameras.json is written last."""
+    directory, renderer = request.directory(scene), StreetRenderer(scene)
+    way_m = drive(road_network(scene), right=request.right)
+    cameras = cameras_along(way_m, request) if len(way_m) > 1 else []
+    frames = []
+    for number, camera in enumerate(cameras):
+        view = renderer.view(camera)
+        frames.append(shaded(view))
+        images = {"semantic": view.semantic, "class_id": view.class_id, "instance": view.instance()}
+        images |= {"depth": depth_image(view), "shaded": frames[-1]}
+        for kind, image in images.items():
+            path = storage.join(directory, kind, f"{number:06d}.png")
+            storage.write_whole(path, lambda stream, image=image: stream.write(png(image)))
+    if frames:
+        every = frames[:: -(-len(frames) // ON_SHEET)]
+        files = {"sheet.png": png(contact_sheet(every, columns=3)), "drive.webp": moving_picture(frames)}
+        for name, content in files.items():
+            storage.write_whole(storage.join(directory, name), lambda stream, content=content: stream.write(content))
+    about = {"scene_id": scene.scene_id, "source": scene.source, "depth_per_m": DEPTH_PER_M, "class_ids": CLASS_ID}
+    about["frames"] = [camera_json(camera) for camera in cameras]
+    storage.write_json(about, storage.join(directory, "cameras.json"))
+    return len(frames)
+
+
+def render_streets(
+    request: StreetRequest, selection: Selection, on_scene: Callable[[], None] | None = None
+) -> dict[str, int]:
+    """Street views of the selected scenes; frames by scene id, 0 for a scene without a road. Goes on where it stopped.
+
+    Raises ValueError if the output holds a run with other cameras, or if no scene has a road.
+    """
+    record = storage.join(request.output, "streets", f"{request.run}.json")
+    if said := changed_option(record, asdict(request)):
+        raise ValueError(f"{request.output} holds a run {request.run!r} with {said}; choose another --run or --output")
+    storage.write_json(asdict(request), record)
+    chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
+
+    def write(row: dict) -> dict:
+        shard, position = chosen[row["id"]]
+        (scene,) = shard.scenes([position])
+        done = storage.join(request.directory(scene), "cameras.json")
+        count = len(storage.read_json(done)["frames"]) if storage.exists(done) else write_street(scene, request)
+        return {"scene_id": scene.scene_id, "frames": count}
+
+    frames = {}
+    for row in per_row(numbered(range(len(chosen))), write).iter_rows():
+        frames[row["scene_id"]] = row["frames"]
+        if on_scene:
+            on_scene()
+    if not any(frames.values()):
+        raise ValueError(f"none of the {len(frames)} scenes has a road: street views need the ground class road")
+    return frames

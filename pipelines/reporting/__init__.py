@@ -1,0 +1,1 @@
+"""HTML reports, charts, contact sheets and model cards."""

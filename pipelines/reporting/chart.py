@@ -1,0 +1,170 @@
+"""Line charts as inline SVG: axes, ticks, legend; linear or logarithmic. Colours come from the page's
+style."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from pipelines.reporting.report_style import STYLE
+
+WIDTH, HEIGHT = 640, 360
+LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 46  # margins around the axes
+MAX_POINTS = 600
+NUM_COLORS = 6  # the style's classes series-0 ..
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Named series of (x, y), equally long each. Values that are not finite, or not positive on a logarithmic
+    axis, are left out. A series of 200 points or more is drawn faintly under its running mean."""
+
+    title: str
+    series: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    x_label: str = ""
+    y_label: str = ""
+    log_y: bool = False
+
+
+def chart_svg(chart: Chart) -> str:
+    """The chart as an <svg> element. Raises ValueError if a series has not as many x as y."""
+    series = {name: _drawable(x, y, chart.log_y) for name, (x, y) in chart.series.items()}
+    points = [np.stack(pair) for pair in series.values() if len(pair[0])]
+    head = f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">'
+    if not points:
+        return f'{head}<text class="empty" x="{WIDTH / 2}" y="{HEIGHT / 2}">no data</text></svg>'
+    low, high = np.hstack(points).min(axis=1), np.hstack(points).max(axis=1)
+    x_ticks, y_ticks = ticks(low[0], high[0]), (log_ticks if chart.log_y else ticks)(low[1], high[1])
+    x_axis = _Axis(low[0], high[0], LEFT, WIDTH - RIGHT)
+    y_axis = _Axis(y_ticks[0], y_ticks[-1], HEIGHT - BOTTOM, TOP, chart.log_y)
+    parts = [head, *_grid(x_axis, y_axis, x_ticks, y_ticks), *_labels(chart)]
+    for index, (x, y) in enumerate(series.values()):
+        parts += _lines(x_axis(x), y_axis(y), index % NUM_COLORS)
+    return "".join([*parts, _legend(list(series)), "</svg>"])
+
+
+def standalone_svg(chart: Chart) -> str:
+    """The chart as a file of its own: with its name space and the page's style."""
+    face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
+    head, rest = chart_svg(chart).split(">", 1)
+    space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    return f"{space}><style><![CDATA[{STYLE}{face}]]></style>{rest}"
+
+
+def ticks(low: float, high: float, about: int = 5) -> list[float]:
+    """Round numbers (1, 2 or 5 times a power of ten) from at most `low` to at least `high`."""
+    if high <= low:
+        high = low + max(abs(low), 1.0)
+    raw = (high - low) / about
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= raw * (1 - 1e-9))
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [round(k * step, 12) for k in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Powers of ten around [low, high], with 2s and 5s where they span less than two decades."""
+    first = math.floor(math.log10(low) + 1e-9)
+    last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
+    factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)
+    values = [m * 10.0**k for k in range(first, last + every, every) for m in factors]
+    start = max(i for i, v in enumerate(values) if v <= low * (1 + 1e-9))
+    stop = min(i for i, v in enumerate(values) if v >= high * (1 - 1e-9) and i > start)
+    return values[start : stop + 1]
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Values to pixels."""
+
+    low: float
+    high: float
+    start_px: float
+    end_px: float
+    log: bool = False
+
+    def __call__(self, value: np.ndarray | float) -> np.ndarray:
+        scale = np.log10 if self.log else np.asarray
+        value, low, high = scale(value), scale(self.low), scale(self.high)
+        share = (value - low) / (high - low) if high > low else np.full_like(value, 0.5)
+        return self.start_px + share * (self.end_px - self.start_px)
+
+
+def _drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if x.shape != y.shape:
+        raise ValueError(f"a series has {x.size} x values and {y.size} y values")
+    keep = np.isfinite(x) & np.isfinite(y)
+    if log_y:
+        keep &= y > 0
+    return x[keep], y[keep]
+
+
+def _grid(x_axis: _Axis, y_axis: _Axis, x_ticks: list[float], y_ticks: list[float]) -> list[str]:
+    bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
+    parts = []
+    for value in y_ticks:
+        y = float(y_axis(value))
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text class="tick y" x="{LEFT - 8}" y="{y + 4:.1f}">{number(value)}</text>')
+    for value in x_ticks:
+        if x_axis.low <= value <= x_axis.high:
+            x = float(x_axis(value))
+            parts.append(f'<line class="axis" x1="{x:.1f}" x2="{x:.1f}" y1="{bottom}" y2="{bottom + 5}"/>')
+            parts.append(f'<text class="tick x" x="{x:.1f}" y="{bottom + 19}">{number(value)}</text>')
+    return [*parts, f'<line class="axis" x1="{LEFT}" x2="{right}" y1="{bottom}" y2="{bottom}"/>']
+
+
+def _labels(chart: Chart) -> list[str]:
+    x, y = (LEFT + WIDTH - RIGHT) / 2, (TOP + HEIGHT - BOTTOM) / 2
+    turned = f'transform="rotate(-90 14 {y})"'
+    return [
+        f'<text class="label" x="{x}" y="{HEIGHT - 6}">{escape(chart.x_label)}</text>',
+        f'<text class="label" x="14" y="{y}" {turned}>{escape(chart.y_label)}</text>',
+    ]
+
+
+def _lines(x: np.ndarray, y: np.ndarray, color: int) -> list[str]:
+    if len(x) == 1:
+        return [f'<circle class="series-{color}" cx="{x[0]:.1f}" cy="{y[0]:.1f}" r="3"/>']
+    if len(x) < 200:
+        return [_polyline(x, y, f"series-{color}")]
+    window = len(x) // 40
+    mean = np.convolve(np.pad(y, window // 2, "edge"), np.full(window, 1 / window), "same")
+    mean = mean[window // 2 :][: len(x)]
+    return [_polyline(x, y, f"series-{color} faint"), _polyline(x, mean, f"series-{color}")]
+
+
+def _polyline(x: np.ndarray, y: np.ndarray, style: str) -> str:
+    at = np.unique(np.linspace(0, len(x) - 1, min(len(x), MAX_POINTS)).round().astype(int))
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[at], y[at], strict=True))
+    return f'<polyline class="{style}" points="{points}"/>'
+
+
+def _legend(names: list[str]) -> str:
+    parts = []
+    for index, name in enumerate(names if len(names) > 1 else []):
+        y = TOP + 14 + 18 * index
+        swatch = f'<rect class="series-{index % NUM_COLORS}" x="{WIDTH - RIGHT - 14}" y="{y - 8}" '
+        parts.append(f'{swatch}width="12" height="4" rx="2"/>')
+        parts.append(f'<text class="legend" x="{WIDTH - RIGHT - 20}" y="{y - 2}">{escape(name)}</text>')
+    return "".join(parts)
+
+
+def number(value: float) -> str:
+    """A number as people write it: at most four digits that matter, thousands apart, powers of ten far
+    out."""
+    if not math.isfinite(value):
+        return "–"
+    size = abs(value)
+    if size >= 1e9 or 0 < size < 1e-3:
+        mantissa, exponent = f"{value:.2e}".split("e")
+        mantissa = mantissa.rstrip("0").rstrip(".")
+        return f"{mantissa}e{int(exponent)}"
+    if size >= 1000 or value == int(value):
+        return f"{round(value):,}"
+    return f"{value:.4g}"

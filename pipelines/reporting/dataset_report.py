@@ -1,0 +1,416 @@
+"""A dataset directory as one page: what is in it, how much, how large, where, under which labels, and what was left out.
+
+Everything is computed from the tables with numpy; what only dataset.json knows (slots, thresholds, what the readers
+dropped) is shown where there is one, so that generated directories have a page too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from models.scene import CATEGORIES, DENSITIES, GROUND_CLASSES
+from pipelines.reporting.chart import number
+from pipelines.reporting.contact_sheet import Catalogue
+from pipelines.reporting.dataset_charts import (
+    count_histogram,
+    label_matrix,
+    share_bars,
+    size_ranges,
+    spelled,
+    track_map,
+)
+from pipelines.reporting.report import Figure, KeyFigures, Picture, Pictures, Section, Table, Text, report_html
+from pipelines.runtime import storage
+from pipelines.schema.tables import find_shards
+
+PERCENTILES = (5, 25, 50, 75, 95)
+SHOWN_REASONS, SHOWN_DEFECTS, SHOWN_SEQUENCES = 30, 50, 60
+NBSP = "\u00a0"  # keeps numbers that belong together on one line
+SPLITS = ("train", "test", "unused", "generated")
+
+
+# -------------------------------------------------------------------------------------------------------- facts
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What the page is made of."""
+
+    catalogue: Catalogue
+    grid_area_m2: np.ndarray  # (n,) of each scene
+    sizes_m: dict[str, np.ndarray]  # category -> (k, 3) length, width, height of every primitive
+    labels: Counter  # (category, the dataset's own label) -> primitives
+    rejects: list[dict]  # rows of the rejects table
+    description: dict | None  # dataset.json
+    records: dict[str, dict]  # generated source -> how it was made
+
+    @property
+    def counts(self) -> np.ndarray:
+        """(n, 11) primitives per scene and category."""
+        return np.stack([self.catalogue.column(f"num_{name}") for name in CATEGORIES], axis=1)
+
+    @property
+    def categories(self) -> list[str]:
+        """Those that occur."""
+        return [name for name in CATEGORIES if name in self.sizes_m]
+
+    @property
+    def slots(self) -> dict[str, int]:
+        layout = self.description["layout"] if self.description else {"categories": (), "slots": ()}
+        return dict(zip(layout["categories"], layout["slots"], strict=True))
+
+
+def read_facts(
+    root: str, source: str | None = None, split: str | None = None, on_shard: Callable[[int, int], None] | None = None
+) -> Facts:
+    """Reads every table of a dataset directory once; `on_shard` hears how many shards are done, of how many.
+
+    Raises ValueError if it holds no scenes of this source and split.
+    """
+    catalogue = Catalogue.read(root, source, split)
+    sizes: dict[str, list[np.ndarray]] = {name: [] for name in CATEGORIES}
+    labels: Counter = Counter()
+    areas = []
+    for done, shard in enumerate(catalogue.shards, 1):
+        grid = shard.read("rasters", ["rows", "cols", "resolution_m"])
+        areas.append(grid["rows"].to_numpy() * grid["cols"].to_numpy() * grid["resolution_m"].to_numpy() ** 2)
+        table = shard.read("primitives", ["category", "label", "length_m", "width_m", "height_m"])
+        size = np.stack([table[f"{name}_m"].to_numpy() for name in ("length", "width", "height")], axis=1)
+        category = table["category"].to_numpy()
+        for name in np.unique(category) if len(category) else ():
+            sizes[name].append(size[category == name])
+        for row in table.group_by(["category", "label"]).aggregate([([], "count_all")]).to_pylist():
+            labels[row["category"], row["label"]] += row["count_all"]
+        if on_shard:
+            on_shard(done, len(catalogue.shards))
+    description = storage.join(root, "dataset.json")
+    records = {name: storage.join(root, f"{name}.json") for name in sorted({s.source for s in catalogue.shards})}
+    return Facts(
+        catalogue=catalogue,
+        grid_area_m2=np.concatenate(areas),
+        sizes_m={name: np.concatenate(parts) for name, parts in sizes.items() if parts},
+        labels=labels,
+        rejects=read_rejects(root, source, split),
+        description=storage.read_json(description) if storage.exists(description) else None,
+        records={name: storage.read_json(path) for name, path in records.items() if storage.exists(path)},
+    )
+
+
+def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]:
+    """Rows of the rejects table; none if there is no such table."""
+    if not storage.list_files(storage.join(root, "rejects"), ".parquet"):
+        return []
+    shards = [s for s in find_shards(root, "rejects") if s.source == (source or s.source)]
+    return [row for s in shards if s.split == (split or s.split) for row in s.read("rejects").to_pylist()]
+
+
+# --------------------------------------------------------------------------------------------------------- page
+
+
+class Drawing(NamedTuple):
+    """An <svg> element, and words under it."""
+
+    svg: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Drawings:
+    """A section of drawings: as wide as the page, two side by side, or as many small ones as fit."""
+
+    title: str
+    drawings: Sequence[Drawing]
+    layout: str  # wide, pairs or small
+    note: str = ""
+
+
+def page_html(title: str, sections: Sequence[Section | Drawings], subtitle: str = "") -> str:
+    """`report_html` with drawings among the sections."""
+    plain = [
+        Text(section.title, [section.note, _marker(index)]) if isinstance(section, Drawings) else section
+        for index, section in enumerate(sections)
+    ]
+    html = report_html(title, plain, subtitle)
+    for index, section in enumerate(sections):
+        if isinstance(section, Drawings):
+            html = html.replace(f"<p>{_marker(index)}</p>", _drawings(section))
+    return html
+
+
+def _marker(index: int) -> str:
+    return f"[drawings of section {index}]"
+
+
+def _drawings(section: Drawings) -> str:
+    kind = {"wide": "scroll", "pairs": "charts", "small": "pictures"}[section.layout]
+    captions = [f"<figcaption>{escape(d.caption)}</figcaption>" if d.caption else "" for d in section.drawings]
+    figures = [f"<figure>{d.svg}{caption}</figure>" for d, caption in zip(section.drawings, captions, strict=True)]
+    return f'<div class="{kind}">{"".join(figures)}</div>'
+
+
+def dataset_html(facts: Facts, scenes: Sequence[tuple[Picture, Picture]] = ()) -> str:
+    """The whole page; `scenes` are pairs of pictures to show, oblique and from above."""
+    root = facts.catalogue.root.rstrip("/")
+    sections = [
+        totals(facts),
+        *([scene_pictures(scenes)] if scenes else []),
+        *split_sections(facts),
+        histograms(facts),
+        *size_sections(facts),
+        ground_shares(facts),
+        *label_sections(facts),
+        *reject_sections(facts),
+        *reader_sections(facts),
+        *origin_sections(facts),
+    ]
+    return page_html(root.rsplit("/", 1)[-1], sections, root)
+
+
+def totals(facts: Facts) -> KeyFigures:
+    catalogue, counts = facts.catalogue, facts.counts
+    per_scene = counts.sum(axis=1)
+    low, high = np.percentile(per_scene, [5, 95])
+    sequences = len(set(catalogue.column("sequence")))
+    figures = [
+        Figure(len(catalogue), "scenes", ", ".join(f"{number(n)} {split}" for split, n in by_split(facts).items())),
+        Figure(int(per_scene.sum()), "primitives", f"in {len(facts.categories)} of {len(CATEGORIES)} categories"),
+        Figure(float(round(per_scene.mean(), 1)), "primitives per scene", f"{low:.0f} to {high:.0f} in nine of ten"),
+        Figure(sequences, "sequence" if sequences == 1 else "sequences"),
+    ]
+    if facts.description:
+        figures.append(Figure(sum(facts.slots.values()), "slots of the tensors", f"{len(facts.slots)} categories"))
+        share = len(facts.rejects) / (len(facts.rejects) + len(catalogue))
+        figures.append(Figure(len(facts.rejects), "rejected scenes", f"{100 * share:.1f} % of all poses"))
+    return KeyFigures("In short", figures)
+
+
+def by_split(facts: Facts) -> dict[str, int]:
+    """Scenes per split, in the order of SPLITS."""
+    found = Counter(facts.catalogue.column("split"))
+    return {name: found[name] for name in sorted(found, key=lambda s: (SPLITS.index(s) if s in SPLITS else 9, s))}
+
+
+def scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
+    """Rows of oblique pictures, each over a row of the same scenes from above."""
+    columns, pictures = min(len(scenes), 4), []
+    for start in range(0, len(scenes), columns):
+        row = scenes[start : start + columns]
+        pictures += [oblique for oblique, _ in row] + [above for _, above in row]
+    note = "From behind, and below it the same scene from above, forward is up."
+    return Pictures("A few scenes", pictures, columns=columns, note=note)
+
+
+def split_sections(facts: Facts) -> list[Section | Drawings]:
+    """How many scenes lie where; the map only where poses are known."""
+    catalogue = facts.catalogue
+    source, split, sequence = (catalogue.column(name) for name in ("source", "split", "sequence"))
+    per_scene, rows = catalogue.column("num_primitives"), []
+    for key in sorted(
+        set(zip(source, split, strict=True)), key=lambda k: (k[0], SPLITS.index(k[1]) if k[1] in SPLITS else 9)
+    ):
+        chosen = (source == key[0]) & (split == key[1])
+        rows.append(
+            (
+                *key,
+                int(chosen.sum()),
+                f"{100 * chosen.mean():.1f}{NBSP}%",
+                len(set(sequence[chosen])),
+                per_scene[chosen].mean(),
+            )
+        )
+    columns = ("source", "split", "scenes", "share", "sequences", "primitives per scene")
+    sections: list[Section | Drawings] = [Table("Splits", columns, rows)]
+    position_m = np.stack([catalogue.column("x_m"), catalogue.column("y_m")], axis=1)
+    if (np.ptp(position_m, axis=0) == 0).all():
+        return sections
+    tracks = {
+        name: {
+            part: position_m[(sequence == name) & (split == part)]
+            for part in SPLITS
+            if ((sequence == name) & (split == part)).any()
+        }
+        for name in sorted(set(sequence))
+    }
+    note = (
+        "A dot per scene at the pose it was cut at, world x to the right and y up. Every sequence is drawn at the same "
+        "scale; where sequences lie to one another is not shown."
+    )
+    return [*sections, Drawings("Split map", [Drawing(track_map(tracks))], "wide", note)]
+
+
+def histograms(facts: Facts) -> Drawings:
+    """Scenes by count, per category, with the slots of dataset.json and the 95th percentile they come from."""
+    training, drawings = facts.catalogue.column("split") == "train", []
+    for k, name in enumerate(CATEGORIES):
+        counts = facts.counts[:, k]
+        marks, words = {}, [f"mean {counts.mean():.1f}"]
+        if (counts == 0).any():
+            words.append(f"none in {100 * (counts == 0).mean():.0f} %")
+        if name in facts.slots and training.any():
+            marks["p95"] = float(np.ceil(np.percentile(counts[training], 95)).clip(1))
+            marks["slots"] = float(facts.slots[name])
+            words.append(f"over slots {100 * (counts[training] > facts.slots[name]).mean():.1f} %")
+        if name in facts.categories or name in facts.slots:
+            drawings.append(
+                Drawing(count_histogram(name, counts, marks), " · ".join(part.replace(" ", NBSP) for part in words))
+            )
+    note = "How many scenes (upwards) have how many primitives of a category (to the right)."
+    if facts.description:
+        note += (
+            " p95 is the 95th percentile of the training split; a tensor holds as many primitives of a category as it "
+            "has slots, the nearest first. Over slots: the share of training scenes that have more."
+        )
+    return Drawings("Primitives per scene", drawings, "small", note)
+
+
+def size_sections(facts: Facts) -> list[Section | Drawings]:
+    """Ranges of length, width and height per category, as a drawing and in numbers."""
+    percentiles = {name: np.percentile(facts.sizes_m[name], PERCENTILES, axis=0) for name in facts.categories}
+    if not percentiles:
+        return [Text("Sizes", ["There is not one primitive."])]
+    note = (
+        "Length is the longer side of the footprint. Thin lines reach from the 5th to the 95th percentile, thick ones "
+        "from the 25th to the 75th, the dot is the median. Of all splits."
+    )
+    rows = []
+    for name, values in percentiles.items():
+        spans = [f"{NBSP}·{NBSP}".join(map(_metres, column)) for column in values[[0, 2, 4]].T]
+        total = len(facts.sizes_m[name])
+        labels = sorted(((n, label) for (c, label), n in facts.labels.items() if c == name), reverse=True)
+        text = (
+            ", ".join(f"{label} {number(n)}" for n, label in labels) if [label for _, label in labels] != [name] else ""
+        )
+        rows.append((spelled(name).replace(" ", NBSP), total, round(total / len(facts.catalogue), 2), *spans, text))
+    columns = ("category", "primitives", "per scene", "length, m", "width, m", "height, m", "the dataset's own labels")
+    return [
+        Drawings("Sizes", [Drawing(size_ranges(percentiles))], "wide", note),
+        Table("Categories", columns, rows, note="Sizes: 5th percentile · median · 95th percentile."),
+    ]
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+
+
+def ground_shares(facts: Facts) -> Drawings:
+    """Mean share of the grid per ground class and density label."""
+    drawings = []
+    for group in ("vegetation", "vehicle"):
+        labels = facts.catalogue.column(f"{group}_density")
+        shares: dict[str, dict[str, float]] = {}
+        for name in GROUND_CLASSES:
+            share = facts.catalogue.column(f"{name}_area_m2").astype(float) / facts.grid_area_m2
+            chosen = {label: (labels == label) & np.isfinite(share) for label in (*DENSITIES, None)}
+            shares[name] = {label or "no label": share[rows].mean() for label, rows in chosen.items() if rows.any()}
+        drawings.append(Drawing(share_bars(f"by {group} density", {n: by for n, by in shares.items() if by})))
+    note = "Mean share of a scene's area that each ground class covers. Classes may overlap, and some of the area has none."
+    return Drawings("Ground", drawings, "pairs", note)
+
+
+def label_sections(facts: Facts) -> list[Section | Drawings]:
+    """Label pairs per split, and the thresholds behind them."""
+    columns = [facts.catalogue.column(f"{group}_density") for group in ("vegetation", "vehicle")]
+    names = [[*DENSITIES, *([None] if None in set(values) else [])] for values in columns]
+    split, drawings = facts.catalogue.column("split"), []
+    for part, total in by_split(facts).items():
+        pairs = Counter(zip(*(values[split == part] for values in columns), strict=True))
+        counts = np.array([[pairs[row, column] for column in names[1]] for row in names[0]])
+        drawings.append(Drawing(label_matrix(f"{part}, {number(total)} scenes", counts, *_named(names))))
+    note = "Scenes per pair of labels. low: count and volume both below their p25; high: both above their p75; else medium."
+    if not facts.description:
+        return [Drawings("Labels", drawings, "small", "Scenes per pair of labels: what was asked for.")]
+    found = {group: facts.description[f"{group}_thresholds"] for group in ("vegetation", "vehicle")}
+    keys = list(found["vegetation"])
+    heads = ("label", *(key.replace("_m3", ", m³").replace("_", " ") for key in keys))
+    rows = [(group, *(values[key] for key in keys)) for group, values in found.items()]
+    return [
+        Drawings("Labels", drawings, "small", note),
+        Table("Label thresholds", heads, rows, note="Of the training split."),
+    ]
+
+
+def _named(names: Sequence[Sequence[str | None]]) -> tuple[list[str], list[str]]:
+    first, second = ([label or "none" for label in labels] for labels in names)
+    return first, second
+
+
+def reject_sections(facts: Facts) -> list[Section]:
+    """Why scenes were left out."""
+    if not facts.rejects:
+        return [Text("Rejected scenes", ["Every pose became a scene."])] if facts.description else []
+    reasons: dict[str, list[dict]] = {}
+    for row in facts.rejects:
+        reasons.setdefault(row["reason"], []).append(row)
+    ordered = sorted(reasons.items(), key=lambda item: -len(item[1]))
+    rows = [
+        (len(found), reason, len({row["sequence"] for row in found}), found[0]["scene_id"])
+        for reason, found in ordered[:SHOWN_REASONS]
+    ]
+    more = f"The {SHOWN_REASONS} most frequent of {len(ordered)} reasons." if len(ordered) > SHOWN_REASONS else ""
+    return [Table("Rejected scenes", ("scenes", "reason", "sequences", "for example"), rows, note=more)]
+
+
+def reader_sections(facts: Facts) -> list[Section]:
+    """What the readers of raw drives dropped, per sequence: numbers, labels without a category, defective objects."""
+    reports: Mapping[str, Mapping] = (facts.description or {}).get("reports") or {}
+    if not reports:
+        return []
+    names = list(dict.fromkeys(name for report in reports.values() for name in report))
+
+    def amount(value: object) -> int | None:
+        if isinstance(value, Mapping):
+            return sum(value.values())
+        return len(value) if isinstance(value, list) else value
+
+    per_sequence = {s: {name: amount(report.get(name)) for name in names} for s, report in sorted(reports.items())}
+    rows = [(sequence, *found.values()) for sequence, found in list(per_sequence.items())[:SHOWN_SEQUENCES]]
+    if len(per_sequence) > 1:
+        rows.insert(0, ("all", *(sum(found[name] or 0 for found in per_sequence.values()) for name in names)))
+    sections: list[Section] = [
+        Table(
+            "What the readers found",
+            ("sequence", *map(spelled, names)),
+            rows,
+            note="Objects in the raw files by what became of them. dropped: known labels of no category; unknown: "
+            "labels in no table; duplicates: objects written a second time; defects: objects that cannot be read.",
+        )
+    ]
+    labels: Counter = Counter()
+    for report in reports.values():
+        for name, value in report.items():
+            if isinstance(value, Mapping):
+                labels.update({(name, label): count for label, count in value.items()})
+    if labels:
+        rows = [(label, name, count) for (name, label), count in labels.most_common()]
+        sections.append(Table("Labels left out", ("label", "why", "objects"), rows))
+    defects = [
+        (s, d) for s, report in sorted(reports.items()) for v in report.values() if isinstance(v, list) for d in v
+    ]
+    if defects:
+        columns = list(defects[0][1])
+        rows = [(sequence, *(defect.get(name) for name in columns)) for sequence, defect in defects[:SHOWN_DEFECTS]]
+        note = f"The first {SHOWN_DEFECTS} of {len(defects)}." if len(defects) > SHOWN_DEFECTS else ""
+        sections.append(Table("Defective objects", ("sequence", *columns), rows, note=note))
+    return sections
+
+
+def origin_sections(facts: Facts) -> list[Section]:
+    """The options each part was made with."""
+    made = {facts.description["source"]: facts.description["options"]} if facts.description else {}
+    sections: list[Section] = []
+    for source, options in (made | facts.records).items():
+        rows = [(name, _plain(value)) for name, value in options.items()]
+        sections.append(Table(f"How {source} was made", ("option", "value"), rows))
+    return sections
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_plain(part)}" for name, part in value.items())
+    return ", ".join(map(_plain, value)) if isinstance(value, list) else "–" if value is None else str(value)

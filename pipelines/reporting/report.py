@@ -1,0 +1,214 @@
+"""A run as one self-contained HTML page: text, key figures, pictures, charts and tables.
+
+No script and nothing fetched: style, charts and pictures are inside, so the file can be mailed, archived and
+opened anywhere. Everything that comes from outside is escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+from uuid import uuid4
+
+import numpy as np
+from PIL import Image
+
+from pipelines.reporting.chart import Chart, chart_svg, number
+from pipelines.reporting.report_style import STYLE
+
+Cell = str | int | float | bool | None
+
+
+@dataclass(frozen=True)
+class Text:
+    """Paragraphs of plain text."""
+
+    title: str
+    paragraphs: Sequence[str]
+
+
+class Figure(NamedTuple):
+    """One large number with what it is, and a remark."""
+
+    value: Cell
+    label: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class KeyFigures:
+    """A row of large numbers."""
+
+    title: str
+    figures: Sequence[Figure]
+
+
+class Picture(NamedTuple):
+    """image (H, W, 3) uint8; `tag` is a short word on the picture, such as "real" or "generated"."""
+
+    caption: str
+    image: np.ndarray
+    tag: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """A grid of pictures: `columns` of them side by side (fewer on a narrow screen), or as many as fit."""
+
+    title: str
+    pictures: Sequence[Picture]
+    columns: int | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Charts:
+    """Line charts side by side."""
+
+    title: str
+    charts: Sequence[Chart]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under column names; `meanings`, one per row, say in words what the row's numbers mean.
+
+    Numbers are written short and set to the right, booleans as a tick or a cross, None as a dash.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    meanings: Sequence[str] = ()
+    note: str = ""
+
+
+Section = Text | KeyFigures | Pictures | Charts | Table
+
+
+def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
+    """Writes `report_html` to a temporary name beside `path` and moves it into place."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
+    temporary.write_text(report_html(title, sections, subtitle), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
+    """The whole page. Raises ValueError if a table's rows, or its meanings, do not fit its columns."""
+    anchors = [f"{index}-{re.sub('[^a-z0-9]+', '-', s.title.lower())}" for index, s in enumerate(sections, 1)]
+    links = [f'<a href="#{a}">{escape(s.title)}</a>' for a, s in zip(anchors, sections, strict=True)]
+    bodies = [
+        f'<section id="{anchor}"><h2>{escape(section.title)}</h2>{_body(section)}</section>'
+        for anchor, section in zip(anchors, sections, strict=True)
+    ]
+    return "\n".join(
+        [
+            '<!doctype html><html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
+            f"<header><h1>{escape(title)}</h1>{_paragraph(subtitle)}<nav>{''.join(links)}</nav></header>",
+            "<main>",
+            *bodies,
+            "</main></body></html>",
+        ]
+    )
+
+
+def _body(section: Section) -> str:
+    match section:
+        case Text():
+            return "".join(map(_paragraph, section.paragraphs))
+        case KeyFigures():
+            return f'<div class="figures">{"".join(map(_figure, section.figures))}</div>'
+        case Pictures():
+            return _paragraph(section.note) + _pictures(section)
+        case Charts():
+            return f'{_paragraph(section.note)}<div class="charts">{"".join(map(_chart, section.charts))}</div>'
+        case Table():
+            return _paragraph(section.note) + _table(section)
+    raise ValueError(f"not a section of a report: {section!r}")
+
+
+def _paragraph(text: str) -> str:
+    return f"<p>{escape(text)}</p>" if text else ""
+
+
+def _figure(figure: Figure) -> str:
+    note = f"<small>{escape(figure.note)}</small>" if figure.note else ""
+    return f"<div><strong>{written(figure.value)}</strong><span>{escape(figure.label)}</span>{note}</div>"
+
+
+def _pictures(section: Pictures) -> str:
+    style = f' style="--columns: {section.columns}"' if section.columns else ""
+    kind = "pictures fixed" if section.columns else "pictures"
+    return f'<div class="{kind}"{style}>{"".join(map(_picture, section.pictures))}</div>'
+
+
+def _picture(picture: Picture) -> str:
+    rows, cols = picture.image.shape[:2]
+    size = f'width="{cols}" height="{rows}" loading="lazy"'
+    tag = f'<span class="tag">{escape(picture.tag)}</span>' if picture.tag else ""
+    image = f'<img src="{data_uri(picture.image)}" {size} alt="{escape(picture.caption)}">'
+    return f"<figure>{tag}{image}<figcaption>{escape(picture.caption)}</figcaption></figure>"
+
+
+def data_uri(image: np.ndarray) -> str:
+    """(H, W, 3) uint8 as a data URI: exact PNG for up to 256 colours, WebP for pictures with shading."""
+    picture, file = Image.fromarray(image), io.BytesIO()
+    flat = picture.getcolors(256) is not None
+    if flat:
+        picture.save(file, "PNG", optimize=True)
+    else:
+        picture.save(file, "WEBP", quality=90, method=4)
+    kind = "png" if flat else "webp"
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _chart(chart: Chart) -> str:
+    return f"<figure>{chart_svg(chart)}<figcaption>{escape(chart.title)}</figcaption></figure>"
+
+
+def _table(table: Table) -> str:
+    meanings = table.meanings or [None] * len(table.rows)
+    if len(meanings) != len(table.rows):
+        raise ValueError(f"table {table.title!r} has {len(table.rows)} rows and {len(meanings)} meanings")
+    rows = []
+    for row, meaning in zip(table.rows, meanings, strict=True):
+        if len(row) != len(table.columns):
+            raise ValueError(f"table {table.title!r} has {len(table.columns)} columns, a row has {len(row)} cells")
+        last = "" if meaning is None else f'<td class="meaning">{escape(meaning)}</td>'
+        rows.append(f"<tr>{''.join(map(_cell, row))}{last}</tr>")
+    numeric = [all(not isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
+    head = "".join(map(_head, table.columns, numeric)) + ("<th>what it means</th>" if table.meanings else "")
+    body = f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    return f'<div class="scroll"><table>{body}</table></div>'
+
+
+def _head(name: str, numeric: bool) -> str:
+    return f'<th class="number">{escape(name)}</th>' if numeric else f"<th>{escape(name)}</th>"
+
+
+def _cell(value: Cell) -> str:
+    if isinstance(value, str):
+        return f"<td>{escape(value)}</td>"
+    if isinstance(value, bool | np.bool):
+        return f'<td class="number {"yes" if value else "no"}">{written(value)}</td>'
+    return f'<td class="number">{written(value)}</td>'
+
+
+def written(value: Cell) -> str:
+    """A cell as people read it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool):
+        return "✓" if value else "✗"
+    return escape(value) if isinstance(value, str) else number(value)

@@ -1,0 +1,1 @@
+"""Storage, provenance and Ray task helpers."""

@@ -1,0 +1,59 @@
+"""Where a result comes from: the command, the commit and the machine, in words. No host names, no paths of this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).parents[2]
+
+
+def machine() -> str:
+    """Processor, cores, memory and GPUs, as in "AMD EPYC, 2 cores, 24 GiB"."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.machine())
+    memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    return ", ".join([processor, f"{os.cpu_count()} cores", f"{memory_gib:.0f} GiB", *gpus])
+
+
+def commit() -> str:
+    """The commit of this code, with a + if files have changed since; "unknown" outside a git checkout."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", "-C", ROOT, *arguments], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def command() -> str:
+    """What was typed; of paths under $PRITTI_HOME or this checkout what comes after, of other absolute ones the last part."""
+    roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
+
+    def public(word: str) -> str:
+        option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        path = Path(value)
+        if not path.is_absolute():
+            return word
+        for root, name in roots:
+            if path.is_relative_to(root):
+                return option + equals + os.path.normpath(Path(name, path.relative_to(root)))
+        return option + equals + f".../{path.name}"
+
+    return " ".join(word if "$PRITTI_HOME" in word else shlex.quote(word) for word in map(public, sys.argv))
+
+
+def versions() -> str:
+    return f"Python {platform.python_version()}, torch {torch.__version__}"

@@ -1,0 +1,1 @@
+"""The Parquet schema, dataset metadata, splits, labels and selections of scenes."""

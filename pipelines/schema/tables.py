@@ -1,0 +1,427 @@
+"""Scenes <-> Parquet tables: the project's one schema, for real and generated scenes alike.
+
+Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
+hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
+same order, so a reader never joins. Units are in the names, and every file says itself what its columns mean:
+docs/tables.md, for people who never read this.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from models.geometry.cholesky import cholesky_parameters
+from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
+from pipelines.runtime import storage
+
+TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
+SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
+HEIGHT_STEP_M = 0.01
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # what 16 bits hold
+
+# What the categories and ground classes hold, for people who look at columns and not at code.
+# fmt: off
+CATEGORY_MEANING = {
+    "vegetation_cuboid":    "trees, bushes and hedges annotated as boxes",
+    "vegetation_ellipsoid": "trees and bushes annotated as ellipsoids",
+    "vehicle_big":          "trucks, buses and trams",
+    "vehicle_small":        "cars and trailers",
+    "two_wheelers":         "bicycles and motorcycles",
+    "human":                "pedestrians and riders",
+    "construction_big":     "buildings and garages",
+    "construction_small":   "walls, fences, guard rails and gates",
+    "pole":                 "poles and bollards",
+    "traffic_control":      "traffic lights, traffic signs and street lamps",
+    "object":               "bins, boxes, cones and other things",
+}
+GROUND_MEANING = {
+    "road":     "carriageway, or drivable area (av2)",
+    "sidewalk": "sidewalks",
+    "parking":  "parking areas and driveways",
+    "terrain":  "grass, soil and the like",
+    "ground":   "ground of any other kind",
+    "crossing": "pedestrian crossings, lying on the road",
+}
+# fmt: on
+
+
+def _schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
+    """A schema that explains itself, from rows of (name, type, unit, description); unit "" where none applies.
+
+    Every field carries `unit` and `description`. DuckDB does not show those, so the same rows stand once more, as
+    JSON, among the table's own key-values, under `pritti_columns`.
+    """
+    fields, rows = [], []
+    for name, kind, unit, meaning in columns:
+        fields.append(pa.field(name, kind, metadata={"description": meaning} | ({"unit": unit} if unit else {})))
+        rows.append({"name": name, "unit": unit or None, "description": meaning})
+    metadata = {
+        "pritti_schema_version": SCHEMA_VERSION,
+        "pritti_description": description,
+        "pritti_columns": json.dumps(rows, ensure_ascii=False),
+    }
+    return pa.schema(fields, metadata)
+
+
+# fmt: off
+_FRAME = "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles counter-clockwise from x, seen from above."
+_SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
+_SEQUENCE = ("sequence", pa.string(), "", "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
+
+SCENES = _schema(
+    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and totals. " + _FRAME,
+    _SCENE_ID,
+    _SEQUENCE,
+    ("frame",                pa.int64(),   "1; av2: ns", "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
+    ("x_m",                  pa.float64(), "m",   "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
+    ("y_m",                  pa.float64(), "m",   "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
+    ("z_m",                  pa.float64(), "m",   "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
+    ("yaw_rad",              pa.float64(), "rad", "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
+    # A variable list: Parquet has no null of a fixed size.
+    ("world_from_imu",       pa.list_(pa.float64()), "1; m", "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
+    ("vegetation_density",   pa.string(),  "",    "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing was."),
+    ("vehicle_density",      pa.string(),  "",    "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
+    ("vegetation_volume_m3", pa.float64(), "m3",  "Sum of the volumes of all vegetation primitives; overlaps count twice."),
+    ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all vehicles, big and small."),
+    ("num_primitives",       pa.int32(),   "1",   "Number of primitives of all categories."),
+    *[(f"num_{name}",        pa.int32(),   "1",   f"Number of {name} primitives: {CATEGORY_MEANING[name]}.") for name in CATEGORIES],
+    *[(f"{name}_area_m2",    pa.float64(), "m2",  f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.") for name in GROUND_CLASSES],
+    ("primitive_offset",     pa.int64(),   "1",   "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
+)
+
+PRIMITIVES = _schema(
+    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen from several poses has a row in each. " + _FRAME,
+    _SCENE_ID,
+    ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
+    ("label",       pa.string(),  "",    "Class name as the source dataset spells it; generated primitives: the category."),
+    ("kind",        pa.string(),  "",    "Shape that fills the box: cuboid or ellipsoid."),
+    ("instance_id", pa.int64(),   "",    "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects apart."),
+    ("x_m",         pa.float32(), "m",   "x of the centre in the scene frame: distance ahead of the ego vehicle."),
+    ("y_m",         pa.float32(), "m",   "y of the centre in the scene frame: distance to the left of the ego vehicle."),
+    ("z_m",         pa.float32(), "m",   "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
+    ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes that are not the height axis."),
+    ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
+    ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
+    ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
+    ("heading_rad", pa.float32(), "rad", "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
+    ("rotation",    pa.list_(pa.float32(), 9), "1", "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
+    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5", "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
+    ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
+)
+
+RASTERS = _schema(
+    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from above. " + _FRAME,
+    _SCENE_ID,
+    ("height",         pa.binary(),  "height_step_m", "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
+    ("occupied",       pa.binary(),  "",    "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
+    ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
+    ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
+    ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is farthest ahead."),
+    ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is leftmost."),
+    ("front_m",        pa.float64(), "m",   "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
+    ("left_m",         pa.float64(), "m",   "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
+    ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
+)
+
+REJECTS = _schema(
+    "One row per scene that was left out, or per drive that could not be read.",
+    ("scene_id", pa.string(), "", "Name that the scene would have; without a frame it names the drive."),
+    _SEQUENCE,
+    ("frame",    pa.int64(),  "1; av2: ns", "Frame number (av2: timestamp); null if the whole drive was left out."),
+    ("reason",   pa.string(), "", "Why it was left out."),
+)
+
+
+EDITS = _schema(
+    "One row per primitive that a step of the list of edits touched, in the scene that was given under the same scene_id.",
+    _SCENE_ID,
+    ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
+    ("edit",       pa.string(),  "",    "remove, duplicate, translate, rotate, scale, relabel, snap or repair."),
+    ("primitive",  pa.int32(),   "1",   "Number of the primitive in the scene as it was before this step, from 0."),
+    ("change",     pa.string(),  "",    "removed, copied or changed."),
+    ("moved_m",    pa.float32(), "m",   "How far the centre moved; a copy's distance from its original."),
+    ("turned_rad", pa.float32(), "rad", "The most that one of its axes turned, as a line."),
+    ("resized",    pa.float32(), "1",   "The largest change of an extent, as a share of what it was."),
+)
+
+
+def latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
+    """(C, h, w) posterior moments per scene; float16, channels first."""
+    tensor = pa.fixed_shape_tensor(pa.float16(), shape)
+    return _schema(
+        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the rasters.",
+        _SCENE_ID,
+        ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
+        ("logvar", tensor, "1", "Natural logarithm of its variance: float16 (channel, row, col) in C order."),
+    )
+# fmt: on
+
+
+# ---------------------------------------------------------------------------------------------------- to tables
+
+
+def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
+    """(height, occupied) as bytes: only occupied pixels carry a height, each as the difference to the one before."""
+    steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
+    if len(steps) and np.abs(steps).max() > 32767:
+        raise ValueError(f"scene {scene.scene_id}: ground heights beyond ±327 m, worst {scene.height_m.max()}")
+    return np.diff(steps.astype("<i2"), prepend=np.int16(0)).tobytes(), np.packbits(scene.occupied).tobytes()
+
+
+def decode_ground(
+    height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
+    steps, mask = ground_steps(height, occupied, shape)
+    height_m = np.zeros(shape, np.float32)
+    height_m[mask] = steps * np.float32(step_m)
+    return height_m, mask
+
+
+def ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Heights of the occupied pixels (m,) int16, in steps, and occupied (G, H, W) bool from one row of `rasters`."""
+    mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
+    return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
+
+
+def _scenes_table(scenes: Sequence[Scene]) -> pa.Table:
+    counts = np.array([scene.counts() for scene in scenes]).reshape(-1, len(CATEGORIES))
+    volumes = [scene.volume_m3 for scene in scenes]
+
+    def volume(group: tuple[int, ...]) -> list[float]:
+        return [float(v[np.isin(s.category, group)].sum()) for s, v in zip(scenes, volumes, strict=True)]
+
+    areas = [dict(zip(s.ground_classes, s.ground_area_m2().tolist(), strict=True)) for s in scenes]
+    totals = counts.sum(axis=1)
+    columns = {
+        "scene_id": [s.scene_id for s in scenes],
+        "sequence": [s.sequence for s in scenes],
+        "frame": [s.frame for s in scenes],
+        "x_m": [s.world_xyz_m[0] for s in scenes],
+        "y_m": [s.world_xyz_m[1] for s in scenes],
+        "z_m": [s.world_xyz_m[2] for s in scenes],
+        "yaw_rad": [s.world_yaw_rad for s in scenes],
+        "world_from_imu": [None if s.world_from_imu is None else s.world_from_imu.ravel().tolist() for s in scenes],
+        "vegetation_density": [s.vegetation_density for s in scenes],
+        "vehicle_density": [s.vehicle_density for s in scenes],
+        "vegetation_volume_m3": volume(VEGETATION),
+        "vehicle_volume_m3": volume(VEHICLES),
+        "num_primitives": totals,
+        **{f"num_{name}": counts[:, k] for k, name in enumerate(CATEGORIES)},
+        **{f"{name}_area_m2": [area.get(name) for area in areas] for name in GROUND_CLASSES},
+        "primitive_offset": np.cumsum(totals) - totals,
+    }
+    return pa.table(columns, schema=SCENES)
+
+
+def _fixed_lists(values: np.ndarray, width: int) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values, np.float32).reshape(-1)), width)
+
+
+def primitives_table(scenes: Sequence[Scene]) -> pa.Table:
+    """The rows of `primitives` for some scenes, one or more."""
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
+
+    category, heading, yaw = joined("category").astype(np.int8), joined("heading_rad"), joined("yaw_rad")
+    center, size = joined("center_m").reshape(-1, 3), joined("size_m").reshape(-1, 3)
+    rotation = joined("rotation").reshape(-1, 3, 3)
+    names = pa.array(CATEGORIES)
+    columns = {
+        "scene_id": np.repeat([s.scene_id for s in scenes], [len(s) for s in scenes]),
+        "category": names.take(pa.array(category)),
+        "label": pa.array(joined("label"), pa.string()),
+        "kind": pa.array(["cuboid", "ellipsoid"]).take(pa.array((category == ELLIPSOID).astype(np.int8))),
+        "instance_id": joined("instance_id").astype(np.int64),
+        **{f"{axis}_m": center[:, k] for k, axis in enumerate("xyz")},
+        **{f"{axis}_m": size[:, k] for k, axis in enumerate(("length", "width", "height"))},
+        "yaw_rad": yaw,
+        "heading_rad": pa.array(heading, mask=np.isnan(heading)),
+        "rotation": _fixed_lists(rotation, 9),
+        "cholesky": _fixed_lists(cholesky_parameters(rotation, size), 6),
+        "existence": joined("existence"),
+    }
+    return pa.table(columns).cast(PRIMITIVES)
+
+
+def _rasters_table(scenes: Sequence[Scene]) -> pa.Table:
+    encoded = [encode_ground(scene) for scene in scenes]
+    columns = {
+        "scene_id": [s.scene_id for s in scenes],
+        "height": [height for height, _ in encoded],
+        "occupied": [occupied for _, occupied in encoded],
+        "resolution_m": [s.grid.resolution_m for s in scenes],
+        "height_step_m": [HEIGHT_STEP_M] * len(scenes),
+        "rows": [s.grid.rows for s in scenes],
+        "cols": [s.grid.cols for s in scenes],
+        "front_m": [s.grid.front_m for s in scenes],
+        "left_m": [s.grid.left_m for s in scenes],
+        "ground_classes": [list(s.ground_classes) for s in scenes],
+    }
+    return pa.table(columns, schema=RASTERS)
+
+
+def scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
+    """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
+    return {"scenes": _scenes_table(scenes), "primitives": primitives_table(scenes), "rasters": _rasters_table(scenes)}
+
+
+# -------------------------------------------------------------------------------------------------- from tables
+
+
+def scenes_from_tables(
+    scenes: pa.Table,
+    primitives: pa.Table,
+    rasters: pa.Table,
+    source: str,
+    split: str,
+    rows: Sequence[int] | None = None,
+) -> Iterator[Scene]:
+    """The Scenes of one shard, or only those in `rows`, in that order; one at a time."""
+    fields = _primitive_fields(primitives)
+    rows = list(range(len(scenes)) if rows is None else rows)
+    for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
+        if scene["scene_id"] != raster["scene_id"]:
+            raise ValueError(f"shard is not aligned: scenes has {scene['scene_id']}, rasters has {raster['scene_id']}")
+        here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
+        grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
+        classes = tuple(raster["ground_classes"])
+        height, occupied = decode_ground(
+            raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols), raster["height_step_m"]
+        )
+        pose = scene["world_from_imu"]
+        yield Scene(
+            scene_id=scene["scene_id"],
+            source=source,
+            sequence=scene["sequence"],
+            frame=scene["frame"],
+            split=split,
+            ground_classes=classes,
+            height_m=height,
+            occupied=occupied,
+            grid=grid,
+            world_xyz_m=(scene["x_m"], scene["y_m"], scene["z_m"]),
+            world_yaw_rad=scene["yaw_rad"],
+            world_from_imu=None if pose is None else np.array(pose).reshape(3, 4),
+            vegetation_density=scene["vegetation_density"],
+            vehicle_density=scene["vehicle_density"],
+            **{name: value[here] for name, value in fields.items()},
+        )
+
+
+def category_indices(names: pa.ChunkedArray) -> np.ndarray:
+    """(n,) int8 index into CATEGORIES. Raises ValueError for a name that is none."""
+    category = pc.index_in(names, pa.array(CATEGORIES))
+    if category.null_count:
+        raise ValueError("primitives hold a category of another version; preprocess again")
+    return category.to_numpy().astype(np.int8)
+
+
+def fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
+    """(n, width) float32 of a column of fixed-size lists."""
+    flat = pa.concat_arrays(column.chunks).flatten() if len(column) else pa.array([], pa.float32())
+    return flat.to_numpy().reshape(-1, width)
+
+
+def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
+    """The per-primitive arrays of a Scene for all rows of a primitives table."""
+    primitives = primitives.combine_chunks()
+
+    def column(name: str) -> np.ndarray:
+        return primitives[name].to_numpy()
+
+    def stacked(*names: str) -> np.ndarray:
+        return np.stack([column(name) for name in names], axis=1)
+
+    return {
+        "category": category_indices(primitives["category"]),
+        "center_m": stacked("x_m", "y_m", "z_m"),
+        "rotation": fixed_lists(primitives["rotation"], 9).reshape(-1, 3, 3),
+        "size_m": stacked("length_m", "width_m", "height_m"),
+        "existence": column("existence"),
+        "heading_rad": column("heading_rad").astype(np.float32),
+        "instance_id": column("instance_id"),
+        "label": column("label").astype(object),
+    }
+
+
+# ------------------------------------------------------------------------------------------------------- shards
+
+
+@dataclass(frozen=True, order=True)
+class Shard:
+    """One aligned shard of a dataset directory; `path(table)` is its file in each table."""
+
+    root: str
+    source: str
+    split: str
+    number: int
+
+    def path(self, table: str) -> str:
+        name = f"part-{self.number:05d}.parquet"
+        return storage.join(self.root, table, f"source={self.source}", f"split={self.split}", name)
+
+    def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
+        schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS, "edits": EDITS}.get(table)
+        return storage.read_parquet(self.path(table), columns, schema)
+
+    def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
+        """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
+        tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
+        try:
+            return list(scenes_from_tables(*tables, self.source, self.split, rows))
+        except ValueError as error:
+            raise ValueError(f"{self.path('scenes')}: {error}") from error
+
+    def write(self, scenes: Sequence[Scene]) -> None:
+        for table, content in scene_tables(scenes).items():
+            storage.write_parquet(content, self.path(table))
+
+    def is_written(self) -> bool:
+        return all(storage.exists(self.path(table)) for table in ("scenes", "primitives", "rasters"))
+
+
+def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
+    """The shards of a table, in order. Raises ValueError if there is none: nothing passes on empty input."""
+    shards = []
+    for path in storage.list_files(storage.join(root, table), ".parquet"):
+        *_, source_part, split_part, name = path.split("/")
+        found = (source_part.removeprefix("source="), split_part.removeprefix("split="))
+        if (source or found[0], split or found[1]) == found:
+            shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
+    if not shards:
+        place, wanted = (
+            storage.join(root, table),
+            "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v),
+        )
+        there = sorted({"/".join(path.split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")})
+        if there:
+            raise ValueError(f"{place}: no {wanted}; there are {', '.join(there)}")
+        raise ValueError(
+            f"{place}: no scenes there; give a directory that jobs/preprocess_scenes.py or another job wrote"
+        )
+    return shards
+
+
+def read_scenes(
+    root: str, source: str | None = None, split: str | None = None, limit: int | None = None
+) -> Iterator[Scene]:
+    """Scenes of a dataset directory, shard by shard."""
+    left = limit
+    for shard in find_shards(root, "scenes", source, split):
+        for scene in shard.scenes():
+            if left == 0:
+                return
+            yield scene
+            left = None if left is None else left - 1
+
+
+def rejects_table(rows: Iterable[dict]) -> pa.Table:
+    return pa.Table.from_pylist(list(rows), schema=REJECTS)

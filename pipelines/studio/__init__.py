@@ -1,0 +1,1 @@
+"""The studio: sessions, HTTP interface and Ray Serve deployment."""

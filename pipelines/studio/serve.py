@@ -1,0 +1,36 @@
+"""The studio as a Ray Serve application: one replica, which holds the model and every visitor's desk."""
+
+from __future__ import annotations
+
+import ray.serve
+from fastapi import FastAPI
+from ray.serve import Application
+
+from pipelines.studio.session import Studio, studio_app
+
+REQUESTS = 32  # at once; more wait, and beyond as many again are told to come back
+
+
+def deployment(model: str, tables: list[str], token: str, hosts: tuple[str, ...], threads: int | None) -> Application:
+    """What ray.serve.run takes. The studio is made when the replica starts."""
+
+    def app() -> FastAPI:
+        import torch
+
+        if threads:
+            torch.set_num_threads(threads)
+        studio = Studio(model, tables)
+        return studio_app(lambda: studio, token, hosts)
+
+    @ray.serve.deployment(
+        name="studio",
+        num_replicas=1,
+        max_ongoing_requests=REQUESTS,
+        max_queued_requests=REQUESTS,
+        logging_config={"log_level": "WARNING", "enable_access_log": False},
+    )
+    @ray.serve.ingress(app)
+    class Server:
+        pass
+
+    return Server.bind()

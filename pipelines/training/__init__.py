@@ -1,0 +1,1 @@
+"""Batches and latents for training."""

@@ -1,0 +1,122 @@
+"""Scenes -> latents: one Ray Data graph, a model per actor, one latents shard per scenes shard."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+
+import numpy as np
+import pyarrow as pa
+import torch
+
+from models.lvae import LayoutVAE
+from models.tensors import layout_batch
+from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import fan_out
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.tables import Shard, find_shards, latents_schema
+
+
+def weights_digest(model: torch.nn.Module) -> str:
+    """Twelve hex digits of a model's weights."""
+    digest = hashlib.sha256()
+    for name, value in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:12]
+
+
+def load_lvae(directory: str) -> LayoutVAE:
+    """Raises ValueError if the directory holds no LVAE."""
+    if not storage.exists(storage.join(directory, "config.json")):
+        raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
+    try:
+        return LayoutVAE.from_pretrained(directory, low_cpu_mem_usage=False).eval().requires_grad_(False)
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{directory}: no layout VAE here ({error}); run jobs/train_lvae.py first") from error
+
+
+class Encoder:
+    """Actor. Row in: number of a shard. Row out: per-channel sums of its latent means. Writes the shard's latents."""
+
+    def __init__(self, lvae: str, output: str, shards: list[Shard], batch_size: int) -> None:
+        self.model, self.output, self.shards, self.batch_size = load_lvae(lvae), output, shards, batch_size
+        self.device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.model.to(self.device)
+
+    @torch.no_grad()
+    def encode(self, shard: Shard) -> tuple[list[str], np.ndarray, np.ndarray]:
+        """Ids, means and log-variances of one shard, float16 (n, c, h, w)."""
+        scenes, spec = shard.scenes(), self.model.spec
+        parts = []
+        for start in range(0, len(scenes), self.batch_size):
+            posterior = self.model.encode(layout_batch(scenes[start : start + self.batch_size], spec).to(self.device))
+            parts.append([v.half().cpu().numpy() for v in (posterior.mean, posterior.logvar)])
+        mean, logvar = (np.concatenate(group) for group in zip(*parts, strict=True))
+        return [scene.scene_id for scene in scenes], mean, logvar
+
+    def __call__(self, row: dict) -> dict:
+        shard = self.shards[row["id"]]
+        target = Shard(self.output, shard.source, shard.split, shard.number)
+        if storage.exists(target.path("latents")):
+            mean = target.read("latents", ["mean"])["mean"].combine_chunks().to_numpy_ndarray()
+        else:
+            ids, mean, logvar = self.encode(shard)
+            tensors = [pa.FixedShapeTensorArray.from_numpy_ndarray(v) for v in (mean, logvar)]
+            schema = latents_schema(mean.shape[1:])
+            storage.write_parquet(pa.table([pa.array(ids), *tensors], schema=schema), target.path("latents"))
+        values = mean.astype(np.float64)
+        return {
+            "split": shard.split,
+            "count": len(mean),
+            "sum": values.sum(axis=(0, 2, 3)),
+            "square": (values**2).sum(axis=(0, 2, 3)),
+            "cells": mean.shape[2] * mean.shape[3],
+        }
+
+
+def encode_latents(
+    dataset: Dataset,
+    lvae: str,
+    output: str,
+    num_actors: int = 1,
+    batch_size: int = 16,
+    on_shard: Callable[[dict], None] | None = None,
+) -> dict:
+    """Write `output`/latents/... and latents.json (LVAE, its digest, channel statistics of the training split).
+
+    Goes on where it stopped. Raises ValueError if the LVAE has another LayoutSpec than the dataset, or if the
+    directory holds latents of another LVAE.
+    """
+    model = load_lvae(lvae)
+    dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
+    description, digest = storage.join(output, "latents.json"), weights_digest(model)
+    if storage.exists(description):
+        found = storage.read_json(description)
+        if found["lvae_digest"] != digest:
+            raise ValueError(f"{output} holds latents of another LVAE ({found['lvae']}); choose another --output")
+        if found["complete"]:
+            return found
+    content = {"lvae": lvae, "lvae_digest": digest, "dataset": dataset.root, "complete": False}
+    storage.write_json(content, description)
+    storage.clean_temporaries(storage.join(output, "latents"))
+
+    shards = find_shards(dataset.root, source=dataset.source)
+    total, square, cells, counts = 0.0, 0.0, 0, {}
+    for row in fan_out(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
+        counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
+        if row["split"] == "train":
+            total, square = total + row["sum"], square + row["square"]
+            cells += int(row["count"]) * int(row["cells"])
+        if on_shard:
+            on_shard(row)
+    mean = total / cells
+    content |= {
+        "complete": True,
+        "scenes": counts,
+        "shape": list(model.latent_shape),
+        "channel_mean": mean.tolist(),
+        "channel_std": np.sqrt(np.maximum(square / cells - mean**2, 1e-12)).tolist(),
+    }
+    storage.write_json(content, description)
+    return content
