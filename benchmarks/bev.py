@@ -19,10 +19,10 @@ import tyro
 from common import DENSE_SEEDS, interleaved, ratios, spread, where
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.preprocess.sources.town.generator import town_drive
-from pipelines.rendering.render import bev_picture
+from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.rendering.render import render_bev
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, GROUND_CLASS_ID
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 
 ROUNDS = 7
 SCENES = 32
@@ -72,17 +72,17 @@ def plain(scene: Scene, supersample: int) -> np.ndarray:
 def main(dataset: str = "") -> None:
     print(where())
     if dataset:
-        chosen = Selection(dataset, limit=SCENES).shards()
+        chosen = SceneSubset(dataset, limit=SCENES).shards()
         scenes = [scene for shard, rows in chosen for scene in shard.scenes(rows)]
     else:
-        scenes = [drive.scene(k) for drive in map(town_drive, DENSE_SEEDS) for k in np.linspace(0, len(drive) - 1, SCENES // len(DENSE_SEEDS)).astype(int)]  # fmt: skip
+        scenes = [drive.scene(k) for drive in map(generate_town, DENSE_SEEDS) for k in np.linspace(0, len(drive) - 1, SCENES // len(DENSE_SEEDS)).astype(int)]  # fmt: skip
     print(f"{len(scenes)} scenes with {np.mean([len(s) for s in scenes]):.0f} primitives and {np.mean([s.occupied.any(axis=(1, 2)).sum() for s in scenes]):.1f} ground classes each")  # fmt: skip
     for supersample in (1, 2):
-        differ = [(plain(s, supersample) != bev_picture(s, supersample=supersample)).any(axis=-1) for s in scenes]
+        differ = [(plain(s, supersample) != render_bev(s, supersample=supersample)).any(axis=-1) for s in scenes]
         seconds = interleaved(
             {
                 "plain": lambda _, k=supersample: [plain(s, k) for s in scenes],
-                "ours": lambda _, k=supersample: [bev_picture(s, supersample=k) for s in scenes],
+                "ours": lambda _, k=supersample: [render_bev(s, supersample=k) for s in scenes],
             },
             ROUNDS,
         )

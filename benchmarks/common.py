@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.preprocess.sources.drive import Drive
-from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import provenance
 
 DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop
@@ -19,7 +19,7 @@ DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives
 
 def where() -> str:
     """Machine, versions and commit in one line."""
-    return f"{provenance.machine()}, {provenance.versions()}, numpy {np.__version__}, commit {provenance.commit()}"
+    return f"{provenance.describe_machine()}, {provenance.list_versions()}, numpy {np.__version__}, commit {provenance.find_commit()}"
 
 
 def interleaved(
@@ -61,4 +61,4 @@ def write_raw(root: Path, seeds: tuple[int, ...] = DENSE_SEEDS, spacing_m: float
     """KITTI-360's own files of dense towns under ROOT, one sequence each; nothing is redone."""
     for seed in seeds:
         if not (root / f"data_poses/2013_05_28_drive_{seed:04d}_sync/poses.txt").exists():
-            write_kitti360(with_dense_poses(town_drive(seed), spacing_m), root)
+            write_kitti360(with_dense_poses(generate_town(seed), spacing_m), root)

@@ -23,7 +23,7 @@ from plain_dit import PlainDiT
 
 from models.dit import DiT
 from models.presets import DIT_PRESETS
-from models.sampling.diffusion import Diffusion, guided
+from models.sampling.diffusion import Diffusion, with_guidance
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,11 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
     latent, label = torch.randn(batch, c.channels, c.size, c.size), torch.arange(batch) % 3
     at = [torch.full((batch,), t) for t in timesteps]
     start = time.perf_counter()
-    prepared = ours.prepared(timesteps, label.tolist())
+    prepared = ours.precompute_conditioning(timesteps, label.tolist())
     print(f"{name}, batch {batch}: all modulations of 250 steps: {time.perf_counter() - start:.2f} s, once")
     for same in (plain, prepared):
         assert torch.allclose(same(latent, at[9], label), ours(latent, at[9], label), atol=1e-3)
-    gemm, doubled = products(ours, batch), guided(ours, ours.null_label, 1.0 + 1e-9)
+    gemm, doubled = products(ours, batch), with_guidance(ours, ours.null_label, 1.0 + 1e-9)
     ways = {
         "ours": lambda k: prepared(latent, at[k], label),
         "ours, modulations in the step": lambda k: ours(latent, at[k], label),

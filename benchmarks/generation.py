@@ -18,8 +18,8 @@ import scipy.linalg
 import torch
 from common import interleaved, ratios, spread, where
 
-from pipelines.metrics.frechet import Moments, frechet_distance, moments
-from pipelines.metrics.neighbours import neighbourhoods, prepare
+from pipelines.metrics.frechet import Moments, compute_frechet_distance, compute_moments
+from pipelines.metrics.neighbours import compute_neighbourhoods, prepare_features
 
 DIMENSIONS = 2048
 ROUNDS = 3
@@ -66,7 +66,7 @@ def against_adm() -> None:
     found = interleaved(
         {
             "ADM": lambda _: adm_precision_recall(real, generated),
-            "ours": lambda _: neighbourhoods(real, generated),
+            "ours": lambda _: compute_neighbourhoods(real, generated),
         },
         ROUNDS,
         time.perf_counter,
@@ -74,18 +74,18 @@ def against_adm() -> None:
     print(
         f"precision and recall, 1,000 a side: ADM {spread(found['ADM'])} s, ours {spread(found['ours'])} s: {ratios(*found.values())}"
     )
-    theirs, ours = adm_precision_recall(real, generated), neighbourhoods(real, generated)[0]
+    theirs, ours = adm_precision_recall(real, generated), compute_neighbourhoods(real, generated)[0]
     print(f"  ADM {theirs[0]:.4f} {theirs[1]:.4f}, ours, exact, {ours.precision:.4f} {ours.recall:.4f}")
-    a, b = moments(features(5000, 0, True)), moments(features(5000, 1, True))
+    a, b = compute_moments(features(5000, 0, True)), compute_moments(features(5000, 1, True))
     found = interleaved(
-        {"sqrtm": lambda _: adm_frechet(a, b), "eigenvalues": lambda _: frechet_distance(a, b)},
+        {"sqrtm": lambda _: adm_frechet(a, b), "eigenvalues": lambda _: compute_frechet_distance(a, b)},
         ROUNDS,
         time.perf_counter,
     )
     print(
         f"FID from moments: sqrtm {spread(found['sqrtm'])} s, eigenvalues {spread(found['eigenvalues'])} s: {ratios(*found.values())}"
     )
-    print(f"  relative difference {abs(adm_frechet(a, b) / frechet_distance(a, b) - 1):.1e}")
+    print(f"  relative difference {abs(adm_frechet(a, b) / compute_frechet_distance(a, b) - 1):.1e}")
 
 
 def alone(count: int) -> None:
@@ -94,9 +94,9 @@ def alone(count: int) -> None:
         before, seconds = peak_gib(), []
         for _ in range(ROUNDS):
             start = time.perf_counter()
-            found = neighbourhoods(real, generated)[0]
+            found = compute_neighbourhoods(real, generated)[0]
             seconds.append(time.perf_counter() - start)
-        axes = prepare(real, generated, (3,))[0].left.shape[1] - 3
+        axes = prepare_features(real, generated, (3,))[0].left.shape[1] - 3
         print(
             f"precision and recall, {count:,} a side, {name} ({axes} axes): {spread(seconds)} s, "
             f"{peak_gib() - before:.2f} GiB above the features; {found.precision:.4f} {found.recall:.4f}"
@@ -106,12 +106,12 @@ def alone(count: int) -> None:
 def over_ray(count: int) -> None:
     import ray
 
-    from pipelines.evaluation.evaluate import spread_neighbourhoods
+    from pipelines.evaluation.evaluate import map_neighbourhoods
 
     ray.init(address="local", logging_level="WARNING")
     real, generated = (features(count, seed, True) for seed in (0, 1))
     start = time.perf_counter()
-    found = spread_neighbourhoods(real, generated, (3,))[0]
+    found = map_neighbourhoods(real, generated, (3,))[0]
     print(
         f"precision and recall, {count:,} a side over Ray: {time.perf_counter() - start:.0f} s, driver's peak "
         f"{peak_gib():.1f} GiB; {found.precision:.4f} {found.recall:.4f}"

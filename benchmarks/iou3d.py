@@ -22,15 +22,15 @@ from test_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs,
 
 from models.geometry.iou3d import (
     Boxes,
-    boxes,
-    boxes_of,
-    ellipsoid_iou3d_pairs,
-    iou3d_matrix,
-    iou3d_pairs,
-    overlapping_bounds,
+    compute_ellipsoid_iou3d_pairs,
+    compute_iou3d_matrix,
+    compute_iou3d_pairs,
+    extract_boxes,
+    find_overlapping_bounds,
+    make_boxes,
 )
 from models.scene import ELLIPSOID
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.preprocess.sources.town.generator import generate_town
 
 ROUNDS = 7
 NUM_PAIRS, NUM_MANIFOLD = 100_000, 1_000
@@ -49,11 +49,11 @@ def overlapping_pairs() -> None:
     """Arbitrarily rotated boxes that truly overlap: ours against manifold3d, per pair."""
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
-    kept = np.flatnonzero(iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
+    kept = np.flatnonzero(compute_iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
     a, b = a.take(kept), b.take(kept)
     few = np.arange(NUM_MANIFOLD)
     ways = {
-        "ours": lambda _: iou3d_pairs(a, b),
+        "ours": lambda _: compute_iou3d_pairs(a, b),
         "manifold3d": lambda _: manifold_iou(a.take(few), b.take(few)),
     }
     seconds = interleaved(ways, ROUNDS)
@@ -65,9 +65,9 @@ def overlapping_pairs() -> None:
 def whole_scenes() -> None:
     """Every predicted with every true box of a scene, most of them culled: by their bounds, and in AP3D by category."""
     rng = np.random.default_rng(1)
-    scenes = [drive.scene(len(drive) // 2) for drive in map(town_drive, DENSE_SEEDS)]
-    truths = [(boxes_of(scene), scene.category) for scene in scenes]
-    joined = boxes(*(np.concatenate(parts) for parts in zip(*(box for box, _ in truths), strict=True)))
+    scenes = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
+    truths = [(extract_boxes(scene), scene.category) for scene in scenes]
+    joined = make_boxes(*(np.concatenate(parts) for parts in zip(*(box for box, _ in truths), strict=True)))
     crowd = np.arange(PAPER_OBJECTS)
     crowded = (joined.take(crowd), np.concatenate([category for _, category in truths])[crowd])
     for name, chosen in (("dense towns", truths), (f"{PAPER_OBJECTS} boxes, several towns in one place", [crowded])):
@@ -76,9 +76,9 @@ def whole_scenes() -> None:
         for kind in ("all pairs", "pairs of one category"):
             masks = [same if kind == "pairs of one category" else np.ones_like(same) for _, _, same in sides]
             survive = sum(
-                int(mask[overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
+                int(mask[find_overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
             )
-            seconds = interleaved({kind: lambda _, s=sides, w=masks: [iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)]}, ROUNDS)[kind]  # fmt: skip
+            seconds = interleaved({kind: lambda _, s=sides, w=masks: [compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)]}, ROUNDS)[kind]  # fmt: skip
             per_scene = [1e3 * s / len(sides) for s in seconds]
             print(f"{name}, {kind}: {spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, {100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene")  # fmt: skip
 
@@ -88,7 +88,7 @@ def errors() -> None:
     print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
     total = wrong = 0
     for name, (a, b) in pairs(np.random.default_rng(0)).items():
-        ours, oracle = iou3d_pairs(a, b), manifold_iou(a, b)
+        ours, oracle = compute_iou3d_pairs(a, b), manifold_iou(a, b)
         error, theirs = np.abs(ours - oracle), 0
         for i in np.flatnonzero(~(error <= TOLERANCE)):
             exact = halfspace_iou(a, b, i)
@@ -112,12 +112,12 @@ def ellipsoids() -> None:
         Boxes(np.einsum("nij,nj->ni", turn, c * stretch), turn, 2 * r[:, None] * stretch)
         for c, r in zip(center, radius, strict=True)
     ]
-    error = ellipsoid_iou3d_pairs(*sides) - exact
-    seconds = interleaved({"ours": lambda _: ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
+    error = compute_ellipsoid_iou3d_pairs(*sides) - exact
+    seconds = interleaved({"ours": lambda _: compute_ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
     print(f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, root mean square {np.sqrt(np.mean(error**2)):.5f}; {spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core")  # fmt: skip
-    real = [s.select(s.category == ELLIPSOID) for s in (town_drive(seed).scene(100) for seed in DENSE_SEEDS)]
-    pair = [(boxes_of(s), disturbed(rng, boxes_of(s), 0.1)) for s in real if len(s)]
-    survive = [len(overlapping_bounds(a, b)[0]) for a, b in pair]
+    real = [s.select(s.category == ELLIPSOID) for s in (generate_town(seed).scene(100) for seed in DENSE_SEEDS)]
+    pair = [(extract_boxes(s), disturbed(rng, extract_boxes(s), 0.1)) for s in real if len(s)]
+    survive = [len(find_overlapping_bounds(a, b)[0]) for a, b in pair]
     print(f"ellipsoids of dense towns: {', '.join(map(str, survive))} pairs a scene survive their bounds")
 
 

@@ -16,10 +16,16 @@ from common import where
 
 from models.lvae import LayoutVAE
 from models.scene import CATEGORIES, Scene
-from models.tensors import layout_batch, scene_from_layout
-from pipelines.metrics.validity import LABEL_MEASURES, label_fidelity, scene_validity, slab_offset_m, validity_rates
+from models.tensors import decode_layout, make_layout_batch
+from pipelines.metrics.validity import (
+    LABEL_MEASURES,
+    compute_label_fidelity,
+    compute_scene_validity,
+    compute_validity_rates,
+    find_slab_offset_m,
+)
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
 
 
@@ -41,20 +47,20 @@ def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> li
     generator = torch.Generator().manual_seed(seed)
     made = []
     for scene in scenes:
-        latent = lvae.encode(layout_batch([scene], lvae.spec)).mean
+        latent = lvae.encode(make_layout_batch([scene], lvae.spec)).mean
         deviation = latent.std(dim=(2, 3), keepdim=True)
         latent = latent + noise * deviation * torch.randn(latent.shape, generator=generator)
-        made.append(scene_from_layout(lvae.decode(latent).layouts()[0], lvae.spec, scene))
+        made.append(decode_layout(lvae.decode(latent).layouts()[0], lvae.spec, scene))
     return made
 
 
 def said(scenes: list[Scene], dataset: Dataset) -> str:
     """Mean counts of the categories that there are, and how valid scenes are."""
-    offset_m = slab_offset_m(dataset.spec.surface)
+    offset_m = find_slab_offset_m(dataset.spec.surface)
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
-    found = validity_rates(np.array([scene_validity(scene, offset_m) for scene in scenes]))
-    fidelity = np.array([label_fidelity(scene, dataset.vegetation, dataset.vehicle) for scene in scenes])
-    found |= {LABEL_MEASURES[0]: validity_rates(fidelity, LABEL_MEASURES)[LABEL_MEASURES[0]]}
+    found = compute_validity_rates(np.array([compute_scene_validity(scene, offset_m) for scene in scenes]))
+    fidelity = np.array([compute_label_fidelity(scene, dataset.vegetation, dataset.vehicle) for scene in scenes])
+    found |= {LABEL_MEASURES[0]: compute_validity_rates(fidelity, LABEL_MEASURES)[LABEL_MEASURES[0]]}
     numbers = [f"{name} {mean:.1f}" for name, mean in zip(CATEGORIES, counts, strict=True) if mean >= 1]
     return ", ".join(numbers + [f"{name} {value:.3f}" for name, value in found.items() if value is not None])
 
@@ -62,7 +68,7 @@ def said(scenes: list[Scene], dataset: Dataset) -> str:
 @torch.no_grad()
 def main(config: Config) -> None:
     dataset = Dataset.open(config.dataset)
-    selection = Selection(dataset.root, dataset.source, config.split, config.limit, "spread")
+    selection = SceneSubset(dataset.root, dataset.source, config.split, config.limit, "spread")
     scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
     if not scenes:
         raise SystemExit(f"{config.dataset} holds no scenes of split {config.split!r}")

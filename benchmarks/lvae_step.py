@@ -20,9 +20,9 @@ from matching import town_batch
 
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.presets import LVAE_PRESETS, preset
+from models.presets import LVAE_PRESETS, find_preset
 from models.vae import losses
-from models.vae.losses import lvae_loss
+from models.vae.losses import compute_lvae_loss
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch
 
     losses.match = timed
     try:
-        total = lvae_loss(output, posterior, batch, model.spec).total
+        total = compute_lvae_loss(output, posterior, batch, model.spec).total
     finally:
         losses.match = matching
     lap("losses")
@@ -71,7 +71,7 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
     print(where(), f"{config.threads} threads")
     for name in config.presets:
-        row = preset(LVAE_PRESETS, name)
+        row = find_preset(LVAE_PRESETS, name)
         batch_size = 2 if name == "kitti360" else row.batch_size
         spec = LayoutSpec().with_resolution(row.raster_px)
         batch = town_batch(spec, max(4, batch_size))
@@ -80,7 +80,7 @@ def main(config: Config) -> None:
         for way, decoder in (("as it is", row.decoder), ("ours", "detr"), ("plain", "detr")):
             torch.manual_seed(0)
             model = LayoutVAE(layout=spec.to_dict(), **(row.architecture() | {"decoder": decoder}))
-            model.start_at(batch)
+            model.init_from_data(batch)
             models[way] = (model, torch.optim.AdamW(model.parameters(), 1e-5))
         noise = torch.randn(batch_size, *models["ours"][0].latent_shape)
         rounds: dict[str, list[dict[str, float]]] = {way: [] for way in models}

@@ -17,9 +17,9 @@ from common import interleaved, ratios, spread, where
 
 from models.layout import LayoutSpec
 from models.scene import Grid
-from models.tensors import layout_batch
-from models.vae.matching import PAPER_WEIGHTS, match
-from pipelines.preprocess.sources.town.generator import town_drive
+from models.tensors import make_layout_batch
+from models.vae.matching import PAPER_WEIGHTS, match_primitives
+from pipelines.preprocess.sources.town.generator import generate_town
 
 BATCH = 32
 
@@ -28,10 +28,10 @@ def town_batch(spec: LayoutSpec, batch: int):
     """Layouts of `batch` town scenes from several districts."""
     scenes = []
     for seed in range(4):
-        drive = town_drive(seed)
+        drive = generate_town(seed)
         poses = np.linspace(0, len(drive) - 1, batch // 4).astype(int)
         scenes += [drive.scene(int(k), "train", Grid()) for k in poses]
-    return layout_batch(scenes, spec)
+    return make_layout_batch(scenes, spec)
 
 
 def main() -> None:
@@ -51,7 +51,7 @@ def main() -> None:
         found: dict[str, torch.Tensor] = {}
         ways = {
             "padded": lambda _, given=given, found=found: found.update(padded=plain.match(*given)),
-            "ours": lambda _, given=given, found=found: found.update(ours=match(*given)),
+            "ours": lambda _, given=given, found=found: found.update(ours=match_primitives(*given)),
         }
         torch.set_num_threads(1)
         seconds = interleaved(ways, 7)

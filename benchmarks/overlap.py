@@ -17,14 +17,14 @@ import torch
 import tyro
 from common import where
 
-from models.composition.outpaint import Block, Lattice, World, height_near
+from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, find_ground_height
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.scene import Grid, Scene
-from models.tensors import layout_batch, new_scene, scene_from_layout
-from pipelines.generation.inpaint import drift, drift_scores
-from pipelines.generation.sample import on_model_grid
-from pipelines.preprocess.sources.town.generator import town_drive
+from models.tensors import decode_layout, make_empty_scene, make_layout_batch
+from pipelines.generation.inpaint import compute_drift, compute_drift_scores
+from pipelines.generation.sample import resample_to_model_grid
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.training.latents import load_lvae
 
 STEP_M = 32.0
@@ -42,13 +42,13 @@ class Config:
 
 def pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
     """Scenes of a town and those 32 m ahead of each, in a frame of their own with the same heading and height."""
-    drive, grid = town_drive(seed), Grid()
+    drive, grid = generate_town(seed), Grid()
     large = replace(grid, front_m=grid.front_m + STEP_M, rows=grid.rows + round(STEP_M / grid.resolution_m))
     found = []
     for pose in np.linspace(0, len(drive) - 1, count).astype(int):
         scene = drive.scene(pose, "test", large)
-        ahead = scene.cropped(replace(grid, front_m=large.front_m)).moved(-STEP_M, 0)
-        found.append(tuple(on_model_grid(part, spec) for part in (scene.cropped(grid), ahead)))
+        ahead = scene.crop(replace(grid, front_m=large.front_m)).translate(-STEP_M, 0)
+        found.append(tuple(resample_to_model_grid(part, spec) for part in (scene.crop(grid), ahead)))
     return found
 
 
@@ -58,22 +58,22 @@ def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str,
     spec = lvae.spec
 
     def encode(scenes: Sequence[Scene]) -> torch.Tensor:
-        return lvae.encode(layout_batch(list(scenes), spec)).mean
+        return lvae.encode(make_layout_batch(list(scenes), spec)).mean
 
     def decoded(latent: torch.Tensor) -> Scene:
-        return scene_from_layout(lvae.decode(latent[None]).layouts()[0], spec, empty)
+        return decode_layout(lvae.decode(latent[None]).layouts()[0], spec, empty)
 
-    empty = new_scene(second.scene_id, second.source, second.sequence, second.frame, spec)
-    lattice = Lattice.of(lvae.latent_shape[-1], STEP_M / 64.0)
-    world = World(lattice, spec, encode, height_near(first, 0.0, 0.0))
-    made, found = {(0, 0): Block(first, encode([first])[0])}, {}
+    empty = make_empty_scene(second.scene_id, second.source, second.sequence, second.frame, spec)
+    lattice = BlockGrid.of(lvae.latent_shape[-1], STEP_M / 64.0)
+    world = BlockComposer(lattice, spec, encode, find_ground_height(first, 0.0, 0.0))
+    made, found = {(0, 0): SceneBlock(first, encode([first])[0])}, {}
     for mode in ("copy", "reencode"):
         task = world.task((1, 0), made, empty, mode)
-        truth = second.moved(0, 0, -task.datum_m)
+        truth = second.translate(0, 0, -task.datum_m)
         latent = torch.where(task.unknown.bool(), encode([truth])[0], task.latent)
-        found[mode] = drift(truth, decoded(latent), task.new_pixels)
+        found[mode] = compute_drift(truth, decoded(latent), task.new_pixels)
         if mode == "reencode":
-            found["own latent"] = drift(truth, decoded(encode([truth])[0]), task.new_pixels)
+            found["own latent"] = compute_drift(truth, decoded(encode([truth])[0]), task.new_pixels)
     return found
 
 
@@ -87,7 +87,7 @@ def main(config: Config) -> None:
                 sums.setdefault(way, []).append(found)
     print(f"{len(sums['copy'])} pairs of {len(config.seeds)} towns, known half of the second block")
     for way, found in sums.items():
-        print(f"{way}:", ", ".join(f"{name} {value:.4g}" for name, value in drift_scores(found).items()))
+        print(f"{way}:", ", ".join(f"{name} {value:.4g}" for name, value in compute_drift_scores(found).items()))
 
 
 if __name__ == "__main__":

@@ -79,8 +79,8 @@ def object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, pr
 @contextlib.contextmanager
 def in_place_of_ours():
     """Within, the objective and the object encoder are the plain ones."""
-    kept = losses.match, losses.object_losses, ObjectEncoder.without_padding
-    losses.match, losses.object_losses = match, object_losses
+    kept = losses.match, losses.compute_object_losses, ObjectEncoder.without_padding
+    losses.match, losses.compute_object_losses = match, object_losses
     ObjectEncoder.without_padding = lambda self, features, real: (
         features,
         real,
@@ -89,7 +89,7 @@ def in_place_of_ours():
     try:
         yield
     finally:
-        losses.match, losses.object_losses, ObjectEncoder.without_padding = kept
+        losses.match, losses.compute_object_losses, ObjectEncoder.without_padding = kept
 
 
 def total_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from models.dit import DiT, timestep_frequencies
+from models.dit import DiT, embed_timesteps
 
 
 class Attention(nn.Module):
@@ -61,7 +61,7 @@ class PlainDiT(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, y: Tensor) -> Tensor:
         x = self.x_embedder(x).flatten(2).transpose(1, 2) + self.pos_embed
-        c = self.t_mlp(timestep_frequencies(t)) + self.y_embedder(y)
+        c = self.t_mlp(embed_timesteps(t)) + self.y_embedder(y)
         for block in self.blocks:
             x = block(x, c)
         shift, scale = self.adaLN_modulation(c).chunk(2, dim=1)

@@ -27,10 +27,10 @@ from pipelines.preprocess import shard_writer
 from pipelines.preprocess.sharding import plan_kitti360
 from pipelines.preprocess.sources import kitti360
 from pipelines.preprocess.sources.drive import Drive
-from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import storage
-from pipelines.schema.dataset import training_statistics
-from pipelines.schema.tables import Shard, scene_tables
+from pipelines.schema.dataset import compute_training_statistics
+from pipelines.schema.tables import Shard, make_scene_tables
 from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
@@ -91,12 +91,12 @@ def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, fl
             ]
             now = time.process_time()
             spent["cut and rasterise"] += now - clock
-            tables.append(scene_tables(batch))
-            shard_writer.extremes(batch)
+            tables.append(make_scene_tables(batch))
+            shard_writer.compute_extremes(batch)
             clock = time.process_time()
             spent["to tables"] += clock - now
         shard = Shard(out, "kitti360", "train", number)
-        for name, table in shard_writer.joined_tables(tables).items():
+        for name, table in shard_writer.join_tables(tables).items():
             storage.write_parquet(table, shard.path(name))
         spent["write Parquet"] += time.process_time() - clock
     return {name: 1e3 * seconds / len(poses) for name, seconds in spent.items()}
@@ -131,7 +131,7 @@ def stored_exactly(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tup
 def peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
     """In a process of its own: poses of a sequence, and its peak resident megabytes for reading it and one shard."""
     with tempfile.TemporaryDirectory() as folder:
-        write_kitti360(with_dense_poses(town_drive(4), spacing_m), folder + "/raw")
+        write_kitti360(with_dense_poses(generate_town(4), spacing_m), folder + "/raw")
         child = multiprocessing.get_context("spawn").Process(target=_one_shard, args=(folder, results))
         child.start()
         child.join()
@@ -150,7 +150,7 @@ def main(config: Config) -> None:
     raw = Path(config.raw or Path(tempfile.gettempdir()) / "pritti-benchmark-raw")
     if not config.raw:
         write_raw(raw)
-    sequence = kitti360.sequences(raw)[-1]
+    sequence = kitti360.list_sequences(raw)[-1]
     print(where())
     xml = raw / f"data_3d_bboxes/train_full/2013_05_28_drive_{sequence}_sync.xml"
     clock = time.process_time()
@@ -194,8 +194,8 @@ def main(config: Config) -> None:
 
         shards = [Shard(f"{out}/0", "kitti360", "train", k) for k in range(-(-len(poses) // 256))]
         manifest = {"source": "kitti360", "split": "train", "number": 0, "scenes": 1, "ground_classes": list(drive.ground_classes)}  # fmt: skip
-        manifest["extremes"] = shard_writer.extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
-        spec = training_statistics([manifest], f"{out}/0", grid, None).spec
+        manifest["extremes"] = shard_writer.compute_extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
+        spec = compute_training_statistics([manifest], f"{out}/0", grid, None).spec
         for pixels in (256, 128):
             reader, rates = LayoutReader(spec.with_resolution(pixels)), []
             for _ in range(3):

@@ -27,8 +27,8 @@ import ray.data
 import tyro
 from common import DENSE_SEEDS, spread, where, write_raw
 
-from pipelines.preprocess.ingest import ingest
-from pipelines.preprocess.sharding import Task, plan_kitti360
+from pipelines.preprocess.ingest import ingest_drives
+from pipelines.preprocess.sharding import ShardTask, plan_kitti360
 from pipelines.preprocess.sources import kitti360
 from pipelines.schema.tables import find_shards
 
@@ -54,18 +54,20 @@ class Run:
     manifest_bytes: int  # what came back to it
 
 
-def timed(tasks: list[Task]) -> Run:
+def timed(tasks: list[ShardTask]) -> Run:
     """One ingest on the Ray that runs."""
     received = []
     with tempfile.TemporaryDirectory() as out:
         start, clock = time.perf_counter(), time.process_time()
-        result = ingest(tasks, out, {"source": "kitti360"}, on_shard=lambda m: received.append(len(pickle.dumps(m))))
+        result = ingest_drives(
+            tasks, out, {"source": "kitti360"}, on_shard=lambda m: received.append(len(pickle.dumps(m)))
+        )
         seconds, driver = time.perf_counter() - start, time.process_time() - clock
         assert len(find_shards(out)) == sum(1 for t in tasks if t.parts[0].poses)
     return Run(sum(result.scenes.values()), len(tasks), seconds, driver, sum(received))
 
 
-def warm_up(tasks: list[Task]) -> None:
+def warm_up(tasks: list[ShardTask]) -> None:
     """Workers import what they need before the clock starts."""
     timed(tasks[:2])
 
@@ -85,7 +87,7 @@ def main(config: Config) -> None:
     raw = Path(tempfile.gettempdir()) / f"pritti-benchmark-raw-{config.spacing_m:g}"
     write_raw(raw, DENSE_SEEDS, config.spacing_m)
     tasks = plan_kitti360(str(raw), split=False)
-    traffic = sum(len(pickle.dumps(kitti360.read_drive(raw, s)[0])) for s in kitti360.sequences(raw))
+    traffic = sum(len(pickle.dumps(kitti360.read_drive(raw, s)[0])) for s in kitti360.list_sequences(raw))
 
     runs: dict[int, list[Run]] = {1: [], 2: []}
     for _ in range(config.rounds):

@@ -16,7 +16,7 @@ import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
 
 from models.pipeline import SAMPLERS, scheduler
-from models.sampling.diffusion import Diffusion, solve
+from models.sampling.diffusion import Diffusion, sample_with_scheduler
 
 DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of these
 STEPS = (10, 20, 25, 50)
@@ -32,7 +32,7 @@ def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
 
     solver.set_timesteps(steps)
     one = SimpleNamespace(draw=lambda: torch.ones((1, 1, 1, 1), dtype=torch.float64))
-    drawn = solve(model, solver, one, torch.zeros(1, dtype=torch.long))
+    drawn = sample_with_scheduler(model, solver, one, torch.zeros(1, dtype=torch.long))
     return drawn.item() / deviation
 
 

@@ -19,12 +19,12 @@ import tyro
 from common import DENSE_SEEDS, interleaved, ratios, spread, where
 
 from models.scene import Scene
-from pipelines.geometry.centerlines import drive, road_network
-from pipelines.io.mesh_export import scene_triangles
-from pipelines.preprocess.sources.town.generator import town_drive
-from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shaded
-from pipelines.rendering.render import png
-from pipelines.rendering.street_views import StreetRequest, cameras_along, depth_image
+from pipelines.geometry.centerlines import extract_road_network, plan_drive
+from pipelines.io.mesh_export import triangulate_scene
+from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shade_view
+from pipelines.rendering.render import encode_png
+from pipelines.rendering.street_views import StreetRequest, encode_depth, place_cameras
 from pipelines.schema.palette import EMPTY
 
 ROUNDS = 5
@@ -33,7 +33,7 @@ FRAMES = 8  # of a scene
 
 def cast(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
     """Class ids (h, w) by embree."""
-    soup = scene_triangles(scene)
+    soup = triangulate_scene(scene)
     mesh = trimesh.Trimesh(soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False)  # fmt: skip
     pictures = []
     for camera in cameras:
@@ -56,16 +56,16 @@ def write(scene: Scene, cameras: list[StreetCamera]) -> None:
     renderer = StreetRenderer(scene)
     for camera in cameras:
         view = renderer.view(camera)
-        for image in (view.semantic, view.class_id, view.instance(), depth_image(view), shaded(view)):
-            png(image)
+        for image in (view.semantic, view.class_id, view.instance(), encode_depth(view), shade_view(view)):
+            encode_png(image)
 
 
 def main() -> None:
     print(where())
     request, chosen = StreetRequest("", "", 1.0, 1.55, 0.0, Lens().resized(704, 188), 0.25, FRAMES), []
     for seed in DENSE_SEEDS:
-        scene = town_drive(seed).scene(20)
-        cameras = cameras_along(drive(road_network(scene)), request)
+        scene = generate_town(seed).scene(20)
+        cameras = place_cameras(plan_drive(extract_road_network(scene)), request)
         chosen += [(scene, cameras)] if cameras else []
     frames = sum(len(cameras) for _, cameras in chosen)
     print(f"{len(chosen)} scenes of {np.mean([len(scene) for scene, _ in chosen]):.0f} primitives, {frames} frames of {request.lens.width} x {request.lens.height}")  # fmt: skip

@@ -18,9 +18,9 @@ from common import DENSE_SEEDS, interleaved, ratios, spread, where
 from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORY_INDEX, ELLIPSOID, Scene
-from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, voxelise
-from pipelines.metrics.reconstruction import voxel_confusion
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, voxelize
+from pipelines.metrics.reconstruction import compute_voxel_confusion
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
 ROUNDS = 7
@@ -71,26 +71,26 @@ def crowded(scenes: list[Scene]) -> Scene:
 def main() -> None:
     print(where())
     rng, voxels = np.random.default_rng(0), VoxelGrid()
-    dense = [drive.scene(len(drive) // 2) for drive in map(town_drive, DENSE_SEEDS)]
+    dense = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
     leaning = [tilted(scene, rng) for scene in dense]
     for name, scenes in (
         ("dense towns", dense),
         ("the same, leaning", leaning),
         (f"{PAPER_OBJECTS} primitives, several towns in one place", [crowded(leaning)]),
     ):
-        differ = sum(int((voxelise(s, voxels) != plain(s, voxels)).sum()) for s in scenes)
+        differ = sum(int((voxelize(s, voxels) != plain(s, voxels)).sum()) for s in scenes)
         seconds = interleaved(
             {
                 "plain": lambda _, scenes=scenes: [plain(s, voxels) for s in scenes],
-                "ours": lambda _, scenes=scenes: [voxelise(s, voxels) for s in scenes],
+                "ours": lambda _, scenes=scenes: [voxelize(s, voxels) for s in scenes],
             },
             ROUNDS,
         )
         per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
-        filled = np.mean([(voxelise(s, voxels) != EMPTY).mean() for s in scenes])
+        filled = np.mean([(voxelize(s, voxels) != EMPTY).mean() for s in scenes])
         print(f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ")  # fmt: skip
-    truth, found = voxelise(dense[0], voxels), voxelise(leaning[0], voxels)
-    confusion = interleaved({"confusion": lambda _: voxel_confusion(truth, found)}, ROUNDS)["confusion"]
+    truth, found = voxelize(dense[0], voxels), voxelize(leaning[0], voxels)
+    confusion = interleaved({"confusion": lambda _: compute_voxel_confusion(truth, found)}, ROUNDS)["confusion"]
     print(f"confusion matrix of two grids: {spread(confusion, 1e3, 1)} ms")
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.scene import Scene, canonical_boxes, yaw_rotation
+from models.scene import Scene, canonicalize_boxes, make_yaw_rotation
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,16 @@ class Augmentation:
         rng = np.random.default_rng([7303, self.seed, place])
         flip, dx, dy, turn = rng.random(), *rng.uniform(-1, 1, 3)
         if self.move_m or self.turn_rad:
-            scene = moved_vehicle(scene, dx * self.move_m, dy * self.move_m, turn * self.turn_rad)
-        return mirrored(scene) if self.flip and flip < 0.5 else scene
+            scene = move_vehicle(scene, dx * self.move_m, dy * self.move_m, turn * self.turn_rad)
+        return mirror_scene(scene) if self.flip and flip < 0.5 else scene
 
 
-def mirrored(scene: Scene) -> Scene:
+def mirror_scene(scene: Scene) -> Scene:
     """The scene with left and right exchanged; exact. Raises ValueError if its grid is not symmetric."""
     if not np.isclose(scene.grid.left_m, -scene.grid.right_m):
         raise ValueError(f"scene {scene.scene_id}: {scene.grid} is not symmetric about the vehicle, cannot mirror")
     mirror = np.array([1, -1, 1], np.float32)
-    rotation, size = canonical_boxes(scene.rotation * mirror[:, None], scene.size_m)
+    rotation, size = canonicalize_boxes(scene.rotation * mirror[:, None], scene.size_m)
     return replace(
         scene,
         center_m=scene.center_m * mirror,
@@ -47,16 +47,16 @@ def mirrored(scene: Scene) -> Scene:
     )
 
 
-def moved_vehicle(scene: Scene, dx_m: float, dy_m: float, turn_rad: float) -> Scene:
+def move_vehicle(scene: Scene, dx_m: float, dy_m: float, turn_rad: float) -> Scene:
     """The scene as seen from a vehicle moved by (dx, dy) and then turned to the left by `turn_rad`.
 
     Primitives are exact, rasters take the nearest pixel; what lies beyond the old crop is empty.
     """
-    new_from_old = yaw_rotation(-turn_rad)
+    new_from_old = make_yaw_rotation(-turn_rad)
     center = (scene.center_m - np.array([dx_m, dy_m, 0.0])) @ new_from_old.T
     inside = scene.grid.contains(center[:, 0], center[:, 1])
     seen = scene.select(inside)
-    rotation, size = canonical_boxes(new_from_old @ seen.rotation, seen.size_m)
+    rotation, size = canonicalize_boxes(new_from_old @ seen.rotation, seen.size_m)
     x, y = np.meshgrid(scene.grid.x_m(), scene.grid.y_m(), indexing="ij")
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     row, col = scene.grid.pixel(cos * x - sin * y + dx_m, sin * x + cos * y + dy_m)

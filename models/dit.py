@@ -10,22 +10,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 import torch.nn.functional as F
-from diffusers import ConfigMixin, ModelMixin
-from diffusers.configuration_utils import register_to_config
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from models.base import ConfiguredModel, register_to_config
 from models.sampling.diffusion import Denoiser, Diffusion
 
 FREQUENCIES = 256
-Prediction = Literal["noise", "velocity"]
+Prediction = Literal["epsilon", "v_prediction"]
 
 
-def timestep_frequencies(timestep: Float[Tensor, batch]) -> Float[Tensor, "batch 256"]:
+def embed_timesteps(timestep: Float[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
     """Sinusoidal embedding of a timestep, cosines first."""
     half = FREQUENCIES // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
@@ -33,7 +32,7 @@ def timestep_frequencies(timestep: Float[Tensor, batch]) -> Float[Tensor, "batch
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
 
-def sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
+def make_sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
     """Fixed 2D sine-cosine positions of a square token grid, row-major: first half columns, second half rows."""
 
     def axis(position: Tensor) -> Tensor:
@@ -49,7 +48,7 @@ def modulate(x: Float[Tensor, "batch n d"], shift: Tensor, scale: Tensor) -> Flo
     return torch.addcmul(shift[:, None], x, (1 + scale)[:, None])
 
 
-class Block(nn.Module):
+class DiTBlock(nn.Module):
     """Self-attention and MLP, both modulated and gated by the condition (adaLN-Zero)."""
 
     def __init__(self, width: int, heads: int) -> None:
@@ -73,15 +72,15 @@ class Block(nn.Module):
         return torch.addcmul(x, gate2[:, None], self.mlp_out(F.gelu(self.mlp_in(y), approximate="tanh")))
 
 
-class DiT(ModelMixin, ConfigMixin):
+class DiT(ConfiguredModel):
     """Predicts the noise in a latent (b, channels, size, size) at timestep t under label y.
 
     Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
     divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
 
-    `prediction` is what the network itself puts out: "noise" as in the paper, or "velocity", sqrt(alpha_bar) noise -
-    sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), of which the noise is made here. A small network then need not carry the
-    noise it is given through all its layers.
+    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction", sqrt(alpha_bar)
+    noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A small network then need
+    not carry its input's noise through all its layers.
     """
 
     @register_to_config
@@ -98,7 +97,7 @@ class DiT(ModelMixin, ConfigMixin):
         layout: dict | None = None,
         shift: tuple[float, ...] | None = None,
         scale: tuple[float, ...] | None = None,
-        prediction: Prediction = "noise",
+        prediction: Prediction = "epsilon",
     ) -> None:
         super().__init__()
         if prediction not in get_args(Prediction):
@@ -108,16 +107,23 @@ class DiT(ModelMixin, ConfigMixin):
         self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
         self.timestep_mlp = nn.Sequential(nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
         self.label_embedding = nn.Embedding(num_labels + 1, width)
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
         self.modulation = nn.Linear(width, 2 * width)
         self.patch_out = nn.Linear(width, patch * patch * channels)
-        self.register_buffer("positions", sincos_positions(size // patch, width), persistent=False)
+        self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
         alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
         self.register_buffer("noise_shares", shares, persistent=False)  # of the latent and of the velocity
-        self.initialise()
+        self.init_weights()
 
-    def initialise(self) -> None:
+    @classmethod
+    def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
+        """Names of predictions as versions before 0.2 wrote them."""
+        renamed = {"noise": "epsilon", "velocity": "v_prediction"}
+        prediction = config.get("prediction", "epsilon")
+        return config | {"prediction": renamed.get(prediction, prediction)}
+
+    def init_weights(self) -> None:
         """The original initialisation: xavier everywhere, every residual branch and the output start at zero."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
@@ -127,11 +133,11 @@ class DiT(ModelMixin, ConfigMixin):
         nn.init.zeros_(self.patch_in.bias)
         for layer in (self.label_embedding, self.timestep_mlp[0], self.timestep_mlp[2]):
             nn.init.normal_(layer.weight, std=0.02)
-        for layer in (*self.modulating(), self.patch_out):
+        for layer in (*self.list_modulations(), self.patch_out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def modulating(self) -> list[nn.Linear]:
+    def list_modulations(self) -> list[nn.Linear]:
         """The layers that the condition goes through: one per block, and the output's."""
         return [*(block.modulation for block in self.blocks), self.modulation]
 
@@ -139,30 +145,30 @@ class DiT(ModelMixin, ConfigMixin):
     def null_label(self) -> int:
         return self.config.num_labels
 
-    def condition(self, timestep: Int[Tensor, batch], label: Int[Tensor, batch]) -> Float[Tensor, "batch d"]:
+    def condition(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> Float[Tensor, "batch d"]:
         """One vector per sample that modulates every block: SiLU of timestep plus label embedding."""
-        frequencies = timestep_frequencies(timestep).to(self.patch_out.weight.dtype)
+        frequencies = embed_timesteps(timestep).to(self.patch_out.weight.dtype)
         return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
 
-    def modulations(self, timestep: Int[Tensor, batch], label: Int[Tensor, batch]) -> list[Tensor]:
+    def modulations(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> list[Tensor]:
         """Shifts, scales and gates of every block (b, 6 d), of the output (b, 2 d), and the noise's shares (b, 2)."""
         condition = self.condition(timestep, label)
-        return [*(layer(condition) for layer in self.modulating()), self.noise_shares[timestep]]
+        return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
 
-    def loss_weight(self, timestep: Int[Tensor, batch]) -> Float[Tensor, batch]:
+    def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
         """What the squared error of the noise counts in training: that of what the network puts out counts 1."""
-        if self.config.prediction == "noise":
+        if self.config.prediction == "epsilon":
             return torch.ones(len(timestep), device=timestep.device)
         return self.noise_shares[timestep, 1] ** -2
 
     def forward(
-        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, batch], label: Int[Tensor, batch]
+        self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]
     ) -> Float[Tensor, "batch c h w"]:
         """The noise in `latent`."""
-        return self.modulated(latent, self.modulations(timestep, label))
+        return self.apply_modulations(latent, self.modulations(timestep, label))
 
     @torch.no_grad()
-    def prepared(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
+    def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
         """`forward` for these timesteps and labels alone: what depends on nothing else is computed once, not in every step.
 
         The modulations are a third of the weights, which each step would read for a row or two. IndexError for others.
@@ -171,17 +177,17 @@ class DiT(ModelMixin, ConfigMixin):
         labels = sorted(set(labels))
         # Label by label: what one's rows round to must not depend on which others there are.
         rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
-        table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.modulating()), 2]
+        table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.list_modulations()), 2]
         row_of = torch.full((int(timestep[-1]) + 1, labels[-1] + 1), len(table), device=timestep.device)
         for k, label in enumerate(labels):
             row_of[timestep, label] = torch.arange(len(timestep), device=timestep.device) + k * len(timestep)
 
         def denoise(latent: Tensor, timestep: Tensor, label: Tensor) -> Tensor:
-            return self.modulated(latent, table[row_of[timestep, label]].split(sizes, dim=1))
+            return self.apply_modulations(latent, table[row_of[timestep, label]].split(sizes, dim=1))
 
         return denoise
 
-    def modulated(
+    def apply_modulations(
         self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor]
     ) -> Float[Tensor, "batch c h w"]:
         """`forward` from modulations that are computed already."""
@@ -194,7 +200,7 @@ class DiT(ModelMixin, ConfigMixin):
         x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c)
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c)
         x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
-        if self.config.prediction == "noise":
+        if self.config.prediction == "epsilon":
             return x
         of_latent, of_velocity = shares[:, :, None, None, None].unbind(1)
         return of_latent * latent + of_velocity * x

@@ -15,7 +15,7 @@ LABELS = {
 }
 
 
-def label_index(kind: str, name: str) -> int:
+def find_label_index(kind: str, name: str) -> int:
     """Index of a label's name; ValueError lists the names of this kind."""
     if name not in LABELS[kind]:
         raise ValueError(f"label {name!r} is unknown to a {kind} model, expected one of: {', '.join(LABELS[kind])}")
@@ -25,4 +25,4 @@ def label_index(kind: str, name: str) -> int:
 def require_labels(kind: str, names: Iterable[str]) -> None:
     """Raises ValueError for a label that is unknown to a model conditioned on `kind`."""
     for name in names:
-        label_index(kind, name)
+        find_label_index(kind, name)

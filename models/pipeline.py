@@ -1,63 +1,68 @@
-"""PrITTIPipeline: LVAE and DiT as one object in diffusers' conventions; labels and seeds in, Scenes out. No Ray."""
+"""PrITTIPipeline: layout VAE and DiT as one object in diffusers' conventions; labels and seeds in, Scenes out. No Ray."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler, DiffusionPipeline, DPMSolverMultistepScheduler, SchedulerMixin
 from jaxtyping import Float
 from torch import Tensor
+from tqdm.auto import tqdm
 
-from models.composition.deduplicate import repeated
-from models.composition.inpaint import Contents, composited, latent_mask, whole_cells
-from models.composition.outpaint import Block, Lattice, Place, World, height_near
+from models.base import Config, read_config, write_config
+from models.composition.deduplicate import find_lower_confidence_duplicates
+from models.composition.extend import Side, extend_scene
+from models.composition.generator import StepCallback
+from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
+from models.composition.outpaint import BlockIndex, outpaint_scene
 from models.dit import DiT
-from models.labels import label_index
+from models.labels import find_label_index
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.pretrained import pipeline_path
+from models.pretrained import INDEX_NAME, find_pipeline_path
 from models.sampling.diffusion import (
     GENERATE,
     INPAINT,
-    OUTPAINT,
     Denoiser,
     Diffusion,
-    Key,
-    Known,
+    InpaintCondition,
     OnStep,
+    SamplingSchedule,
+    SceneKey,
     SceneNoise,
-    Walk,
-    guided,
-    rescaled,
     sample,
-    solve,
+    sample_with_scheduler,
+    scale_noise,
+    with_guidance,
 )
-from models.sampling.repaint import JUMP_LENGTH, RESAMPLINGS, repaint_transitions
+from models.sampling.repaint import NUM_INFERENCE_STEPS, RePaintConfig
+from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene
-from models.tensors import EXISTENCE_THRESHOLD, layout_batch, new_scene, scene_from_layout
+from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene, make_layout_batch
 
-NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
+if TYPE_CHECKING:
+    from diffusers import SchedulerMixin
 
-# The paper's, and others for fewer steps: diffusers' class and its options. Steps even in the log of signal to noise: on a
-# Gaussian of a tenth of the latent's deviation, 20 of them keep 93 % of it, 20 even in time 31 %.
-SAMPLERS = {
-    "ddpm": (DDPMScheduler, {"timestep_spacing": "leading"}),
-    "ddim": (DDIMScheduler, {"timestep_spacing": "leading"}),
-    "dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}),
-    "sde-dpm++": (DPMSolverMultistepScheduler, {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}),
-}
-StepCallback = Callable[[DiffusionPipeline, int, int, dict], dict]  # diffusers' callback_on_step_end
+COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
+SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 
 
-def seeds_of(generator: torch.Generator | Sequence[torch.Generator] | None, seed: int, count: int) -> list[int]:
-    """A seed per scene: `seed` without a generator, else what one draws for all, or each for its scene."""
+def draw_seeds(
+    generator: torch.Generator | Sequence[torch.Generator] | None, seed: int | Sequence[int], count: int
+) -> list[int]:
+    """One seed per scene: `seed` without a generator, else what one generator draws for all or each for its scene.
+
+    Raises:
+        ValueError: The number of generators is neither 1 nor `count`.
+    """
     if generator is None:
-        return [seed] * count
+        return [seed] * count if isinstance(seed, int) else list(seed)
     drawn = [
         int(torch.randint(2**31, (), generator=one, device=one.device))
         for one in ([generator] if isinstance(generator, torch.Generator) else generator)
@@ -67,134 +72,190 @@ def seeds_of(generator: torch.Generator | Sequence[torch.Generator] | None, seed
     return drawn * (count // len(drawn))
 
 
-def scheduler() -> DDPMScheduler:
-    """The paper's noise schedule as a diffusers scheduler, for saving and for its samplers."""
-    d = Diffusion()
-    return DDPMScheduler(
-        num_train_timesteps=d.num_timesteps,
-        beta_start=d.beta_start,
-        beta_end=d.beta_end,
-        beta_schedule="linear",
-        variance_type="fixed_small",
-        timestep_spacing="leading",
-        clip_sample=False,
-    )
-
-
-def require_scaling(noise_scaling: float) -> float:
-    """The same number. Raises ValueError for one that is not near 1."""
+def check_noise_scaling(noise_scaling: float) -> float:
+    """Return the number. Raises ValueError if it is not between 0.9 and 1.1."""
     if not 0.9 <= noise_scaling <= 1.1:
-        raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or a little more, up to 1.1")
+        raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or slightly more, up to 1.1")
     return noise_scaling
 
 
-@dataclass(frozen=True)
-class Resampling:
-    """How inpainting walks: RePaint's roll-back and resamplings over `num_steps` visited timesteps; default: the paper's.
+class PrITTIPipeline:
+    """Generates Scenes. Methods and files are those of diffusers' pipelines.
 
-    `known_guidance`: how strongly what is made is drawn to what is known (diffusion.explaining); 0 is not at all. `eta`: how
-    much noise steps add (diffusion.Walk); of few steps with noise small objects get lost.
-    """
+    Args:
+        lvae: Layout VAE.
+        dit: Diffusion transformer on its latents.
+        scheduler: Noise schedule and sampler (default: the paper's DDPM).
+        noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`); not in
+            the paper.
+        existence_threshold: A scene keeps the primitives whose existence probability is higher; 0.3 in the paper.
 
-    num_steps: int = NUM_INFERENCE_STEPS
-    jump_length: int = JUMP_LENGTH
-    resamplings: int = RESAMPLINGS
-    known_guidance: float = 0.0
-    eta: float = 1.0
-
-    @classmethod
-    def guided(cls, num_steps: int = 50) -> Resampling:
-        """Ours: joins better than the paper's and keeps more objects, for a twenty-fourth of the work (BENCHMARKS.md)."""
-        return cls(num_steps, resamplings=1, known_guidance=1.0, eta=0.3)
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.eta <= 1:
-            raise ValueError(f"eta is {self.eta}, expected 0 (steps add no noise) to 1 (the paper)")
-        if not 0 <= self.known_guidance < math.inf:
-            raise ValueError(f"known_guidance is {self.known_guidance}, expected 0 (none) or more; 1 is its weight")
-
-    def transitions(self) -> list[tuple[int, int]]:
-        return repaint_transitions(self.num_steps, self.jump_length, self.resamplings)
-
-    @property
-    def evaluations(self) -> int:
-        """How often the network is asked."""
-        return sum(to < state for state, to in self.transitions())
-
-
-class PrITTIPipeline(DiffusionPipeline):
-    """Generates Scenes. `from_pretrained(directory)` and `save_pretrained(directory)` as in diffusers.
-
-    `noise_scaling` is what all samplers but the paper's divide the network's noise by (diffusion.rescaled); not in the paper.
-    Primitives whose existence is above `existence_threshold` are in a scene; 0.3 in the paper.
+    Raises:
+        ValueError: The DiT was trained on layouts of another LayoutSpec.
     """
 
     def __init__(
         self,
         lvae: LayoutVAE,
         dit: DiT,
-        scheduler: SchedulerMixin,
+        scheduler: SchedulerConfig | SchedulerMixin | None = None,
         noise_scaling: float = 1.0,
         existence_threshold: float = EXISTENCE_THRESHOLD,
     ) -> None:
-        super().__init__()
-        self.register_modules(lvae=lvae, dit=dit, scheduler=scheduler)
-        self.register_to_config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
-        self.lvae.eval().requires_grad_(False)
-        self.dit.eval().requires_grad_(False)
+        self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
+        self.scheduler_config, self._scheduler = SchedulerConfig.ddpm(), None
+        if scheduler is not None:
+            self.scheduler = scheduler
+        self.config = Config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
+        self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
 
     @classmethod
-    def from_pretrained(cls, directory: str, **options) -> PrITTIPipeline:
-        """A pipeline from a directory that `save_pretrained` or jobs/train_dit.py wrote, or by the name of released weights.
+    def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
+        """Load a pipeline from a local directory or by the name of released weights; nothing is downloaded.
 
-        "town" comes with the package (models/pretrained.py); nothing is ever fetched. Raises ValueError for what is neither.
+        Args:
+            directory: What `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town" (models/pretrained.py).
+            torch_dtype: Data type of the parameters (default: as stored).
+
+        Raises:
+            ValueError: There is no complete pipeline, or a file of it is damaged.
         """
-        return super().from_pretrained(pipeline_path(directory), **{"low_cpu_mem_usage": False} | options)
+        path = Path(find_pipeline_path(directory))
+        index = read_config(path / INDEX_NAME)
+        for name, kind in COMPONENTS.items():
+            if index.get(name) != [kind.__module__, kind.__name__]:
+                raise ValueError(
+                    f"{path / INDEX_NAME}: {name} is {index.get(name)}, expected {[kind.__module__, kind.__name__]}"
+                )
+        scheduler = index.get("scheduler")
+        if not isinstance(scheduler, list) or len(scheduler) != 2 or not isinstance(scheduler[1], str):
+            raise ValueError(f"{path / INDEX_NAME}: scheduler is {scheduler}, expected a class of diffusers")
+        options = {name: index[name] for name in ("noise_scaling", "existence_threshold") if name in index}
+        return cls(
+            LayoutVAE.from_pretrained(path / "lvae", torch_dtype),
+            DiT.from_pretrained(path / "dit", torch_dtype),
+            SchedulerConfig(scheduler[1], read_config(path / SCHEDULER_CONFIG)),
+            **options,
+        )
+
+    def save_pretrained(self, directory: str | os.PathLike) -> None:
+        """Write model_index.json and a directory per component."""
+        path = Path(directory)
+        self.lvae.save_pretrained(path / "lvae")
+        self.dit.save_pretrained(path / "dit")
+        scheduler = path / SCHEDULER_CONFIG
+        scheduler.parent.mkdir(exist_ok=True)
+        write_config(self.scheduler_config.class_name, self.scheduler_config.config, scheduler)
+        index = {name: [kind.__module__, kind.__name__] for name, kind in COMPONENTS.items()}
+        index["scheduler"] = ["diffusers", self.scheduler_config.class_name]
+        write_config(type(self).__name__, index | self.config, path / INDEX_NAME)
+
+    @property
+    def scheduler(self) -> SchedulerMixin:
+        """The sampler as an object of diffusers, which is imported on first use."""
+        if self._scheduler is None:
+            self._scheduler = self.scheduler_config.build()
+        return self._scheduler
+
+    @scheduler.setter
+    def scheduler(self, scheduler: SchedulerConfig | SchedulerMixin) -> None:
+        if isinstance(scheduler, SchedulerConfig):
+            self.scheduler_config, self._scheduler = scheduler, None
+            return
+        plain = json.loads(scheduler.to_json_string())
+        config = {name: value for name, value in plain.items() if not name.startswith("_")}
+        self.scheduler_config, self._scheduler = SchedulerConfig(type(scheduler).__name__, config), scheduler
+
+    def use_sampler(self, name: str) -> None:
+        """Sample with one of `SAMPLERS` ("ddpm" is the paper's). Any other scheduler of diffusers may be set as `scheduler`."""
+        self.scheduler = self.scheduler_config.with_sampler(name)
+
+    @property
+    def uses_ddpm(self) -> bool:
+        """Whether the sampler is the paper's."""
+        return self.scheduler_config.class_name == "DDPMScheduler"
+
+    def register_modules(self, **components: Any) -> None:
+        """Replace `lvae`, `dit` or `scheduler`."""
+        for name, component in components.items():
+            setattr(self, name, component)
+
+    def register_to_config(self, **changes: Any) -> None:
+        """Replace `noise_scaling` or `existence_threshold`."""
+        self.config = Config(self.config | changes)
+
+    @property
+    def components(self) -> dict[str, Any]:
+        """Layout VAE, DiT and scheduler by name."""
+        return {"lvae": self.lvae, "dit": self.dit, "scheduler": self.scheduler}
+
+    def to(self, *args: Any, **kwargs: Any) -> PrITTIPipeline:
+        """Move the networks to a device or data type, as `torch.nn.Module.to`."""
+        self.lvae.to(*args, **kwargs)
+        self.dit.to(*args, **kwargs)
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        return self.dit.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.dit.dtype
+
+    def set_progress_bar_config(self, **options: Any) -> None:
+        """Options of the progress bar, as tqdm takes them: `disable=True` hides it."""
+        self._progress_bar = options
 
     @property
     def spec(self) -> LayoutSpec:
         return self.lvae.spec
 
     @property
+    def latent_shape(self) -> tuple[int, int, int]:
+        return self.lvae.latent_shape
+
+    @property
     def diffusion(self) -> Diffusion:
-        c = self.scheduler.config
-        return Diffusion(c.num_train_timesteps, c.beta_start, c.beta_end)
+        config = self.scheduler_config.config
+        return Diffusion(config["num_train_timesteps"], config["beta_start"], config["beta_end"])
 
     def _moments(self) -> tuple[Tensor, Tensor]:
+        """Shift and scale of the latents, (c, 1, 1) each."""
         channels = self.dit.config.channels
         shift, scale = self.dit.config.shift or [0.0] * channels, self.dit.config.scale or [1.0] * channels
-        return tuple(torch.tensor(v, device=self.device)[:, None, None] for v in (shift, scale))
+        return tuple(torch.tensor(values, device=self.device)[:, None, None] for values in (shift, scale))
 
     @torch.no_grad()
     def encode(self, scenes: Sequence[Scene]) -> Float[Tensor, "b c h w"]:
-        """Posterior means of scenes, in the space the diffusion model lives in."""
+        """Posterior means of scenes in the space of the diffusion model."""
         shift, scale = self._moments()
-        return (self.lvae.encode(layout_batch(list(scenes), self.spec).to(self.device)).mean - shift) / scale
+        return (self.lvae.encode(make_layout_batch(list(scenes), self.spec).to(self.device)).mean - shift) / scale
 
     @torch.no_grad()
     def decode(
         self, latents: Float[Tensor, "b c h w"], identities: Sequence[Scene], existence_threshold: float | None = None
     ) -> list[Scene]:
-        """Scenes from latents; ids and labels from `identities`. Latents are decoded one by one.
+        """Decode latents to scenes that take their ids and labels from `identities`.
 
-        One at a time on purpose: the scene is then the same to the last bit whatever stood beside it. Where every cell
-        decodes by itself, two of them may claim one object: the surer stays (duplicates.repeated).
+        Latents are decoded one at a time, so that a scene is the same to the last bit in any batch. Where cells are
+        decoded separately, two of them may propose the same object: the higher-confidence one is kept.
         """
-        threshold = self.threshold(existence_threshold)
+        threshold = self.resolve_existence_threshold(existence_threshold)
         shift, scale = self._moments()
         layouts = [self.lvae.decode(latent[None] * scale + shift).layouts()[0] for latent in latents]
         scenes = [
-            scene_from_layout(layout, self.spec, identity, threshold)
+            decode_layout(layout, self.spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
         ]
-        if self.lvae.config.decoder != "cells":
+        if self.lvae.config.objects["decoder"] != "cells":
             return scenes
-        return [scene.select(~repeated(scene)) for scene in scenes]
+        return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
 
-    def identity(self, run: str, seed: int, index: int, label: str) -> Scene:
-        """The empty Scene number `index` of a run, carrying the labels it is asked for."""
+    def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
+        """An empty Scene with the id of scene `index` of a run and the requested labels."""
         vegetation, vehicle = None, None
         if self.dit.config.label == "vegetation":
             vegetation = label
@@ -202,7 +263,7 @@ class PrITTIPipeline(DiffusionPipeline):
             vehicle = label
         elif self.dit.config.label == "joint":
             vegetation, vehicle = label.split("-")
-        return new_scene(
+        return make_empty_scene(
             f"generated-{run}-{seed}-{index:07d}",
             f"generated-{run}",
             str(seed),
@@ -213,29 +274,23 @@ class PrITTIPipeline(DiffusionPipeline):
         )
 
     def label_tensor(self, labels: Sequence[str]) -> Tensor:
-        return torch.tensor([label_index(self.dit.config.label, name) for name in labels], device=self.device)
+        """(b,) indices of labels. Raises ValueError for a label that the model does not know."""
+        return torch.tensor([find_label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
     def _denoiser(self, timesteps: np.ndarray | Tensor, label: Tensor, guidance_scale: float) -> Denoiser:
-        """The DiT, guided, with all that does not depend on the latent computed."""
+        """The DiT with classifier-free guidance and precomputed conditioning."""
         null = self.dit.null_label
         labels = label.tolist() if guidance_scale == 1.0 else [*label.tolist(), null]
-        return guided(self.dit.prepared(timesteps.tolist(), labels), null, guidance_scale)
+        return with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
 
-    def use_sampler(self, name: str) -> None:
-        """Sample by one of SAMPLERS from now on: "ddpm" is the paper's; another of diffusers' may be set as `scheduler`."""
-        if name not in SAMPLERS:
-            raise ValueError(f"sampler {name!r} is unknown, expected one of: {', '.join(SAMPLERS)}")
-        kind, changes = SAMPLERS[name]
-        self.scheduler = kind.from_config(self.scheduler.config, **changes)
-
-    def scaling(self, noise_scaling: float | None) -> float:
-        """The number given, or the pipeline's own with its present sampler. Raises ValueError for one that is not near 1."""
+    def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
+        """The number given, or the default of the pipeline with its sampler. Raises ValueError if it is not near 1."""
         if noise_scaling is None:
-            return 1.0 if isinstance(self.scheduler, DDPMScheduler) else self.config.noise_scaling
-        return require_scaling(noise_scaling)
+            return 1.0 if self.uses_ddpm else self.config.noise_scaling
+        return check_noise_scaling(noise_scaling)
 
-    def threshold(self, existence_threshold: float | None) -> float:
-        """The number given, or the pipeline's own. Raises ValueError for one that is no probability."""
+    def resolve_existence_threshold(self, existence_threshold: float | None) -> float:
+        """The number given, or the pipeline's default. Raises ValueError if it is not a probability."""
         if existence_threshold is None:
             return self.config.existence_threshold
         if not 0 < existence_threshold < 1:
@@ -243,9 +298,9 @@ class PrITTIPipeline(DiffusionPipeline):
         return existence_threshold
 
     @contextmanager
-    def _watched(self, evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
-        """What a sampler calls after each evaluation of the model: moves a progress bar, then calls the user's."""
-        with self.progress_bar(total=evaluations) as bar:
+    def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
+        """What a sampler calls after each evaluation: it moves a progress bar and calls the user's callback."""
+        with tqdm(total=num_evaluations, **self._progress_bar) as bar:
 
             def on_step(number: int, timestep: int, latents: Tensor) -> Tensor:
                 bar.update()
@@ -263,22 +318,23 @@ class PrITTIPipeline(DiffusionPipeline):
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """Latents of scenes `indices`; each depends on (seed, its index, its label) only."""
-        noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device)
-        label, noise_scaling = self.label_tensor(labels), self.scaling(noise_scaling)
-        with self._watched(num_inference_steps, callback_on_step_end) as on_step:
-            if isinstance(self.scheduler, DDPMScheduler):
-                walk = Walk(self.diffusion, num_inference_steps)
-                model = rescaled(self._denoiser(walk.timesteps, label, guidance_scale), noise_scaling)
-                return sample(model, walk, noise, label, on_step=on_step)
-            self.diffusion.visited(num_inference_steps)  # diffusers would take any number
+        """Sample latents of scenes `indices`; each depends on (seed, its index, its label) only."""
+        noise = SceneNoise(seed, indices, self.latent_shape, self.device)
+        label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
+        with self._step_callback(num_inference_steps, callback_on_step_end) as on_step:
+            if self.uses_ddpm:
+                schedule = SamplingSchedule(self.diffusion, num_inference_steps)
+                model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
+                return sample(model, schedule, noise, label, on_step=on_step)
+            self.diffusion.select_timesteps(num_inference_steps)  # diffusers accepts any number
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
-            if self.scheduler.timesteps.is_floating_point():
+            timesteps = self.scheduler.timesteps
+            if timesteps.is_floating_point():
                 raise ValueError(
-                    f"{type(self.scheduler).__name__} has timesteps between whole ones: DPM-Solver++ and DDIM have not"
+                    f"{self.scheduler_config.class_name} uses fractional timesteps; DPM-Solver++ and DDIM do not"
                 )
-            model = rescaled(self._denoiser(self.scheduler.timesteps, label, guidance_scale), noise_scaling)
-            return solve(model, self.scheduler, noise, label, on_step)
+            model = scale_noise(self._denoiser(timesteps, label, guidance_scale), noise_scaling)
+            return sample_with_scheduler(model, self.scheduler, noise, label, on_step)
 
     def generate(
         self,
@@ -293,41 +349,60 @@ class PrITTIPipeline(DiffusionPipeline):
         noise_scaling: float | None = None,
         existence_threshold: float | None = None,
     ) -> list[Scene]:
-        """One Scene per label. Scene i depends on (seed, indices[i], its label) only, whatever the batch.
+        """Generate one Scene per label. Scene i depends on (seed, indices[i], its label) only, whatever the batch.
 
-        A `generator` draws the seed, one per scene their seeds. `callback_on_step_end(pipeline, step, timestep,
-        {"latents": ...})` returns such a dict, as in diffusers. `noise_scaling`, `existence_threshold`: instead of the pipeline's own.
+        Args:
+            labels: Class of each scene, such as "low".
+            seed: Seed of the run.
+            indices: Index of each scene within the run (default: 0, 1, ...).
+            num_inference_steps: Number of denoising steps; 250 in the paper.
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            run: Name of the run, part of the scenes' ids.
+            generator: Draws the seed; several draw the seed of their scene.
+            callback_on_step_end: Called as (pipeline, step, timestep, {"latents": ...}), returns such a dict.
+            noise_scaling, existence_threshold: Replace the pipeline's own.
+
+        Raises:
+            ValueError: A label is unknown or a number is out of range.
         """
         indices = range(len(labels)) if indices is None else indices
-        seeds = seeds_of(generator, seed, len(labels))
+        seeds = draw_seeds(generator, seed, len(labels))
         latents = self.sample_latents(
             labels, seeds, indices, num_inference_steps, guidance_scale, callback_on_step_end, noise_scaling
         )
         scenes = zip(seeds, indices, labels, strict=True)
-        return self.decode(latents, [self.identity(run, *scene) for scene in scenes], existence_threshold)
+        return self.decode(latents, [self.new_identity(run, *scene) for scene in scenes], existence_threshold)
 
     __call__ = generate
 
-    def complete(
+    def inpaint_latents(
         self,
-        known: Known,
+        condition: InpaintCondition,
         labels: Sequence[str],
         seed: int | Sequence[int],
-        indices: Sequence[Key],
-        resampling: Resampling,
+        indices: Sequence[SceneKey],
+        repaint: RePaintConfig,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
-        """RePaint: latents that keep `known` bit for bit where its mask is 0 (paper, Sec. 3.3)."""
-        walk = Walk(self.diffusion, resampling.num_steps, resampling.eta)
-        transitions = resampling.transitions()
-        noise = SceneNoise(seed, indices, self.lvae.latent_shape, self.device, purpose)
+        """Sample latents with RePaint; they keep the condition bit for bit where its mask is 0 (paper, Sec. 3.3)."""
+        schedule = SamplingSchedule(self.diffusion, repaint.num_inference_steps, repaint.eta)
+        noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
-        scaling = 1.0 if resampling.eta == 1 else self.config.noise_scaling
-        model = rescaled(self._denoiser(walk.timesteps, label, guidance_scale), scaling)
-        with self._watched(resampling.evaluations, callback_on_step_end) as on_step:
-            return sample(model, walk, noise, label, transitions, known, on_step, resampling.known_guidance)
+        scaling = 1.0 if repaint.eta == 1 else self.config.noise_scaling
+        model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), scaling)
+        with self._step_callback(repaint.num_evaluations, callback_on_step_end) as on_step:
+            return sample(
+                model,
+                schedule,
+                noise,
+                label,
+                repaint.transitions(),
+                condition,
+                on_step,
+                repaint.pseudoinverse_guidance,
+            )
 
     def inpaint(
         self,
@@ -336,112 +411,111 @@ class PrITTIPipeline(DiffusionPipeline):
         labels: Sequence[str],
         contents: Contents = "both",
         seed: int = 0,
-        indices: Sequence[int] | None = None,
-        resampling: Resampling | None = None,
+        indices: Sequence[SceneKey] | None = None,
+        repaint: RePaintConfig | None = None,
         guidance_scale: float = 1.0,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: StepCallback | None = None,
         composite: bool = True,
     ) -> list[Scene]:
-        """Scenes made anew inside their regions (inpaint.py), in whole latent cells (paper, Sec. 3.3).
+        """Regenerate scenes inside their regions, which grow to whole latent cells (paper, Sec. 3.3).
 
-        "objects" alone puts objects on the given ground; "ground" alone, ground under the given objects. The rest is the
-        input's; without `composite` it is what the decoders make of the known latent. Raises ValueError for scenes that
-        are not on the model's grid, or for a model whose latent is not split if contents are not "both".
+        Args:
+            scenes: Scenes on the model's grid.
+            regions: Masks (rows, cols) per scene, True = regenerate (models/composition/inpaint.py).
+            labels: Class of each scene.
+            contents: "objects" puts objects on the given ground, "ground" ground under the given objects.
+            seed, indices, generator: As for `generate`.
+            repaint: Options of RePaint (default: the paper's).
+            guidance_scale, callback_on_step_end: As for `generate`.
+            composite: Take everything outside the regions from the input. Otherwise it is the decoders' reconstruction.
+
+        Raises:
+            ValueError: A scene is not on the model's grid, or the model's latent is not split and `contents` is not "both".
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
             self.require_grid(scene)
         if contents != "both" and not self.lvae.config.split_latent:
-            raise ValueError(f"this model's latent mixes ground and objects: {contents} cannot be made anew alone")
-        shape = self.lvae.latent_shape
-        mask = latent_mask(regions, shape, contents).to(self.device)
-        seeds = seeds_of(generator, seed, len(scenes))
-        known = Known(self.encode(scenes), mask)
-        latents = self.complete(
-            known, labels, seeds, indices, resampling or Resampling(), guidance_scale, callback_on_step_end, INPAINT
-        )
-        made = self.decode(latents, scenes)
-        if not composite:
-            return made
-        return [
-            composited(scene, one, whole_cells(region, scene.grid, shape[-1]), contents)
-            for scene, one, region in zip(scenes, made, regions, strict=True)
-        ]
-
-    def extend(
-        self,
-        world: World,
-        places: Sequence[Place],
-        made: Mapping[Place, Block],
-        like: Scene,
-        label: str | Mapping[Place, str],
-        seed: int = 0,
-        index: int = 0,
-        mode: str = "reencode",
-        resampling: Resampling | None = None,
-        guidance_scale: float = 1.0,
-        callback_on_step_end: StepCallback | None = None,
-    ) -> dict[Place, Block]:
-        """Blocks of a world, all in one batch, that know those made before; ids from `like`, noise from seed, index, place.
-
-        Raises KeyError for a place without a label, or one whose earlier neighbours are not all made.
-        """
-        if mode not in ("copy", "reencode"):
-            raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
-        empty = new_scene(like.scene_id, like.source, like.sequence, like.frame, self.spec)
-        tasks = [world.task(place, made, empty, mode) for place in places]
-        known = Known(torch.stack([task.latent for task in tasks]), torch.stack([task.unknown for task in tasks]))
-        resampling = resampling or Resampling()
-        if not any(task.knows for task in tasks):  # nothing to harmonise with
-            resampling = replace(resampling, resamplings=1, known_guidance=0.0)
-        latents = self.complete(
-            known,
-            [label if isinstance(label, str) else label[place] for place in places],
-            seed,
-            [(index, *place) for place in places],
-            resampling,
+            raise ValueError(f"this model's latent mixes ground and objects: {contents} cannot be regenerated alone")
+        shape = self.latent_shape
+        mask = make_latent_mask(regions, shape, contents).to(self.device)
+        seeds = draw_seeds(generator, seed, len(scenes))
+        condition = InpaintCondition(self.encode(scenes), mask)
+        latents = self.inpaint_latents(
+            condition,
+            labels,
+            seeds,
+            indices,
+            repaint or RePaintConfig(),
             guidance_scale,
             callback_on_step_end,
-            OUTPAINT,
+            INPAINT,
         )
-        scenes = self.decode(latents, [empty] * len(places))
-        parts = zip(places, tasks, latents, scenes, strict=True)
-        return {place: world.block(task, latent, scene) for place, task, latent, scene in parts}
+        generated = self.decode(latents, scenes)
+        if not composite:
+            return generated
+        return [
+            composite_scenes(scene, new, grow_to_cells(region, scene.grid, shape[-1]), contents)
+            for scene, new, region in zip(scenes, generated, regions, strict=True)
+        ]
 
     def outpaint(
         self,
         scene: Scene,
-        label: str | Mapping[Place, str],
+        label: str | Mapping[BlockIndex, str],
         seed: int = 0,
         index: int = 0,
         overlap: float = 0.5,
         mode: str = "reencode",
-        last: tuple[int, int, int, int] = (1, 1, 1, 1),
-        resampling: Resampling | None = None,
+        num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1),
+        repaint: RePaintConfig | None = None,
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
+        side: Side | None = None,
     ) -> Scene:
-        """The scene extended by blocks ahead, behind, left and right, `last` of each (outpaint.py).
+        """Extend a scene by generated blocks; what it held is kept (paper, supplement B.3).
 
-        One to every side is the paper's outpainting: four sides in one batch, then four corners (supplement B.3). `copy`
-        hands each block the shifted latent, as the paper does; `reencode` hands it what is known so far as a Scene, moved
-        into the block's frame and height datum, encoded anew: object latents hold absolute centres, which a copy leaves
-        wrong. `label` is one for all blocks or a mapping from (steps ahead, steps left). Raises ValueError for a scene
-        that is not on the model's grid, or an overlap between two cells.
+        Args:
+            scene: On the model's grid; with `side`, of any size from one block on.
+            label: Class of all blocks, or of each block (steps ahead, steps left).
+            seed, index: Seed of the run and index of the scene within it.
+            overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
+            mode: "copy" gives each block the shifted latent, as the paper does; "reencode" decodes what is known, moves
+                it into the block's frame and height datum and encodes it again. Object latents hold absolute centres,
+                which a copy does not change.
+            num_blocks: Blocks ahead, behind, left and right. One to every side is the paper's outpainting.
+            repaint, guidance_scale, callback_on_step_end: As for `inpaint`.
+            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"), instead of
+                `num_blocks`.
+
+        Returns:
+            One scene that covers all blocks.
+
+        Raises:
+            ValueError: The scene does not fit the model, or the overlap is not a whole number of cells.
         """
+        if side is not None:
+            if not isinstance(label, str):
+                raise ValueError("outpainting to one side takes one label for all blocks")
+            return extend_scene(self, scene, side, label, seed, overlap, repaint, guidance_scale, callback_on_step_end)
         self.require_grid(scene)
-        lattice = Lattice.of(self.lvae.latent_shape[-1], overlap, last=last)
-        world = World(lattice, self.spec, self.encode, height_near(scene, 0.0, 0.0))
-        made = {(0, 0): Block(scene, self.encode([scene])[0])}
-        for front in lattice.fronts(place for place in lattice.places() if place not in made):
-            made |= self.extend(
-                world, front, made, scene, label, seed, index, mode, resampling, guidance_scale, callback_on_step_end
-            )
-        return world.stitched(made, scene)
+        return outpaint_scene(
+            self,
+            scene,
+            label,
+            seed,
+            index,
+            overlap,
+            mode,
+            num_blocks,
+            repaint,
+            guidance_scale,
+            callback_on_step_end,
+        )
 
     def require_grid(self, scene: Scene) -> None:
-        """Raises ValueError for a scene that is not on the model's grid, with its ground classes."""
+        """Raises ValueError if a scene is not on the model's grid with the model's ground classes."""
         if scene.grid != self.spec.grid or scene.ground_classes != self.spec.ground_classes:
             raise ValueError(
                 f"scene {scene.scene_id} has {scene.grid} and ground classes {scene.ground_classes}; "

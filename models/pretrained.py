@@ -7,33 +7,33 @@ import os
 from pathlib import Path
 
 WEIGHTS = Path(__file__).parent / "weights"
-INDEX = "model_index.json"  # makes a directory a pipeline's
-CHECKSUMS = "checksums.json"
-TRAINING = "training.json"  # what the card says of training, for those who go on from these weights
+INDEX_NAME = "model_index.json"  # makes a directory a pipeline's
+CHECKSUMS_NAME = "checksums.json"
+TRAINING_NAME = "training.json"  # what the card says of training, for those who go on from these weights
 
 
-def released() -> list[str]:
+def list_released() -> list[str]:
     """Names that `PrITTIPipeline.from_pretrained` knows."""
-    return sorted(path.parent.name for path in WEIGHTS.glob(f"*/{INDEX}"))
+    return sorted(path.parent.name for path in WEIGHTS.glob(f"*/{INDEX_NAME}"))
 
 
-def pipeline_path(model: str | os.PathLike) -> str:
+def find_pipeline_path(model: str | os.PathLike) -> str:
     """The directory that a path or a name means; a path goes first. Raises ValueError where there is neither.
 
     Never looks beyond this machine.
     """
     model = os.fspath(model)
-    if os.path.exists(os.path.join(model, INDEX)):
+    if os.path.exists(os.path.join(model, INDEX_NAME)):
         return model
-    if model in released():
+    if model in list_released():
         return str(WEIGHTS / model)
     raise ValueError(
-        f"{model}: no PrITTI pipeline here, and none of that name comes with the package ({', '.join(released())})"
+        f"{model}: no PrITTI pipeline here, and none of that name comes with the package ({', '.join(list_released())})"
     )
 
 
-def checksums(directory: str | os.PathLike) -> dict[str, str]:
+def compute_checksums(directory: str | os.PathLike) -> dict[str, str]:
     """SHA-256 of every file that is loaded from a pipeline's directory, by its path there."""
     root = Path(directory)
-    files = [root / INDEX, *sorted(path for path in root.glob("*/*") if path.suffix in (".safetensors", ".json"))]
+    files = [root / INDEX_NAME, *sorted(path for path in root.glob("*/*") if path.suffix in (".safetensors", ".json"))]
     return {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -77,7 +77,7 @@ class Grid:
         """True where a point lies inside the grid's rectangle (half-open: the far and left border belong)."""
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 
-    def shared(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    def intersect(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
         """(rows, cols) of this grid and of the other that show the same place. ValueError if not aligned to whole pixels."""
         row0 = (other.front_m - self.front_m) / self.resolution_m
         col0 = (other.left_m - self.left_m) / self.resolution_m
@@ -92,7 +92,7 @@ class Grid:
             there.append(slice(start + ahead, stop + ahead))
         return tuple(here), tuple(there)
 
-    def enlarged(self, cells: np.ndarray) -> np.ndarray:
+    def upsample_cells(self, cells: np.ndarray) -> np.ndarray:
         """(rows, cols): each of the coarser (h, w) cells as its block of pixels. h divides rows and w cols."""
         h, w = cells.shape
         return cells.repeat(self.rows // h, axis=0).repeat(self.cols // w, axis=1)
@@ -104,7 +104,7 @@ class Grid:
         return row, col
 
 
-def canonical_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same boxes with height nearest the vertical, length >= width and yaw in [-pi/2, pi/2).
 
     rotation (n, 3, 3), columns = the box's axes in the scene frame; size_m (n, 3), full extents along them.
@@ -130,12 +130,12 @@ def canonical_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarra
     return np.stack([length_axis, width_axis, height_axis], axis=2).astype(rotation.dtype), size_m
 
 
-def yaw_of(rotation: np.ndarray) -> np.ndarray:
+def compute_yaw(rotation: np.ndarray) -> np.ndarray:
     """(n,) yaw of the length axis, in [-pi/2, pi/2) for canonical boxes."""
     return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
 
 
-def yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
+def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     """(..., 3, 3) rotation about z."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
@@ -208,7 +208,7 @@ class Scene:
 
     @property
     def yaw_rad(self) -> np.ndarray:
-        return yaw_of(self.rotation)
+        return compute_yaw(self.rotation)
 
     @property
     def bottom_m(self) -> np.ndarray:
@@ -253,19 +253,19 @@ class Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
         return replace(self, **{name: getattr(self, name)[keep] for name in PER_PRIMITIVE})
 
-    def moved(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
+    def translate(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
         """The same content in a frame whose origin lies at (-dx, -dy, -dz): everything, the grid too, moves by d."""
         grid = replace(self.grid, front_m=self.grid.front_m + dx_m, left_m=self.grid.left_m + dy_m)
         center = self.center_m + np.array([dx_m, dy_m, dz_m], np.float32)
         height = np.where(self.occupied, self.height_m + np.float32(dz_m), np.float32(0))
         return replace(self, center_m=center, height_m=height, grid=grid)
 
-    def cropped(self, grid: Grid) -> Scene:
+    def crop(self, grid: Grid) -> Scene:
         """The part inside `grid` (same resolution, aligned to whole pixels); pixels beyond the scene are empty.
 
         Raises ValueError if the grids are not aligned.
         """
-        here, there = grid.shared(self.grid)
+        here, there = grid.intersect(self.grid)
         shape = (len(self.ground_classes), grid.rows, grid.cols)
         height, occupied = np.zeros(shape, np.float32), np.zeros(shape, bool)
         height[:, *here], occupied[:, *here] = self.height_m[:, *there], self.occupied[:, *there]
@@ -273,7 +273,7 @@ class Scene:
         return replace(self.select(inside), height_m=height, occupied=occupied, grid=grid)
 
 
-def merge(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
+def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
     """One scene on `like.grid` from scenes on that grid, by ownership (mask per scene, (H, W) bool, disjoint).
 
     A pixel comes from the scene that owns it; a primitive from the scene that owns the pixel under its centre.
@@ -285,9 +285,9 @@ def merge(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
         row, col = like.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
         row, col = row.clip(0, like.grid.rows - 1), col.clip(0, like.grid.cols - 1)
         parts.append(scene.select(mask[row, col]))
-    return replace(like, height_m=height, occupied=occupied, **joined(parts))
+    return replace(like, height_m=height, occupied=occupied, **concatenate_primitives(parts))
 
 
-def joined(scenes: Sequence[Scene]) -> dict[str, np.ndarray]:
+def concatenate_primitives(scenes: Sequence[Scene]) -> dict[str, np.ndarray]:
     """The primitives of all scenes, one after the other, as fields of a Scene."""
     return {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in PER_PRIMITIVE}

@@ -8,19 +8,19 @@ import numpy as np
 import torch
 
 from models.batch import LayoutBatch
-from models.geometry.cholesky import boxes_from_cholesky, cholesky_parameters
+from models.geometry.cholesky import compute_cholesky_parameters, decode_cholesky_boxes
 from models.layout import FEATURES, LayoutSpec
-from models.scene import CATEGORY_INDEX, Grid, Scene, canonical_boxes
+from models.scene import CATEGORY_INDEX, Grid, Scene, canonicalize_boxes
 
 EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
 
-def ground_on_grid(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground (`resampled`)."""
-    return resampled(*ground_of_classes(scene, ground_classes), scene.grid, grid)
+    return resample_ground(*select_ground_classes(scene, ground_classes), scene.grid, grid)
 
 
-def ground_of_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """height_m and occupied of the named classes; those that the scene does not have are empty."""
     if ground_classes == scene.ground_classes:
         return scene.height_m, scene.occupied
@@ -33,7 +33,7 @@ def ground_of_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np
     return height, occupied
 
 
-def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Heights (G, H, W), metres or whole numbers, and masks on another grid over the same ground.
 
     Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
@@ -47,7 +47,7 @@ def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -
     if own.rows % grid.rows == 0:
         f = own.rows // grid.rows
         wide = np.uint32 if height.dtype.kind == "u" else height.dtype
-        count, total = _block_sums(occupied.view(np.uint8), f, np.uint8), _block_sums(height, f, wide)
+        count, total = _sum_blocks(occupied.view(np.uint8), f, np.uint8), _sum_blocks(height, f, wide)
         keep = 2 * count.astype(np.int16) >= f * f
         mean = total / np.maximum(count, 1).astype(np.float32)
         mean = np.rint(mean) if height.dtype.kind == "u" else mean
@@ -58,7 +58,7 @@ def resampled(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -
     raise ValueError(f"{own.rows} pixels do not divide into {grid.rows}")
 
 
-def _block_sums(values: np.ndarray, f: int, dtype: type) -> np.ndarray:
+def _sum_blocks(values: np.ndarray, f: int, dtype: type) -> np.ndarray:
     """(G, H / f, W / f) sums over f x f blocks: whole rows first, then strided columns of what is left."""
     rows = sum(
         (values[:, i::f].astype(dtype, copy=False) for i in range(1, f)), values[:, ::f].astype(dtype, copy=False)
@@ -66,7 +66,7 @@ def _block_sums(values: np.ndarray, f: int, dtype: type) -> np.ndarray:
     return sum((rows[:, :, j::f] for j in range(1, f)), rows[:, :, ::f])
 
 
-def slot_primitives(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
+def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
     """Which primitive sits in which slot: (m,) slots and (m,) primitive indices.
 
     A category with more primitives than slots keeps those nearest to the ego vehicle (supplement A).
@@ -83,47 +83,47 @@ def slot_primitives(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec
     return ((np.cumsum(slots) - slots)[group] + rank)[kept], order[kept]
 
 
-def compact_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
+def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     """The layout of one scene as small arrays, cheap to send between processes: `LayoutBatch.from_compact` unpacks.
 
     height (G, H, W) uint16 in 65535ths of the bounds, occupied (G, H, W) bool, features (N, 9) float32, real (N,).
     """
-    parameters = cholesky_parameters(scene.rotation, scene.size_m)
-    return compact_ground(scene, spec) | compact_primitives(scene.category, scene.center_m, parameters, spec)
+    parameters = compute_cholesky_parameters(scene.rotation, scene.size_m)
+    return encode_ground(scene, spec) | encode_primitives(scene.category, scene.center_m, parameters, spec)
 
 
-def compact_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
+def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     """height and occupied of `compact_layout`."""
-    height_m, occupied = ground_of_classes(scene, spec.ground_classes)
+    height_m, occupied = select_ground_classes(scene, spec.ground_classes)
     height = np.zeros(height_m.shape, np.uint16)
-    height[occupied] = compact_height(height_m[occupied], spec)
-    height, occupied = resampled(height, occupied, scene.grid, spec.grid)
+    height[occupied] = encode_height(height_m[occupied], spec)
+    height, occupied = resample_ground(height, occupied, scene.grid, spec.grid)
     return {"height": height, "occupied": occupied}
 
 
-def compact_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
+def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
     """Heights in 65535ths of the spec's bounds, uint16, clipped."""
     (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
     scaled = (height_m - np.float32(low)) * np.float32(65535 / (high - low))
     return np.rint(scaled.clip(0, 65535)).astype(np.uint16)
 
 
-def compact_primitives(
+def encode_primitives(
     category: np.ndarray, center_m: np.ndarray, parameters: np.ndarray, spec: LayoutSpec
 ) -> dict[str, np.ndarray]:
     """features and real of `compact_layout` from categories (n,), centres (n, 3) and Cholesky parameters (n, 6)."""
     features = np.zeros((spec.num_slots, FEATURES), np.float32)
     real = np.zeros(spec.num_slots, bool)
-    slots, primitives = slot_primitives(category, center_m, spec)
+    slots, primitives = assign_slots(category, center_m, spec)
     features[slots, :3] = spec.center_bounds_m.normalise(center_m[primitives])
     features[slots, 3:] = spec.cholesky_bounds.normalise(parameters[primitives])
     real[slots] = True
     return {"features": features, "real": real}
 
 
-def layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
+def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
     """Scenes as one batch on the CPU."""
-    layouts = [compact_layout(scene, spec) for scene in scenes]
+    layouts = [encode_layout(scene, spec) for scene in scenes]
     stacked = {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
     return LayoutBatch.from_compact({name: torch.from_numpy(value) for name, value in stacked.items()})
 
@@ -139,7 +139,7 @@ class DecodedLayout:
     category: np.ndarray  # (n,) position in the spec's categories
 
 
-def scene_from_layout(
+def decode_layout(
     layout: DecodedLayout, spec: LayoutSpec, identity: Scene, threshold: float = EXISTENCE_THRESHOLD
 ) -> Scene:
     """The Scene a decoder means (supplement B.2, Layout Reconstruction); ids, pose and labels from `identity`.
@@ -149,8 +149,8 @@ def scene_from_layout(
     occupied = layout.occupancy > 0.5
     height = spec.height_bounds_m.restore(layout.height[..., None])[..., 0]
     kept = np.flatnonzero(layout.existence > threshold)
-    rotation, size = boxes_from_cholesky(spec.cholesky_bounds.restore(layout.features[kept, 3:]))
-    rotation, size = canonical_boxes(rotation, size)
+    rotation, size = decode_cholesky_boxes(spec.cholesky_bounds.restore(layout.features[kept, 3:]))
+    rotation, size = canonicalize_boxes(rotation, size)
     category = np.array([CATEGORY_INDEX[name] for name in spec.categories], np.int8)[layout.category[kept]]
     return replace(
         identity,
@@ -169,7 +169,7 @@ def scene_from_layout(
     )
 
 
-def new_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields) -> Scene:
+def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields) -> Scene:
     """An empty generated Scene to hand to `scene_from_layout` as its identity."""
     shape = (len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
     return Scene(

@@ -17,22 +17,22 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from diffusers import ModelMixin
 from jaxtyping import Float, Int
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from models.base import ConfiguredModel
 from models.batch import LayoutBatch
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.sampling.diffusion import Diffusion, keyed_generator
-from models.vae.losses import lvae_loss
-from models.vae.matching import NotFiniteError
+from models.sampling.diffusion import Diffusion, make_keyed_generator
+from models.vae.losses import compute_lvae_loss
+from models.vae.matching import NonFiniteCostError
 
 
 @dataclass(frozen=True)
-class Optimisation:
+class OptimizerConfig:
     """AdamW with a cosine (OneCycle without warm-up) or constant learning rate."""
 
     steps: int
@@ -60,7 +60,7 @@ class Optimisation:
 
 
 @dataclass(frozen=True)
-class Execution:
+class ExecutionConfig:
     """How steps are computed, not what: the same weights come out, up to rounding."""
 
     accumulate: int = 1  # parts into which a batch is cut, one after another, where it does not fit memory
@@ -80,7 +80,7 @@ class Execution:
         return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
 
 
-class NotFinite(ValueError):
+class NonFiniteLossError(ValueError):
     """A loss is not finite. `positions` are the samples of the global batch that are to blame, empty if all are."""
 
     def __init__(self, step: int, positions: list[int]) -> None:
@@ -92,12 +92,12 @@ class NotFinite(ValueError):
 LossFunction = Callable[[nn.Module, dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
 
 
-def stacked_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
+def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
     """(len(generators), *shape) standard normal numbers, one generator per sample."""
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 
-def stacked_corruption(
+def sample_corruption(
     generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
 ) -> Tensor:
     """(len(generators), *shape) normal numbers, each sample's as large as |N(0, spread^2)| says."""
@@ -105,7 +105,7 @@ def stacked_corruption(
     return torch.stack(drawn).to(device)
 
 
-def layout_loss(
+def make_layout_loss(
     spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
 ) -> LossFunction:
     """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
@@ -113,11 +113,11 @@ def layout_loss(
     def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
         device = arrays["real"].device
         batch = LayoutBatch.from_compact(arrays)
-        noise = stacked_noise(generators, latent_shape, device)
-        corruption = stacked_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
+        noise = sample_noise(generators, latent_shape, device)
+        corruption = sample_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
         output, posterior = model(batch, noise, corruption)
         output, posterior = output.float(), posterior.float()
-        parts = lvae_loss(output, posterior, batch, spec, kl_weight).items()
+        parts = compute_lvae_loss(output, posterior, batch, spec, kl_weight).items()
         return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
 
     return loss
@@ -127,7 +127,7 @@ Timesteps = Literal["even", "middle"]
 MIDDLE = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half of the timesteps lie between 196 and 552
 
 
-def drawn_timestep(uniform: Float[Tensor, b], density: Timesteps, num_timesteps: int) -> Int[Tensor, b]:
+def sample_timesteps(uniform: Float[Tensor, " b"], density: Timesteps, num_timesteps: int) -> Int[Tensor, " b"]:
     """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
 
     Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these. Logit-normal, as in
@@ -138,7 +138,9 @@ def drawn_timestep(uniform: Float[Tensor, b], density: Timesteps, num_timesteps:
     return (uniform * num_timesteps).long().clamp(max=num_timesteps - 1)
 
 
-def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float, timesteps: Timesteps = "even") -> LossFunction:
+def make_diffusion_loss(
+    dit: DiT, diffusion: Diffusion, label_dropout: float, timesteps: Timesteps = "even"
+) -> LossFunction:
     """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
 
     Latents are sampled anew from the cached posterior; one label-dropout mask per sample.
@@ -150,11 +152,11 @@ def noise_loss(dit: DiT, diffusion: Diffusion, label_dropout: float, timesteps: 
     def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
-        latent = mean + (0.5 * logvar).exp() * stacked_noise(generators, shape, device)
+        latent = mean + (0.5 * logvar).exp() * sample_noise(generators, shape, device)
         latent = (latent - shift.to(device)) / scale.to(device)
-        noise = stacked_noise(generators, shape, device)
+        noise = sample_noise(generators, shape, device)
         uniform = torch.stack([torch.rand(2, generator=generator) for generator in generators]).to(device)
-        timestep = drawn_timestep(uniform[:, 0], timesteps, diffusion.num_timesteps)
+        timestep = sample_timesteps(uniform[:, 0], timesteps, diffusion.num_timesteps)
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
@@ -171,17 +173,19 @@ class Trainer:
 
     def __init__(
         self,
-        model: ModelMixin,
+        model: ConfiguredModel,
         loss: LossFunction,
-        settings: Optimisation,
+        settings: OptimizerConfig,
         device: torch.device,
         wrapped: nn.Module | None = None,
-        execution: Execution | None = None,
+        execution: ExecutionConfig | None = None,
     ) -> None:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
-        self.settings, self.device, self.execution = settings, device, execution or Execution()
+        self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
         self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
-        rates = getattr(model, "learning_rates", dict)()  # of parts whose rate is not everybody's, by name's beginning
+        rates = getattr(
+            model, "learning_rate_factors", dict
+        )()  # of parts whose rate is not everybody's, by name's beginning
         share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
         groups = [
             {"params": [p for n, p in self.parameters.items() if share[n] == value], "share": value}
@@ -214,7 +218,7 @@ class Trainer:
             with self.wrapped.no_sync() if more and hasattr(self.wrapped, "no_sync") else nullcontext():
                 losses = self._losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
-                    raise NotFinite(self.steps_done, self._to_blame(arrays, positions))
+                    raise NonFiniteLossError(self.steps_done, self._find_nonfinite_samples(arrays, positions))
                 (share * losses["loss"]).backward()
             for name, value in losses.items():
                 totals[name] = totals.get(name, 0) + share * value.detach()
@@ -227,16 +231,16 @@ class Trainer:
 
     def _losses(self, network: nn.Module, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
         """The parts of the loss by `network`, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
-        generators = [keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
+        generators = [make_keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
         try:
             with self.execution.autocast(self.device):
                 losses = self.loss(network, arrays, generators)
-        except NotFiniteError:
+        except NonFiniteCostError:
             return None
         return losses if torch.isfinite(losses["loss"]) else None
 
     @torch.no_grad()
-    def _to_blame(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
+    def _find_nonfinite_samples(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
         """The positions whose own loss is not finite; empty if that is all of them.
 
         By the model itself: a wrapped one would wait here for the other workers, who are elsewhere.
@@ -255,7 +259,7 @@ class Trainer:
         torch._foreach_lerp_(list(self.ema.values()), list(self.parameters.values()), 1 - decay)
 
     @torch.no_grad()
-    def averaged(self) -> ModelMixin:
+    def ema_model(self) -> ConfiguredModel:
         """The model to use: a copy with EMA weights, or the model itself where there is no EMA."""
         if not self.ema:
             return self.model
@@ -311,35 +315,35 @@ class Trainer:
 Wrap = Callable[[nn.Module], nn.Module]
 
 
-def lvae_trainer(
+def make_lvae_trainer(
     model: LayoutVAE,
-    settings: Optimisation,
+    settings: OptimizerConfig,
     kl_weight: float,
     device: torch.device,
     wrap: Wrap = lambda m: m,
-    execution: Execution | None = None,
+    execution: ExecutionConfig | None = None,
     latent_noise: float = 0.0,
 ) -> Trainer:
-    execution = execution or Execution()
+    execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise)
-    return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
+    loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise)
+    return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
 
 
-def dit_trainer(
+def make_dit_trainer(
     model: DiT,
-    settings: Optimisation,
+    settings: OptimizerConfig,
     label_dropout: float,
     device: torch.device,
     wrap: Wrap = lambda m: m,
-    execution: Execution | None = None,
+    execution: ExecutionConfig | None = None,
     timesteps: Timesteps = "even",
 ) -> Trainer:
-    execution = execution or Execution()
+    execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = noise_loss(model, Diffusion(), label_dropout, timesteps)
-    return Trainer(model, loss, settings, device, wrap(_compiled(model, execution)), execution)
+    loss = make_diffusion_loss(model, Diffusion(), label_dropout, timesteps)
+    return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
 
 
-def _compiled(model: nn.Module, execution: Execution) -> nn.Module:
+def _compile_model(model: nn.Module, execution: ExecutionConfig) -> nn.Module:
     return torch.compile(model) if execution.compile else model

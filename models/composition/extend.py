@@ -1,4 +1,4 @@
-"""Scenes of any size, block by block of the model's: grown to one side, or made anew inside a region (paper, Sec. 3.3)."""
+"""Scenes larger than one block: extended to one side, or regenerated inside a region (paper, Sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,24 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from models.composition.inpaint import Contents, composited, latent_mask, whole_cells
-from models.composition.outpaint import Lattice, height_near
-from models.composition.seam_blending import new_part, spread
-from models.pipeline import PrITTIPipeline, Resampling, StepCallback
-from models.sampling.diffusion import OUTPAINT, Known
-from models.scene import Grid, Scene, merge
-from models.tensors import new_scene
+from models.composition.generator import SceneGenerator, StepCallback
+from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
+from models.composition.outpaint import BlockGrid, find_ground_height
+from models.composition.seam_blending import extract_new_part, extrapolate_ground
+from models.sampling.diffusion import OUTPAINT, InpaintCondition
+from models.sampling.repaint import RePaintConfig
+from models.scene import Grid, Scene, merge_scenes
+from models.tensors import make_empty_scene
 
 Side = Literal["ahead", "behind", "left", "right"]
 
 
-def grown(grid: Grid, side: Side, pixels: int) -> Grid:
-    """The grid with so many more pixels on a side. ValueError for a side that is none."""
+def expand_grid(grid: Grid, side: Side, pixels: int) -> Grid:
+    """Add pixels to a grid on one side.
+
+    Raises:
+        ValueError: The side is unknown.
+    """
     if side not in get_args(Side):
         raise ValueError(f"side {side!r}, expected one of: {', '.join(get_args(Side))}")
     more_m = pixels * grid.resolution_m
@@ -30,21 +35,21 @@ def grown(grid: Grid, side: Side, pixels: int) -> Grid:
     return replace(grid, left_m=grid.left_m + (more_m if side == "left" else 0), cols=grid.cols + pixels)
 
 
-def windows(grid: Grid, side: Side, small: Grid, step_px: int) -> Iterator[Grid]:
-    """Blocks of the model's size along a side of a grid, every step_px, the last one flush with its end."""
+def tile_side(grid: Grid, side: Side, block: Grid, step_px: int) -> Iterator[Grid]:
+    """Blocks of the model's size along one side of a grid, every `step_px`; the last one ends with the grid."""
     along = grid.cols if side in ("ahead", "behind") else grid.rows
-    size = small.cols if side in ("ahead", "behind") else small.rows
+    size = block.cols if side in ("ahead", "behind") else block.rows
     for start in [*range(0, along - size, step_px), along - size]:
-        row = {"ahead": 0, "behind": grid.rows - small.rows}.get(side, start)
-        col = {"left": 0, "right": grid.cols - small.cols}.get(side, start)
+        row = {"ahead": 0, "behind": grid.rows - block.rows}.get(side, start)
+        col = {"left": 0, "right": grid.cols - block.cols}.get(side, start)
         front_m, left_m = grid.front_m - row * grid.resolution_m, grid.left_m - col * grid.resolution_m
-        yield replace(small, front_m=front_m, left_m=left_m)
+        yield replace(block, front_m=front_m, left_m=left_m)
 
 
-def covering(grid: Grid, region: np.ndarray, small: Grid, cell_px: int) -> list[Grid]:
-    """Blocks of the model's size, on whole cells of a grid, that hold all pixels of a region between them.
+def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> list[Grid]:
+    """Blocks of the model's size, on whole cells of a grid, that together hold all pixels of a region.
 
-    One in the middle of a region that fits into a block; else one every half a block.
+    A region that fits into one block gets one, centred; a larger one gets a block every half a block.
     """
 
     def starts(found: np.ndarray, along: int, size: int) -> list[int]:
@@ -57,146 +62,170 @@ def covering(grid: Grid, region: np.ndarray, small: Grid, cell_px: int) -> list[
 
     rows, cols = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
     return [
-        replace(small, front_m=grid.front_m - row * grid.resolution_m, left_m=grid.left_m - col * grid.resolution_m)
-        for row in starts(rows, grid.rows, small.rows)
-        for col in starts(cols, grid.cols, small.cols)
+        replace(block, front_m=grid.front_m - row * grid.resolution_m, left_m=grid.left_m - col * grid.resolution_m)
+        for row in starts(rows, grid.rows, block.rows)
+        for col in starts(cols, grid.cols, block.cols)
     ]
 
 
-def in_block(canvas: Scene, window: Grid, small: Grid, level_m: float) -> tuple[Scene, tuple[float, float, float]]:
-    """What a window of a scene holds, in the model's frame and at the height `level_m` there; the way back, x, y, z in metres."""
-    dx_m, dy_m = small.front_m - window.front_m, small.left_m - window.left_m
-    known = canvas.cropped(window).moved(dx_m, dy_m)
-    datum_m = height_near(known, 0.0, 0.0) - level_m
-    return known.moved(0, 0, -datum_m), (-dx_m, -dy_m, datum_m)
+def to_block_frame(
+    canvas: Scene, window: Grid, block: Grid, level_m: float
+) -> tuple[Scene, tuple[float, float, float]]:
+    """Crop a window of a scene and move it into the model's frame, with ground at height `level_m` under the origin.
 
-
-def require_blocks(scene: Scene, pipeline: PrITTIPipeline) -> None:
-    """Raises ValueError for a scene of another resolution or of other ground classes than the model's, or smaller than a block."""
-    spec, small = pipeline.spec, pipeline.spec.grid
-    if scene.grid.resolution_m != small.resolution_m or scene.ground_classes != spec.ground_classes:
-        raise ValueError(f"{scene}: the model needs {small.resolution_m} m and {', '.join(spec.ground_classes)}")
-    if scene.grid.rows < small.rows or scene.grid.cols < small.cols:
-        raise ValueError(f"{scene} is smaller than a block of {small.rows} x {small.cols}")
-
-
-def region_blocks(pipeline: PrITTIPipeline, scene: Scene, region: np.ndarray) -> list[tuple[Grid, np.ndarray]]:
-    """Blocks with the part (rows, cols) of a region that each makes anew, in whole cells, no cell twice.
-
-    Raises ValueError as `require_blocks`.
+    Returns:
+        The cropped scene and the translation back (x, y, z) in metres.
     """
-    require_blocks(scene, pipeline)
-    small, size = pipeline.spec.grid, pipeline.lvae.latent_shape[-1]
-    left, parts = region.copy(), []
-    for window in covering(scene.grid, region, small, small.rows // size) if region.any() else []:
-        here = scene.grid.shared(window)[0]
-        if left[here].any():
-            parts.append((window, whole_cells(left[here], small, size)))
-            left[here] &= ~parts[-1][1]
+    dx_m, dy_m = block.front_m - window.front_m, block.left_m - window.left_m
+    known = canvas.crop(window).translate(dx_m, dy_m)
+    datum_m = find_ground_height(known, 0.0, 0.0) - level_m
+    return known.translate(0, 0, -datum_m), (-dx_m, -dy_m, datum_m)
+
+
+def require_blocks(model: SceneGenerator, scene: Scene) -> None:
+    """Raises ValueError if a scene has another resolution or other ground classes than the model, or is below one block."""
+    spec, block = model.spec, model.spec.grid
+    if scene.grid.resolution_m != block.resolution_m or scene.ground_classes != spec.ground_classes:
+        raise ValueError(f"{scene}: the model needs {block.resolution_m} m and {', '.join(spec.ground_classes)}")
+    if scene.grid.rows < block.rows or scene.grid.cols < block.cols:
+        raise ValueError(f"{scene} is smaller than a block of {block.rows} x {block.cols}")
+
+
+def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> list[tuple[Grid, np.ndarray]]:
+    """Split a region into blocks, each with the part (rows, cols) that it regenerates, in disjoint whole cells.
+
+    Raises:
+        ValueError: As `require_blocks`.
+    """
+    require_blocks(model, scene)
+    block, size = model.spec.grid, model.latent_shape[-1]
+    remaining, parts = region.copy(), []
+    for window in tile_region(scene.grid, region, block, block.rows // size) if region.any() else []:
+        here = scene.grid.intersect(window)[0]
+        if remaining[here].any():
+            parts.append((window, grow_to_cells(remaining[here], block, size)))
+            remaining[here] &= ~parts[-1][1]
     return parts
 
 
 @dataclass(frozen=True)
-class Step:
-    """A block made anew in several variants of a scene: `made` what decoders said, `canvases` the scenes with it in them.
+class InpaintStep:
+    """One block regenerated in several variants of a scene.
 
-    `known`, `made` and `region` (rows, cols; whole cells) are the block's own; `canvases` are as large as the scene.
+    Args:
+        known: The block's input per variant.
+        generated: What was decoded for it, before compositing.
+        region: (rows, cols) bool, the block's regenerated pixels, in whole cells.
+        canvases: The whole scene per variant, with the block composited.
     """
 
     known: list[Scene]
-    made: list[Scene]
+    generated: list[Scene]
     region: np.ndarray
     canvases: list[Scene]
 
 
-def inpainting(
-    pipeline: PrITTIPipeline,
+def inpaint_blocks(
+    model: SceneGenerator,
     scene: Scene,
     region: np.ndarray,
     label: str,
     contents: Contents = "both",
     seed: int = 0,
     indices: Sequence[int] = (0,),
-    resampling: Resampling | None = None,
+    repaint: RePaintConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
-) -> Iterator[Step]:
-    """A scene of any size made anew, once per index, inside a region (rows, cols) of its pixels; the last step has all of it.
+) -> Iterator[InpaintStep]:
+    """Regenerate a region of a scene of any size, block by block, once per index; the last step holds the result.
 
-    `PrITTIPipeline.inpaint` on a scene of the model's size; on a larger one block by block, each knowing what is there.
-    Regions grow to whole cells, the rest stays bit for bit. Raises ValueError for an empty one, and as `require_blocks`.
+    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit for
+    bit.
+
+    Args:
+        model, scene: The model and the scene, at least one block large.
+        region: (rows, cols) bool, True = regenerate.
+        label: Class of the scene.
+        contents: As for `PrITTIPipeline.inpaint`.
+        seed, indices: One variant per index.
+        repaint, guidance_scale, callback_on_step_end: As for `PrITTIPipeline.inpaint`.
+
+    Raises:
+        ValueError: The region is empty, or as `require_blocks`.
     """
     if not region.any():
         raise ValueError(f"{scene}: the region holds no pixel of it")
-    canvases, level_m = [scene] * len(indices), height_near(scene, 0.0, 0.0)
-    for number, (window, part) in enumerate(region_blocks(pipeline, scene, region)):
-        blocks = [in_block(canvas, window, pipeline.spec.grid, level_m) for canvas in canvases]
+    canvases, level_m = [scene] * len(indices), find_ground_height(scene, 0.0, 0.0)
+    for number, (window, part) in enumerate(split_region(model, scene, region)):
+        blocks = [to_block_frame(canvas, window, model.spec.grid, level_m) for canvas in canvases]
         known = [block for block, _ in blocks]
-        made = pipeline.inpaint(
+        generated = model.inpaint(
             known,
             [part] * len(known),
             [label] * len(known),
             contents,
             seed,
             [(index, number) if number else index for index in indices],
-            resampling,
+            repaint,
             guidance_scale,
             callback_on_step_end=callback_on_step_end,
             composite=False,
         )
         inside = np.zeros_like(region)
-        inside[scene.grid.shared(window)[0]] = part
+        inside[scene.grid.intersect(window)[0]] = part
         canvases = [
-            composited(canvas, one.moved(*offset_m).cropped(scene.grid), inside, contents)
-            for canvas, one, (_, offset_m) in zip(canvases, made, blocks, strict=True)
+            composite_scenes(canvas, new.translate(*offset_m).crop(scene.grid), inside, contents)
+            for canvas, new, (_, offset_m) in zip(canvases, generated, blocks, strict=True)
         ]
-        yield Step(known, made, part, canvases)
+        yield InpaintStep(known, generated, part, canvases)
 
 
-def extended(
-    pipeline: PrITTIPipeline,
+def extend_scene(
+    model: SceneGenerator,
     scene: Scene,
     side: Side,
     label: str,
     seed: int = 0,
     overlap: float = 0.5,
-    resampling: Resampling | None = None,
+    repaint: RePaintConfig | None = None,
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Scene:
-    """The scene with (1 - overlap) of a block more on one side; what was there stays as it is.
+    """Extend a scene by (1 - overlap) of a block to one side; see `PrITTIPipeline.outpaint`.
 
-    Each block knows what lies in it already, encoded anew in its own frame and height. Raises ValueError for a scene of
-    another resolution or of other ground classes than the model's, smaller than a block, or for an overlap between cells.
+    Each block is conditioned on what lies in it already, encoded again in the block's frame and height.
+
+    Raises:
+        ValueError: As `require_blocks`, or the overlap is not a whole number of cells, or the side is unknown.
     """
-    spec, small = pipeline.spec, pipeline.spec.grid
-    require_blocks(scene, pipeline)
-    size = pipeline.lvae.latent_shape[-1]
-    step_px = Lattice.of(size, overlap).step * (small.rows // size)
-    grid = grown(scene.grid, side, step_px)
-    canvas, level_m = scene.cropped(grid), height_near(scene, 0.0, 0.0)
-    made = np.zeros((grid.rows, grid.cols), bool)
-    made[grid.shared(scene.grid)[0]] = True
-    empty = new_scene(scene.scene_id, scene.source, scene.sequence, scene.frame, spec)
-    for number, window in enumerate(windows(grid, side, small, step_px)):
-        here = grid.shared(window)[0]
-        unknown = ~made[here]
-        known, offset_m = in_block(canvas, window, small, level_m)
-        latent = pipeline.encode([spread(known, unknown)])
-        mask = latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
-        latent = pipeline.complete(
-            Known(latent, mask),
+    spec, block = model.spec, model.spec.grid
+    require_blocks(model, scene)
+    size = model.latent_shape[-1]
+    step_px = BlockGrid.from_overlap(size, overlap).step * (block.rows // size)
+    grid = expand_grid(scene.grid, side, step_px)
+    canvas, level_m = scene.crop(grid), find_ground_height(scene, 0.0, 0.0)
+    covered = np.zeros((grid.rows, grid.cols), bool)
+    covered[grid.intersect(scene.grid)[0]] = True
+    empty = make_empty_scene(scene.scene_id, scene.source, scene.sequence, scene.frame, spec)
+    for number, window in enumerate(tile_side(grid, side, block, step_px)):
+        here = grid.intersect(window)[0]
+        unknown = ~covered[here]
+        known, offset_m = to_block_frame(canvas, window, block, level_m)
+        latent = model.encode([extrapolate_ground(known, unknown)])
+        mask = make_latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
+        latent = model.inpaint_latents(
+            InpaintCondition(latent, mask),
             [label],
             seed,
             [(number, step_px, grid.rows, grid.cols, get_args(Side).index(side))],
-            resampling or Resampling(),
+            repaint or RePaintConfig(),
             guidance_scale,
             callback_on_step_end,
             OUTPAINT,
         )
-        block = pipeline.decode(latent, [empty])[0]
-        new = new_part(block, known, unknown).moved(*offset_m)
-        before = made.copy()
-        made[here] = True
-        canvas = merge([canvas, new.cropped(grid)], [before, made & ~before], canvas)
+        generated = model.decode(latent, [empty])[0]
+        new = extract_new_part(generated, known, unknown).translate(*offset_m)
+        before = covered.copy()
+        covered[here] = True
+        canvas = merge_scenes([canvas, new.crop(grid)], [before, covered & ~before], canvas)
     return canvas

@@ -1,6 +1,6 @@
-"""Inpainting: which part of a scene to make anew, and the scene put together from both (paper, Sec. 3.3).
+"""Inpainting: regions to regenerate, and the composition of known and generated parts (paper, Sec. 3.3).
 
-A region is a mask (rows, cols) over a scene's pixels, True = make anew. Regions are sets: join them with |, & and ~.
+A region is a mask (rows, cols) over a scene's pixels, True = regenerate. Regions are sets: join them with |, & and ~.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.composition.deduplicate import doubles
-from models.composition.seam_blending import continued
-from models.scene import Grid, Scene, joined, merge, yaw_rotation
+from models.composition.deduplicate import find_regenerated_objects
+from models.composition.seam_blending import blend_ground
+from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation, merge_scenes
 
-Contents = Literal["both", "ground", "objects"]  # what to make anew inside a region
+Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a region
 
 
-def polygon_contains(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+def contains_points(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
 
     Raises ValueError for fewer than three corners or numbers that are not finite.
@@ -36,12 +36,12 @@ def polygon_contains(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m:
     return inside
 
 
-def polygon_region(grid: Grid, corners_m: Sequence[Sequence[float]]) -> np.ndarray:
+def select_polygon(grid: Grid, corners_m: Sequence[Sequence[float]]) -> np.ndarray:
     """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
-    return polygon_contains(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
+    return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
 
-def half_plane_region(grid: Grid, normal: Sequence[float], offset_m: float) -> np.ndarray:
+def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> np.ndarray:
     """(rows, cols) pixels at least `offset_m` along a direction (x, y), which need not have length 1.
 
     (1, 0) and 40: everything at least 40 m ahead. Raises ValueError for a direction of length 0.
@@ -53,19 +53,19 @@ def half_plane_region(grid: Grid, normal: Sequence[float], offset_m: float) -> n
     return along >= offset_m * length
 
 
-def object_region(scene: Scene, primitives: Sequence[int], margin_m: float = 1.0) -> np.ndarray:
+def select_around_objects(scene: Scene, primitives: Sequence[int], margin_m: float = 1.0) -> np.ndarray:
     """(rows, cols) pixels within the upright bounds of primitives, grown by a margin. IndexError for none of that number."""
     chosen = scene.select(np.asarray(primitives, int))
     region = np.zeros((scene.grid.rows, scene.grid.cols), bool)
-    upright = yaw_rotation(chosen.yaw_rad)
+    upright = make_yaw_rotation(chosen.yaw_rad)
     half_m = np.abs(np.swapaxes(upright, 1, 2) @ chosen.rotation) @ chosen.size_m[..., None] / 2 + margin_m
     for center, axes, half in zip(chosen.center_m, upright, half_m[:, :2, 0], strict=True):
         signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
-        region |= polygon_region(scene.grid, center[:2] + (signs * half) @ axes[:2, :2].T)
+        region |= select_polygon(scene.grid, center[:2] + (signs * half) @ axes[:2, :2].T)
     return region
 
 
-def cells_of(region: np.ndarray, size: int) -> np.ndarray:
+def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
     """(size, size) latent cells that hold a pixel of a region. ValueError if pixels do not divide into cells."""
     rows, cols = region.shape
     if rows % size or cols % size:
@@ -73,20 +73,21 @@ def cells_of(region: np.ndarray, size: int) -> np.ndarray:
     return region.reshape(size, rows // size, size, cols // size).any(axis=(1, 3))
 
 
-def whole_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
-    """The region grown to whole latent cells: what is really made anew."""
-    return grid.enlarged(cells_of(region, size))
+def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
+    """Grow a region to whole latent cells, which are what is regenerated."""
+    return grid.upsample_cells(find_region_cells(region, size))
 
 
-def latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents) -> Tensor:
-    """(b, c, h, w) float32, 1 = make anew: in a split latent the first half of the channels is the ground's.
+def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents) -> Tensor:
+    """(b, c, h, w) float32, 1 = regenerate. The first half of a split latent's channels is the ground's.
 
-    Raises ValueError for unknown contents.
+    Raises:
+        ValueError: `contents` is unknown.
     """
     if contents not in get_args(Contents):
         raise ValueError(f"contents {contents!r}, expected one of: {', '.join(get_args(Contents))}")
     channels, size, _ = shape
-    cells = torch.from_numpy(np.stack([cells_of(region, size) for region in regions])).float()
+    cells = torch.from_numpy(np.stack([find_region_cells(region, size) for region in regions])).float()
     mask = cells[:, None].repeat(1, channels, 1, 1)
     if contents != "both":
         kept = slice(channels // 2, None) if contents == "ground" else slice(channels // 2)
@@ -94,19 +95,25 @@ def latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], cont
     return mask
 
 
-def composited(scene: Scene, made: Scene, region: np.ndarray, contents: Contents) -> Scene:
-    """The scene with what was made anew inside a region of whole cells; all else from the scene, bit for bit. New ground
-    is bent near the border to go on from the given (borders.py).
+def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
+    """Combine a scene with its regenerated part; everything outside the region is the input's, bit for bit.
 
-    Pixels by place, primitives by the pixel under their centre. Decoders see the whole latent: what they say outside the
-    region differs a little from the scene although the latent there does not. A known object near the border may so be
-    decoded a little inside it: it is not put there again.
+    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known ground
+    at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region differs
+    slightly from the scene although the latent there does not: a known object near the border may be decoded a little
+    inside the region. Such copies are removed.
+
+    Args:
+        scene: Input.
+        generated: Decoded scene on the same grid.
+        region: (rows, cols) bool, whole latent cells.
+        contents: What was regenerated.
     """
     nothing = np.zeros_like(region)
     ground, objects = (nothing if contents == other else region for other in ("objects", "ground"))
-    kept = merge([scene], [~objects], scene)
-    made = continued(made.select(~doubles(made, kept)), scene, ground)
-    of_ground = merge([scene, made], [~ground, ground], scene)
-    new = merge([made], [objects], scene)
-    both = joined([kept, new])
+    kept = merge_scenes([scene], [~objects], scene)
+    generated = blend_ground(generated.select(~find_regenerated_objects(generated, kept)), scene, ground)
+    of_ground = merge_scenes([scene, generated], [~ground, ground], scene)
+    new = merge_scenes([generated], [objects], scene)
+    both = concatenate_primitives([kept, new])
     return replace(scene, height_m=of_ground.height_m, occupied=of_ground.occupied, **both)

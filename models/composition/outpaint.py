@@ -1,12 +1,12 @@
-"""A growing world: blocks on a lattice, what a new one knows of earlier ones, and all of them put together.
+"""Outpainting on a grid of overlapping blocks (paper, supplement B.3).
 
-The paper's outpainting (supplement B.3) is three blocks by three, the given one in the middle. Any rectangle is the same
-with more blocks, and so is a world without end: only the order differs in which neighbours are made.
+The paper extends a scene to three by three blocks, with the given one in the middle. Any rectangle works the same way
+with more blocks, and so does an unbounded grid; only the order differs in which neighbours are generated.
 
-Block (i, j) lies i steps ahead and j steps left of block (0, 0); a step is (1 - overlap) of a block. Every block has a
-rank that follows from (i, j) alone. Where blocks overlap, the lowest rank owns; equal ranks never meet in what they own.
-A block is made knowing what lower ranks own of it. So the world does not depend on when, where or in which order its
-blocks are made.
+Block (i, j) lies i steps ahead and j steps left of block (0, 0); a step is (1 - overlap) of a block. The rank of a block
+follows from (i, j) alone. Where blocks overlap, the lowest rank owns the cell; blocks of equal rank never overlap in cells
+that they own. A block is conditioned on the cells that lower ranks own. The result therefore does not depend on when,
+where or in which order blocks are generated.
 """
 
 from __future__ import annotations
@@ -15,106 +15,126 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby, product
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from models.composition.seam_blending import new_part, spread
+from models.composition.generator import SceneGenerator, StepCallback
+from models.composition.seam_blending import extract_new_part, extrapolate_ground
 from models.layout import LayoutSpec
-from models.scene import Grid, Scene, joined, merge
+from models.sampling.diffusion import OUTPAINT, InpaintCondition
+from models.sampling.repaint import RePaintConfig
+from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
+from models.tensors import make_empty_scene
 
-Place = tuple[int, int]  # (i, j) of a block: steps ahead, steps left
-Encode = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid -> latents (b, c, h, w)
-
-
-def outward(place: Place) -> int:
-    """Ranks from block (0, 0) outward: the paper's four sides, then its four corners, and so on."""
-    return abs(place[0]) + abs(place[1])
+BlockIndex = tuple[int, int]  # (i, j) of a block: steps ahead, steps left
+EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid -> latents (b, c, h, w)
 
 
-def colour(place: Place) -> int:
-    """Four ranks for a world without end: every second block both ways, those between two of them, the rest."""
-    return place[0] % 2 + 2 * (place[1] % 2)
+def rank_outward(index: BlockIndex) -> int:
+    """Rank by distance from block (0, 0): the paper's four sides, then its four corners, and so on."""
+    return abs(index[0]) + abs(index[1])
+
+
+def rank_four_colors(index: BlockIndex) -> int:
+    """One of four ranks, for an unbounded grid: every second block both ways, those between two of them, the rest."""
+    return index[0] % 2 + 2 * (index[1] % 2)
 
 
 @dataclass(frozen=True)
-class Lattice:
-    """Blocks of `size` cells every `step` cells. `last` bounds the world: places (-behind..ahead, -right..left)."""
+class BlockGrid:
+    """Blocks of `size` cells every `step` cells.
+
+    Args:
+        size: Side of a block in latent cells.
+        step: Distance of neighbouring blocks in cells.
+        rank: Rank of a block; lower ranks are generated first.
+        num_blocks: Blocks ahead, behind, left and right of block (0, 0); None for an unbounded grid.
+    """
 
     size: int
     step: int
-    rank: Callable[[Place], int] = outward
-    last: tuple[int, int, int, int] | None = (1, 1, 1, 1)  # ahead, behind, left, right; None: no end
+    rank: Callable[[BlockIndex], int] = rank_outward
+    num_blocks: tuple[int, int, int, int] | None = (1, 1, 1, 1)
 
     @classmethod
-    def of(cls, size: int, overlap: float, **options) -> Lattice:
-        """Raises ValueError for an overlap between two cells, or one that leaves a world without end with holes or knots."""
+    def from_overlap(cls, size: int, overlap: float, **options: Any) -> BlockGrid:
+        """A grid by the overlap of neighbouring blocks, as a fraction of a block.
+
+        Raises:
+            ValueError: The overlap is not a whole number of cells, or blocks of equal rank would overlap.
+        """
         step = round(size * (1 - overlap))
         if not 0 < step < size or abs(step - size * (1 - overlap)) > 1e-6:
             raise ValueError(f"overlap {overlap} is not a whole number of the {size} latent cells between 0 and 1")
-        lattice = cls(size, step, **options)
-        if lattice.rank is colour and 2 * step <= size:
-            raise ValueError(f"overlap {overlap}: four colours need less than 0.5, or equal ranks would meet")
-        return lattice
+        grid = cls(size, step, **options)
+        if grid.rank is rank_four_colors and 2 * step <= size:
+            raise ValueError(f"overlap {overlap}: four colours need less than 0.5, or blocks of equal rank overlap")
+        return grid
 
-    def holds(self, place: Place) -> bool:
-        if self.last is None:
+    def contains(self, index: BlockIndex) -> bool:
+        if self.num_blocks is None:
             return True
-        ahead, behind, left, right = self.last
-        return -behind <= place[0] <= ahead and -right <= place[1] <= left
+        ahead, behind, left, right = self.num_blocks
+        return -behind <= index[0] <= ahead and -right <= index[1] <= left
 
-    def places(self) -> list[Place]:
-        """All places of a bounded world. Raises ValueError for one without end."""
-        if self.last is None:
-            raise ValueError("a world without end has no list of places")
-        ahead, behind, left, right = self.last
+    def indices(self) -> list[BlockIndex]:
+        """All blocks of a bounded grid. Raises ValueError for an unbounded one."""
+        if self.num_blocks is None:
+            raise ValueError("an unbounded grid has no list of blocks")
+        ahead, behind, left, right = self.num_blocks
         return list(product(range(-behind, ahead + 1), range(-right, left + 1)))
 
-    def fronts(self, places: Iterable[Place]) -> list[list[Place]]:
-        """Places by rank, lowest first: those of a front can be made at the same time."""
-        ordered = sorted(places, key=lambda place: (self.rank(place), place))
-        return [list(front) for _, front in groupby(ordered, key=self.rank)]
+    def group_by_rank(self, indices: Iterable[BlockIndex]) -> list[list[BlockIndex]]:
+        """Blocks by rank, lowest first; those of a group can be generated concurrently."""
+        ordered = sorted(indices, key=lambda index: (self.rank(index), index))
+        return [list(group) for _, group in groupby(ordered, key=self.rank)]
 
-    def earlier(self, place: Place) -> list[Place]:
-        """Overlapping places of lower rank, lowest first: what a block must know before it is made."""
+    def list_predecessors(self, index: BlockIndex) -> list[BlockIndex]:
+        """Overlapping blocks of lower rank, lowest first: they must be generated before this block."""
         reach = range(-((self.size - 1) // self.step), (self.size - 1) // self.step + 1)
-        near = [(place[0] + i, place[1] + j) for i in reach for j in reach]
-        rank = self.rank(place)
-        return sorted((p for p in near if self.holds(p) and self.rank(p) < rank), key=lambda p: (self.rank(p), p))
+        near = [(index[0] + i, index[1] + j) for i in reach for j in reach]
+        rank = self.rank(index)
+        return sorted((p for p in near if self.contains(p) and self.rank(p) < rank), key=lambda p: (self.rank(p), p))
 
-    def cells(self, place: Place, of: Place) -> tuple[slice, slice]:
-        """Rows and columns of the block at `place` that the block at `of` covers."""
+    def overlap_cells(self, index: BlockIndex, of: BlockIndex) -> tuple[slice, slice]:
+        """Rows and columns of the block `index` that the block `of` covers."""
         rows, cols = (
             slice(max(0, shift), max(0, min(self.size, self.size + shift)))
-            for shift in ((a - b) * self.step for a, b in zip(place, of, strict=True))
+            for shift in ((a - b) * self.step for a, b in zip(index, of, strict=True))
         )
         return rows, cols
 
-    def owned(self, place: Place) -> np.ndarray:
-        """(size, size) cells of a block that belong to it: those that no earlier block covers."""
-        mine = np.ones((self.size, self.size), bool)
-        for other in self.earlier(place):
-            mine[self.cells(place, other)] = False
-        return mine
+    def owned_cells(self, index: BlockIndex) -> np.ndarray:
+        """(size, size) bool: cells of a block that no predecessor covers."""
+        owned = np.ones((self.size, self.size), bool)
+        for other in self.list_predecessors(index):
+            owned[self.overlap_cells(index, other)] = False
+        return owned
 
-    def known(self, place: Place) -> list[tuple[Place, np.ndarray]]:
-        """Earlier places with the cells (size, size) of this block that each owns; those that own none left out."""
+    def known_cells(self, index: BlockIndex) -> list[tuple[BlockIndex, np.ndarray]]:
+        """Predecessors that own cells of this block, with those cells (size, size) bool."""
         parts = []
-        for other in self.earlier(place):
+        for other in self.list_predecessors(index):
             here = np.zeros((self.size, self.size), bool)
-            here[self.cells(place, other)] = self.owned(other)[self.cells(other, place)]
+            here[self.overlap_cells(index, other)] = self.owned_cells(other)[self.overlap_cells(other, index)]
             if here.any():
                 parts.append((other, here))
         return parts
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """A block that is made: what it owns as a Scene, and its latent (c, h, w), in its own frame, `datum_m` above the world's.
+class SceneBlock:
+    """A generated block.
 
-    `known_ground` is the share of what it knew beforehand that had any ground: the paper's outpainting fails where it is
-    next to nothing. 1 where nothing was known.
+    Args:
+        scene: What the block owns, in its own frame, `datum_m` above the world's heights.
+        latent: (c, h, w) of the whole block.
+        datum_m: Height of the block's frame in the world.
+        known_ground: Fraction of the pixels known beforehand that had any ground; 1 if nothing was known. The paper's
+            outpainting fails where it is near 0.
     """
 
     scene: Scene
@@ -124,26 +144,27 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """A block to be made: what is known of it as a Scene and as latent (c, h, w), mask 1 = make, and its datum."""
+class BlockCondition:
+    """What is known of a block before it is generated: as a Scene and as a latent (c, h, w); mask 1 = generate."""
 
     known: Scene
     latent: Tensor
-    unknown: Tensor
+    mask: Tensor
     datum_m: float
 
     @property
-    def knows(self) -> bool:
-        return not bool(self.unknown.all())
+    def is_empty(self) -> bool:
+        """Whether nothing of the block is known."""
+        return bool(self.mask.all())
 
     @cached_property
     def new_pixels(self) -> np.ndarray:
-        """(rows, cols) True where the block is made."""
-        return self.known.grid.enlarged(self.unknown[0].cpu().numpy() > 0)
+        """(rows, cols) bool: pixels to generate."""
+        return self.known.grid.upsample_cells(self.mask[0].cpu().numpy() > 0)
 
 
-def height_near(scene: Scene, x_m: float, y_m: float) -> float:
-    """Height of the fused surface at the occupied pixel nearest to a point; 0 if there is none."""
+def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
+    """Height of the fused surface at the occupied pixel nearest to a point in metres; 0 if there is no ground."""
     height, ground_class = scene.surface()
     row, col = np.nonzero(ground_class >= 0)
     if len(row) == 0:
@@ -153,64 +174,84 @@ def height_near(scene: Scene, x_m: float, y_m: float) -> float:
     return float(height[row[nearest], col[nearest]])
 
 
-class World:
-    """Blocks of a model's scenes on a lattice; nothing is kept here but how they fit together."""
+class BlockComposer:
+    """Conditions blocks on their predecessors and stitches them together. Keeps no blocks.
 
-    def __init__(self, lattice: Lattice, spec: LayoutSpec, encode: Encode, level_m: float = 0.0) -> None:
-        """`level_m`: height of the ground under the origin of a block's frame, as the model's training data have it."""
-        self.lattice, self.spec, self.encode, self.level_m = lattice, spec, encode, level_m
+    Args:
+        block_grid: Which blocks there are.
+        spec: Layout of one block.
+        encode: Encodes scenes to latents.
+        level_m: Height of the ground under the origin of a block's frame, as in the model's training data.
+    """
+
+    def __init__(self, block_grid: BlockGrid, spec: LayoutSpec, encode: EncodeScenes, level_m: float = 0.0) -> None:
+        self.block_grid, self.spec, self.encode, self.level_m = block_grid, spec, encode, level_m
 
     @property
     def step_px(self) -> int:
-        return self.lattice.step * (self.spec.grid.rows // self.lattice.size)
+        """Distance of neighbouring blocks in pixels."""
+        return self.block_grid.step * (self.spec.grid.rows // self.block_grid.size)
 
     @property
     def step_m(self) -> float:
+        """Distance of neighbouring blocks in metres."""
         return self.step_px * self.spec.grid.resolution_m
 
-    def seen_from(self, place: Place, other: Place, block: Block) -> Scene:
-        """The part of a block's Scene inside another block's grid, in that one's frame and the world's heights."""
-        x, y = ((a - b) * self.step_m for a, b in zip(other, place, strict=True))
-        return block.scene.moved(x, y, block.datum_m).cropped(self.spec.grid)
+    def to_block_frame(self, index: BlockIndex, other: BlockIndex, block: SceneBlock) -> Scene:
+        """The part of block `other` inside block `index`, in the latter's frame and the world's heights."""
+        x, y = ((a - b) * self.step_m for a, b in zip(other, index, strict=True))
+        return block.scene.translate(x, y, block.datum_m).crop(self.spec.grid)
 
-    def task(self, place: Place, made: Mapping[Place, Block], empty: Scene, mode: str) -> Task:
-        """What is known of a block. `copy` takes the neighbours' latents as they are (the paper); `reencode` what they
-        decode to, moved into the block's frame and down to its datum, encoded anew: object latents hold absolute centres.
+    def condition_block(
+        self, index: BlockIndex, blocks: Mapping[BlockIndex, SceneBlock], empty: Scene, mode: str
+    ) -> BlockCondition:
+        """Gather what predecessors know of a block.
 
-        Raises KeyError if an earlier block that it must know is not among those made.
+        Args:
+            index: The block.
+            blocks: Generated blocks, with all its predecessors.
+            empty: An empty Scene with the ids of the result.
+            mode: "copy" takes the neighbours' latents (the paper); "reencode" decodes them, moves them into the block's
+                frame and datum and encodes the result, because object latents hold absolute centres.
+
+        Raises:
+            KeyError: A predecessor is missing.
         """
-        parts = [(other, made[other], cells) for other, cells in self.lattice.known(place)]
+        parts = [(other, blocks[other], cells) for other, cells in self.block_grid.known_cells(index)]
         grid = self.spec.grid
-        scenes = [self.seen_from(place, other, block) for other, block, _ in parts]
-        known = merge(scenes, [grid.enlarged(cells) for *_, cells in parts], empty) if parts else empty
-        own = self.lattice.owned(place)
-        unknown = torch.from_numpy(own)
-        datum = height_near(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
-        known = known.moved(0, 0, -datum)
-        latent = self.encode([spread(known, grid.enlarged(own))])[0]
+        scenes = [self.to_block_frame(index, other, block) for other, block, _ in parts]
+        known = merge_scenes(scenes, [grid.upsample_cells(cells) for *_, cells in parts], empty) if parts else empty
+        owned = self.block_grid.owned_cells(index)
+        mask = torch.from_numpy(owned)
+        datum_m = find_ground_height(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
+        known = known.translate(0, 0, -datum_m)
+        latent = self.encode([extrapolate_ground(known, grid.upsample_cells(owned))])[0]
         if mode == "copy":
             latent = torch.zeros_like(latent)
             for other, block, cells in parts:
-                there, here = self.lattice.cells(other, place), self.lattice.cells(place, other)
-                mine = torch.from_numpy(cells[here]).to(latent.device)
-                latent[:, *here] = torch.where(mine, block.latent[:, *there].to(latent), latent[:, *here])
-        return Task(known, latent, unknown.to(latent).expand_as(latent), datum)
+                there, here = self.block_grid.overlap_cells(other, index), self.block_grid.overlap_cells(index, other)
+                shared = torch.from_numpy(cells[here]).to(latent.device)
+                latent[:, *here] = torch.where(shared, block.latent[:, *there].to(latent), latent[:, *here])
+        return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m)
 
-    def block(self, task: Task, latent: Tensor, made: Scene) -> Block:
-        """A block from what its task's latent became: the new part, without objects that are known already."""
-        own = new_part(made, task.known, task.new_pixels)
-        seen = task.known.occupied.any(axis=0)[~task.new_pixels]
-        return Block(own, latent, task.datum_m, float(seen.mean()) if task.knows else 1.0)
+    def finish_block(self, condition: BlockCondition, latent: Tensor, generated: Scene) -> SceneBlock:
+        """The new part of a decoded block, blended into the known part and without copies of its objects."""
+        own = extract_new_part(generated, condition.known, condition.new_pixels)
+        seen = condition.known.occupied.any(axis=0)[~condition.new_pixels]
+        return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
 
-    def stitched(self, made: Mapping[Place, Block], like: Scene, grid: Grid | None = None) -> Scene:
-        """All blocks as one Scene, each with what it owns; ids and labels from `like`. Default grid: all of them.
+    def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:
+        """Combine blocks to one Scene, each with what it owns.
 
-        Grids count from block (0, 0), in whole pixels.
+        Args:
+            blocks: Generated blocks.
+            like: Gives ids and labels.
+            grid: Extent of the result, in whole pixels from block (0, 0) (default: all blocks).
         """
         small = self.spec.grid
         if grid is None:
-            ahead, left = (max(place[k] for place in made) for k in (0, 1))
-            behind, right = (-min(place[k] for place in made) for k in (0, 1))
+            ahead, left = (max(index[k] for index in blocks) for k in (0, 1))
+            behind, right = (-min(index[k] for index in blocks) for k in (0, 1))
             grid = replace(
                 small,
                 front_m=small.front_m + ahead * self.step_m,
@@ -220,13 +261,104 @@ class World:
             )
         shape = (len(self.spec.ground_classes), grid.rows, grid.cols)
         height, occupied, objects = np.zeros(shape, np.float32), np.zeros(shape, bool), []
-        for place, block in sorted(made.items()):
-            x, y = (steps * self.step_m for steps in place)
-            mine = small.enlarged(self.lattice.owned(place))
-            part = block.scene.moved(x, y, block.datum_m)
-            here, there = grid.shared(part.grid)
+        for index, block in sorted(blocks.items()):
+            x, y = (steps * self.step_m for steps in index)
+            owned = small.upsample_cells(self.block_grid.owned_cells(index))
+            part = block.scene.translate(x, y, block.datum_m)
+            here, there = grid.intersect(part.grid)
             for whole, piece in ((height, part.height_m), (occupied, part.occupied)):
-                np.copyto(whole[:, *here], piece[:, *there], where=mine[there])
+                np.copyto(whole[:, *here], piece[:, *there], where=owned[there])
             objects.append(part.select(grid.contains(part.center_m[:, 0], part.center_m[:, 1])))
         classes = self.spec.ground_classes
-        return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **joined(objects))
+        primitives = concatenate_primitives(objects)
+        return replace(like, grid=grid, height_m=height, occupied=occupied, ground_classes=classes, **primitives)
+
+
+def generate_blocks(
+    model: SceneGenerator,
+    composer: BlockComposer,
+    indices: Sequence[BlockIndex],
+    blocks: Mapping[BlockIndex, SceneBlock],
+    like: Scene,
+    label: str | Mapping[BlockIndex, str],
+    seed: int = 0,
+    scene_index: int = 0,
+    mode: str = "reencode",
+    repaint: RePaintConfig | None = None,
+    guidance_scale: float = 1.0,
+    callback_on_step_end: StepCallback | None = None,
+) -> dict[BlockIndex, SceneBlock]:
+    """Generate blocks in one batch, conditioned on those generated before.
+
+    Args:
+        model: Generates one block.
+        composer: Which blocks there are and how they fit together.
+        indices: Blocks to generate.
+        blocks: Generated blocks, with all predecessors of `indices`.
+        like: Gives the ids of the result.
+        label: Class of all blocks or of each.
+        seed, scene_index: Noise depends on them and on the block's index.
+        mode: As for `BlockComposer.condition_block`.
+        repaint: Options of RePaint (default: the paper's).
+        guidance_scale, callback_on_step_end: As for `PrITTIPipeline.generate`.
+
+    Raises:
+        KeyError: A block has no label or a predecessor is missing.
+        ValueError: `mode` is unknown.
+    """
+    if mode not in ("copy", "reencode"):
+        raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
+    empty = make_empty_scene(like.scene_id, like.source, like.sequence, like.frame, model.spec)
+    conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
+    stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
+    repaint = repaint or RePaintConfig()
+    if all(condition.is_empty for condition in conditions):  # nothing to harmonise with
+        repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
+    latents = model.inpaint_latents(
+        stacked,
+        [label if isinstance(label, str) else label[index] for index in indices],
+        seed,
+        [(scene_index, *index) for index in indices],
+        repaint,
+        guidance_scale,
+        callback_on_step_end,
+        OUTPAINT,
+    )
+    scenes = model.decode(latents, [empty] * len(indices))
+    parts = zip(indices, conditions, latents, scenes, strict=True)
+    return {index: composer.finish_block(condition, latent, scene) for index, condition, latent, scene in parts}
+
+
+def outpaint_scene(
+    model: SceneGenerator,
+    scene: Scene,
+    label: str | Mapping[BlockIndex, str],
+    seed: int,
+    scene_index: int,
+    overlap: float,
+    mode: str,
+    num_blocks: tuple[int, int, int, int],
+    repaint: RePaintConfig | None,
+    guidance_scale: float,
+    callback_on_step_end: StepCallback | None,
+) -> Scene:
+    """Extend a scene on the model's grid by blocks ahead, behind, left and right; see `PrITTIPipeline.outpaint`."""
+    block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, num_blocks=num_blocks)
+    composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0))
+    blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}
+    for group in block_grid.group_by_rank(index for index in block_grid.indices() if index not in blocks):
+        blocks |= generate_blocks(
+            model,
+            composer,
+            group,
+            blocks,
+            scene,
+            label,
+            seed,
+            scene_index,
+            mode,
+            repaint,
+            guidance_scale,
+            callback_on_step_end,
+        )
+    return composer.stitch(blocks, scene)

@@ -1,10 +1,10 @@
-"""What was made beside known ground goes on from it: near the border its ground is bent to meet the known.
+"""Blend generated ground into known ground at seams.
 
-A new part is decoded together with what is known, so the decoder draws both sides as one; but the known side is kept as
-it was given, and where the two drawings of it differ, by a pixel of kerb or a centimetre of height, the border would show.
-What the drawings differ by at the border is therefore added to the new side, less and less with distance. A decoder that
-sees a latent half known and half new may also draw a step right at the border: what is steeper there than STEEPEST and
-than the known ground beside it is taken out in the same way. Differs from the paper, which pastes.
+A new part is decoded together with the known part, so the decoder draws both sides consistently; but the known side is
+kept as given, and where the two differ by a pixel of kerb or a centimetre of height the seam is visible. The difference at
+the seam is therefore added to the new side and falls off with distance. A decoder that sees a latent half known and half
+new may also draw a step at the seam: a slope there that exceeds MAX_SLOPE and the slope of the known ground is removed in
+the same way. Differs from the paper, which pastes.
 """
 
 from __future__ import annotations
@@ -15,98 +15,111 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from models.composition.deduplicate import doubles
-from models.scene import Scene, merge
+from models.composition.deduplicate import find_regenerated_objects
+from models.scene import Scene, merge_scenes
 
-REACH_M = 8.0  # how far from the border the new ground is bent
-LIMIT_M = 2.0  # classes' edges are moved by no more
-STEEPEST = 0.08  # rise per metre across the border where known ground is no steeper; more is a step that decoders draw
+BLEND_M = 8.0  # distance from the seam within which new ground changes
+MAX_EDGE_SHIFT_M = 2.0  # largest shift of a class's edge
+MAX_SLOPE = 0.08  # rise per metre across the seam where known ground is less steep; a higher one is a decoder's step
 
 
-def continued(made: Scene, known: Scene, new: np.ndarray) -> Scene:
-    """`made` with its pixels `new` (rows, cols) bent to meet those of `known`, both scenes of one grid; objects stand as
-    high above the ground as before. Other pixels are as they were.
+def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
+    """Blend generated ground into the known ground at seams; objects keep their height above the ground.
 
-    Per class: its signed distance from the class's edge and its height take up the difference at the nearest known pixel.
-    Far from the class's known pixels its height takes up what the surfaces differ by, where both are of one class.
+    Per class, its signed distance from the class's edge and its height take up the difference at the nearest known pixel.
+    Far from the class's known pixels, its height takes up the difference of the surfaces where both are of one class.
+
+    Args:
+        generated: Scene on the grid of `known`.
+        known: Scene whose pixels outside `new` are kept.
+        new: (rows, cols) bool, pixels that were generated; the others of `generated` stay unchanged.
+
+    Returns:
+        `generated` with blended ground in `new`.
     """
     if new.all() or not new.any():
-        return made
-    resolution_m = made.grid.resolution_m
-    window = _around(new, math.ceil(REACH_M / resolution_m))
+        return generated
+    resolution_m = generated.grid.resolution_m
+    window = _find_bounding_window(new, math.ceil(BLEND_M / resolution_m))
     new = new[window]
     given = ~new
-    limit = LIMIT_M / resolution_m
-    distance, nearest = _nearest(given)
-    share = _falling(distance * resolution_m)
-    lifted_m = _surface_difference(made, known, window, given)
-    occupied, height_m = made.occupied.copy(), made.height_m.copy()
-    for c in range(len(made.ground_classes)):
-        was, is_made, was_m, is_made_m = (
-            of[c][window] for of in (known.occupied, made.occupied, known.height_m, made.height_m)
+    limit_px = MAX_EDGE_SHIFT_M / resolution_m
+    distance, nearest = _find_nearest(given)
+    weight = _compute_falloff(distance * resolution_m)
+    lift_m = _compute_surface_difference(generated, known, window, given)
+    occupied, height_m = generated.occupied.copy(), generated.height_m.copy()
+    for c in range(len(generated.ground_classes)):
+        known_mask, new_mask, known_m, new_m = (
+            of[c][window] for of in (known.occupied, generated.occupied, known.height_m, generated.height_m)
         )
-        was = was & given
-        if not was.any() and not is_made.any():
+        known_mask = known_mask & given
+        if not known_mask.any() and not new_mask.any():
             continue
-        differs = _edge_distance(was, given, limit) - _edge_distance(is_made, given, limit)
-        inside = _edge_distance(is_made, np.ones_like(new), limit) + share * differs[nearest] > 0
-        # The class's height everywhere: that of its nearest pixel, of the known ones if none was made.
-        away, place = _nearest(was) if was.any() else (np.full(new.shape, np.inf), nearest)
-        level_m = is_made_m[_nearest(is_made)[1]] if is_made.any() else was_m[place]
-        own = _falling(away * resolution_m)
-        steepest_m = np.maximum(STEEPEST * resolution_m, _steps(was_m, was))
-        differs_m = was_m - _across(is_made_m, level_m, is_made & new, steepest_m)
-        risen_m = level_m + own * differs_m[place] + (1 - own) * lifted_m
-        occupied[c][window] = np.where(new, inside, is_made)
-        height_m[c][window] = np.where(new, np.where(inside, risen_m, 0), is_made_m)
-    bent = replace(made, occupied=occupied, height_m=height_m)
-    (before_m, class_before), (after_m, class_after) = made.ground_under(), bent.ground_under()
-    center_m = made.center_m.copy()
+        shift_px = _compute_edge_distance(known_mask, given, limit_px) - _compute_edge_distance(
+            new_mask, given, limit_px
+        )
+        inside = _compute_edge_distance(new_mask, np.ones_like(new), limit_px) + weight * shift_px[nearest] > 0
+        # The class's height everywhere: that of its nearest generated pixel, or of the nearest known one if there is none.
+        away, place = _find_nearest(known_mask) if known_mask.any() else (np.full(new.shape, np.inf), nearest)
+        level_m = new_m[_find_nearest(new_mask)[1]] if new_mask.any() else known_m[place]
+        own = _compute_falloff(away * resolution_m)
+        max_step_m = np.maximum(MAX_SLOPE * resolution_m, _compute_largest_steps(known_m, known_mask))
+        difference_m = known_m - _limit_step(new_m, level_m, new_mask & new, max_step_m)
+        blended_m = level_m + own * difference_m[place] + (1 - own) * lift_m
+        occupied[c][window] = np.where(new, inside, new_mask)
+        height_m[c][window] = np.where(new, np.where(inside, blended_m, 0), new_m)
+    blended = replace(generated, occupied=occupied, height_m=height_m)
+    (before_m, class_before), (after_m, class_after) = generated.ground_under(), blended.ground_under()
+    center_m = generated.center_m.copy()
     center_m[:, 2] += np.where((class_before >= 0) & (class_after == class_before), after_m - before_m, 0)
-    return replace(bent, center_m=center_m)
+    return replace(blended, center_m=center_m)
 
 
-def new_part(made: Scene, known: Scene, new: np.ndarray) -> Scene:
-    """What was made in the pixels `new`, fit to be put beside `known`: its ground meets it, no object of it comes again."""
-    fresh = made.select(~doubles(made, known))
-    return merge([continued(fresh, known, new)], [new], made)
+def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
+    """The generated part in the pixels `new`, blended into `known` and without copies of its objects."""
+    fresh = generated.select(~find_regenerated_objects(generated, known))
+    return merge_scenes([blend_ground(fresh, known, new)], [new], generated)
 
 
-def spread(known: Scene, unknown: np.ndarray) -> Scene:
-    """A scene to encode: its pixels `unknown` (rows, cols) bear the ground of the nearest known one.
+def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
+    """Fill the pixels `unknown` (rows, cols) of a scene with the ground of the nearest known pixel, for encoding.
 
-    An encoder looks a little beyond a cell; left empty, what is merely not known yet would be an edge to it.
+    An encoder sees a little beyond a cell; empty unknown pixels would look like an edge of the ground.
     """
     if unknown.all() or not unknown.any():
         return known
-    row, col = _nearest(~unknown)[1]
+    row, col = _find_nearest(~unknown)[1]
     return replace(known, occupied=known.occupied[:, row, col], height_m=known.height_m[:, row, col])
 
 
-def _around(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """The rectangle of a mask that is not empty, with a margin."""
+def _find_bounding_window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Bounding rectangle of a non-empty mask, with a margin in pixels."""
     spans = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     return tuple(slice(max(0, span[0] - margin), span[-1] + 1 + margin) for span in spans)
 
 
-def _nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Distance in pixels to the nearest pixel of a mask that is not empty, and which one that is."""
+def _find_nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Distance in pixels to the nearest pixel of a non-empty mask, and that pixel's (row, col)."""
     distance, (row, col) = distance_transform_edt(~mask, return_indices=True)
     return distance, (row, col)
 
 
-def _surface_difference(made: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray) -> np.ndarray:
-    """Metres by which the known surface lies above the made one where both are of one class, less and less away from there."""
-    (was_m, was), (is_made_m, is_made) = ([part[window] for part in scene.surface()] for scene in (known, made))
-    alike = given & (was == is_made) & (was >= 0)
+def _compute_surface_difference(
+    generated: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray
+) -> np.ndarray:
+    """Metres by which the known surface lies above the generated one where both have one class, with a falloff elsewhere."""
+    (known_m, known_class), (new_m, new_class) = (
+        [part[window] for part in scene.surface()] for scene in (known, generated)
+    )
+    alike = given & (known_class == new_class) & (known_class >= 0)
     if not alike.any():
         return np.zeros(given.shape, np.float32)
-    distance, nearest = _nearest(alike)
-    return _falling(distance * made.grid.resolution_m) * (was_m - is_made_m)[nearest]
+    distance, nearest = _find_nearest(alike)
+    return _compute_falloff(distance * generated.grid.resolution_m) * (known_m - new_m)[nearest]
 
 
-def _steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The largest step of height from each pixel of a mask to those of its four neighbours that are in it; 0 if none is."""
+def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Largest height step from each pixel of a mask to those of its four neighbours that are in the mask, else 0."""
     largest = np.zeros(mask.shape, np.float32)
     for axis in (0, 1):
         height, inside, out = (of.swapaxes(0, axis) for of in (height_m, mask, largest))
@@ -116,26 +129,25 @@ def _steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return largest
 
 
-def _across(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, steepest_m: np.ndarray) -> np.ndarray:
-    """The level of a class as it is seen from its nearest new pixel: of a step between the two no more than steepest_m
-    per pixel is the ground's, the rest is left out."""
+def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_step_m: np.ndarray) -> np.ndarray:
+    """A class's level at known pixels as seen from its nearest new pixel, with at most `max_step_m` of rise per pixel."""
     if not new.any():
         return level_m
-    distance, nearest = _nearest(new)
+    distance, nearest = _find_nearest(new)
     rise_m = height_m[nearest] - level_m
-    return height_m[nearest] - np.clip(rise_m, -steepest_m * distance, steepest_m * distance)
+    return height_m[nearest] - np.clip(rise_m, -max_step_m * distance, max_step_m * distance)
 
 
-def _falling(distance_m: np.ndarray) -> np.ndarray:
-    """1 at the border, 0 from REACH_M on, smooth."""
-    left = np.clip(1 - distance_m / REACH_M, 0, 1)
+def _compute_falloff(distance_m: np.ndarray) -> np.ndarray:
+    """Smooth weight: 1 at the seam, 0 from BLEND_M on."""
+    left = np.clip(1 - distance_m / BLEND_M, 0, 1)
     return left * left * (3 - 2 * left)
 
 
-def _edge_distance(mask: np.ndarray, domain: np.ndarray, limit: float) -> np.ndarray:
+def _compute_edge_distance(mask: np.ndarray, domain: np.ndarray, limit: float) -> np.ndarray:
     """Signed distance in pixels from the edge of a mask inside a domain, positive in the mask, within +-limit."""
     inside, outside = (
-        np.minimum(_nearest(side)[0] - 0.5, limit) if side.any() else np.full(mask.shape, limit)
+        np.minimum(_find_nearest(side)[0] - 0.5, limit) if side.any() else np.full(mask.shape, limit)
         for side in (mask & domain, ~mask & domain)
     )
     return np.where(mask, outside, -inside)

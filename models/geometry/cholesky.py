@@ -16,19 +16,19 @@ TRIL = np.tril_indices(3)
 MIN_EXTENT_M = 0.01
 
 
-def scatter_matrix(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+def compute_scatter_matrix(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     """S (..., 3, 3) of boxes with axes rotation[..., :, j] and full extents size_m[..., j] (supplement Eq. 1)."""
     return np.einsum("...ij,...j,...kj->...ik", rotation, size_m, rotation)
 
 
-def cholesky_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+def compute_cholesky_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     """c (..., 6), float64, of boxes (supplement Eq. 2). Extents below 1 cm count as 1 cm."""
     size_m = np.maximum(np.asarray(size_m, np.float64), MIN_EXTENT_M)
-    lower = np.linalg.cholesky(scatter_matrix(np.asarray(rotation, np.float64), size_m))
+    lower = np.linalg.cholesky(compute_scatter_matrix(np.asarray(rotation, np.float64), size_m))
     return lower[..., TRIL[0], TRIL[1]]
 
 
-def boxes_from_cholesky(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decode_cholesky_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """rotation (..., 3, 3), right-handed, and size_m (..., 3) from c (..., 6) (supplement, Reconstruction).
 
     Any six finite numbers give a box: S = L L^T is positive semi-definite whatever L is, extents below 1 cm are

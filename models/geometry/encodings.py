@@ -33,7 +33,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from models.geometry.cholesky import MIN_EXTENT_M, TRIL, boxes_from_cholesky, cholesky_parameters, scatter_matrix
+from models.geometry.cholesky import (
+    MIN_EXTENT_M,
+    TRIL,
+    compute_cholesky_parameters,
+    compute_scatter_matrix,
+    decode_cholesky_boxes,
+)
 
 TRACE_PART = 3 / 5  # the mean over the unit sphere of sum_j (v_j . x)^4
 STARTS, ROUNDS = 4, 12  # of the search for the frame: tests/test_ablation.py
@@ -53,7 +59,7 @@ class Encoding(NamedTuple):
 # -------------------------------------------------------------------------------------------------- quaternion
 
 
-def quaternion_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+def encode_quaternions(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     """(..., 7): the unit quaternion x, y, z, w >= 0 of the rotation, then the three extents in metres.
 
     Axes are taken as they come: a heading of yaw + 180 degrees is another code for the same box.
@@ -64,7 +70,7 @@ def quaternion_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarra
     return np.concatenate([quaternion.reshape(*rotation.shape[:-2], 4), size_m], axis=-1)
 
 
-def boxes_from_quaternion(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """rotation (..., 3, 3) and size_m (..., 3) from (..., 7). Raises ValueError for a quaternion that is all zeros."""
     parameters = np.asarray(parameters, np.float64)
     rotation = Rotation.from_quat(parameters[..., :4].reshape(-1, 4)).as_matrix()
@@ -75,7 +81,7 @@ def boxes_from_quaternion(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 @cache
-def harmonics() -> np.ndarray:
+def compute_harmonics() -> np.ndarray:
     """(9, 3, 3, 3, 3) orthonormal basis of the traceless symmetric tensors of rank four.
 
     In the order cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. Coefficients of t^k in n(t)^4 with n(t) . n(t) = 0:
@@ -90,23 +96,23 @@ def harmonics() -> np.ndarray:
 
 
 @cache
-def isotropic() -> np.ndarray:
+def compute_isotropic_part() -> np.ndarray:
     """(3, 3, 3, 3) the symmetric tensor of |x|^4."""
     eye = np.eye(3)
     pairs = np.einsum("ab,cd->abcd", eye, eye)
     return (pairs + pairs.transpose(0, 2, 1, 3) + pairs.transpose(0, 3, 2, 1)) / 3
 
 
-def octahedral_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     """(..., 15): the scatter matrix in metres, row-major lower triangle, then the nine harmonics of the axes."""
     rotation, size_m = np.asarray(rotation, np.float64), np.maximum(np.asarray(size_m, np.float64), MIN_EXTENT_M)
-    scatter = scatter_matrix(rotation, size_m)[..., TRIL[0], TRIL[1]]
+    scatter = compute_scatter_matrix(rotation, size_m)[..., TRIL[0], TRIL[1]]
     square = np.einsum("...aj,...bj->...jab", rotation, rotation)
     fourth = np.einsum("...jab,...jcd->...abcd", square, square)
-    return np.concatenate([scatter, np.einsum("kabcd,...abcd->...k", harmonics(), fourth)], axis=-1)
+    return np.concatenate([scatter, np.einsum("kabcd,...abcd->...k", compute_harmonics(), fourth)], axis=-1)
 
 
-def boxes_from_octahedral(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """rotation (..., 3, 3), right-handed, and size_m (..., 3) from (..., 15).
 
     Axes are those of the nearest frame tensor, extents s_j = v_j^T S v_j: linear in S, so nothing is divided by a
@@ -115,11 +121,11 @@ def boxes_from_octahedral(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarra
     parameters = np.asarray(parameters, np.float64)
     scatter = np.zeros((*parameters.shape[:-1], 3, 3))
     scatter[..., TRIL[0], TRIL[1]] = scatter[..., TRIL[1], TRIL[0]] = parameters[..., :6]
-    axes = nearest_frame(parameters[..., 6:])
+    axes = find_nearest_frame(parameters[..., 6:])
     return axes, np.maximum(np.einsum("...aj,...ab,...bj->...j", axes, scatter, axes), MIN_EXTENT_M)
 
 
-def nearest_frame(harmonic: np.ndarray) -> np.ndarray:
+def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
     """(..., 3, 3) right-handed axes whose frame tensor is nearest to (..., 9): the maximum of sum_j T(v_j, v_j, v_j, v_j).
 
     Monotone ascent: axes <- the orthogonal polar factor of the gradient (Zhai et al., Complete dictionary learning via
@@ -129,21 +135,21 @@ def nearest_frame(harmonic: np.ndarray) -> np.ndarray:
     flat = harmonic.reshape(-1, 9)
     unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
     length = np.sqrt(3 - 5 * TRACE_PART**2)  # of the harmonics of any frame: |T|^2 = 3 less the trace part
-    tensor = np.einsum("nk,kabcd->nabcd", unit * length, harmonics()) + TRACE_PART * isotropic()
+    tensor = np.einsum("nk,kabcd->nabcd", unit * length, compute_harmonics()) + TRACE_PART * compute_isotropic_part()
     best, best_value = np.zeros((len(flat), 3, 3)), np.full(len(flat), -np.inf)
     for start in Rotation.random(STARTS, rng=np.random.default_rng(0)).as_matrix():
         axes = np.broadcast_to(start, (len(flat), 3, 3))
         for _ in range(ROUNDS):
-            left, _, right = np.linalg.svd(_gradient(tensor, axes))
+            left, _, right = np.linalg.svd(_compute_gradient(tensor, axes))
             axes = left @ right
-        value = np.einsum("naj,naj->n", _gradient(tensor, axes), axes)
+        value = np.einsum("naj,naj->n", _compute_gradient(tensor, axes), axes)
         better = value > best_value
         best[better], best_value[better] = axes[better], value[better]
     best[:, :, 0] *= np.where(np.linalg.det(best) < 0, -1.0, 1.0)[:, None]
     return best.reshape(*harmonic.shape[:-1], 3, 3)
 
 
-def _gradient(tensor: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def _compute_gradient(tensor: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """(n, 3, 3): column j is T(v_j, v_j, v_j, .)."""
     square = np.einsum("naj,nbj->nabj", axes, axes)
     half = np.einsum("nabcd,nabj->ncdj", tensor, square)
@@ -151,7 +157,7 @@ def _gradient(tensor: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 ENCODINGS = {
-    "cholesky": Encoding(6, cholesky_parameters, boxes_from_cholesky),
-    "quaternion": Encoding(7, quaternion_parameters, boxes_from_quaternion),
-    "octahedral": Encoding(15, octahedral_parameters, boxes_from_octahedral),
+    "cholesky": Encoding(6, compute_cholesky_parameters, decode_cholesky_boxes),
+    "quaternion": Encoding(7, encode_quaternions, decode_quaternion_boxes),
+    "octahedral": Encoding(15, encode_octahedral, decode_octahedral_boxes),
 }

@@ -42,7 +42,7 @@ class Boxes(NamedTuple):
         return self.size_m.prod(axis=1)
 
 
-def boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -> Boxes:
+def make_boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -> Boxes:
     """Boxes ready for the functions below: float64, axes orthonormal to rounding (float32 rotations are not).
 
     Raises ValueError for wrong shapes, non-finite numbers, negative extents or axes far from orthonormal.
@@ -65,43 +65,43 @@ def boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -> Box
     return Boxes(center_m, np.stack([x, np.cross(z, x), z], axis=2), size_m)
 
 
-def boxes_of(scene: Scene) -> Boxes:
+def extract_boxes(scene: Scene) -> Boxes:
     """The bounding boxes of a scene's primitives; an ellipsoid's is the box around it."""
-    return boxes(scene.center_m, scene.rotation, scene.size_m)
+    return make_boxes(scene.center_m, scene.rotation, scene.size_m)
 
 
 # ---------------------------------------------------------------------------------------------------- exact, boxes
 
 
-def intersection_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
+def compute_intersection_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     """(n,) volume of a[i] ∩ b[i], exact up to rounding and GROWTH; 0 where the boxes only touch."""
     volume = np.empty(len(a.center_m))
     for start in range(0, len(volume), PAIRS_PER_CHUNK):
         chunk = slice(start, start + PAIRS_PER_CHUNK)
-        volume[chunk] = _chunk_volume_m3(a.take(chunk), b.take(chunk))
+        volume[chunk] = _compute_chunk_volume_m3(a.take(chunk), b.take(chunk))
     return np.minimum(volume, np.minimum(a.volume_m3, b.volume_m3))
 
 
-def iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
+def compute_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     """(n,) IoU3D of a[i] with b[i], in [0, 1]; 0 for two boxes without volume."""
-    return _iou(intersection_volume_m3(a, b), a.volume_m3, b.volume_m3)
+    return _compute_iou(compute_intersection_volume_m3(a, b), a.volume_m3, b.volume_m3)
 
 
-def iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -> np.ndarray:
+def compute_iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -> np.ndarray:
     """(n, m) IoU3D of every a with every b, or of those that the mask `wanted` (n, m) names, 0 elsewhere.
 
     Only pairs whose axis-aligned bounds overlap are computed.
     """
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
-    i, j = overlapping_bounds(a, b)
+    i, j = find_overlapping_bounds(a, b)
     if wanted is not None:
         chosen = wanted[i, j]
         i, j = i[chosen], j[chosen]
-    matrix[i, j] = iou3d_pairs(a.take(i), b.take(j))
+    matrix[i, j] = compute_iou3d_pairs(a.take(i), b.take(j))
     return matrix
 
 
-def overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]:
+def find_overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]:
     """Indices (p,), (p,) of the pairs whose axis-aligned bounds overlap: every pair with IoU3D > 0 is among them."""
     reach_a, reach_b = (0.5 * np.einsum("nij,nj->ni", np.abs(box.rotation), box.size_m) for box in (a, b))
     overlap = np.ones((len(a.center_m), len(b.center_m)), bool)
@@ -113,12 +113,12 @@ def overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]:
     return np.nonzero(overlap)
 
 
-def _iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.ndarray) -> np.ndarray:
+def _compute_iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.ndarray) -> np.ndarray:
     union = volume_a + volume_b - intersection
     return np.divide(intersection, union, out=np.zeros_like(union), where=union > 0)
 
 
-def _chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
+def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     """(n,) volumes in A's frame, whose origin is A's centre. Arrays are (..., n): pairs lie along the last axis."""
     rotation_a, rotation_b = np.moveaxis(a.rotation, 0, -1), np.moveaxis(b.rotation, 0, -1)
     axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n): a_i . b_j
@@ -138,13 +138,13 @@ def _chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     # (3, 2, n) distances of the planes of both boxes from A's centre; index 0 is the face on the negative side.
     distance_a = np.stack([half_a, half_a], axis=1)
     distance_b = np.stack([half_b - offset, half_b + offset], axis=1)
-    edges = _own_edges(half_a, half_b, axes, offset, distance_a)
-    edges += _own_edges(half_b, half_a, np.swapaxes(axes, 0, 1), -center_b, distance_b)
-    volume[near] = np.maximum(edges / 3 + _crossing_edges(half_a, half_b, axes, offset, distance_b) / 6, 0)
+    edges = _clip_own_edges(half_a, half_b, axes, offset, distance_a)
+    edges += _clip_own_edges(half_b, half_a, np.swapaxes(axes, 0, 1), -center_b, distance_b)
+    volume[near] = np.maximum(edges / 3 + _clip_crossing_edges(half_a, half_b, axes, offset, distance_b) / 6, 0)
     return volume
 
 
-def _own_edges(
+def _clip_own_edges(
     half: np.ndarray, other_half: np.ndarray, axes: np.ndarray, other_center: np.ndarray, distance: np.ndarray
 ) -> np.ndarray:
     """(n,) sum over one box's 12 edges of d d' |edge inside the other box|.
@@ -155,7 +155,7 @@ def _own_edges(
     total = np.zeros(half.shape[1])
     for along, second, third in CYCLIC:
         clip = _Clip(-half[along], half[along])
-        at_second, at_third = _signed(half[second])[:, None], _signed(half[third])[None]
+        at_second, at_third = _list_signs(half[second])[:, None], _list_signs(half[third])[None]
         for j in range(3):
             at = at_second * axes[second, j] + at_third * axes[third, j] - other_center[j]
             clip.slab(at, axes[along, j], other_half[j])
@@ -163,21 +163,21 @@ def _own_edges(
     return total
 
 
-def _crossing_edges(
+def _clip_crossing_edges(
     half_a: np.ndarray, half_b: np.ndarray, axes: np.ndarray, offset: np.ndarray, distance_b: np.ndarray
 ) -> np.ndarray:
     """(n,) sum over the 36 face pairs of (d_a r_a + d_b r_b) |common line inside both boxes|."""
     total = np.zeros(half_a.shape[1])
     sign_b = np.array([-1.0, 1.0])[None, :, None]
     for i, k, l in CYCLIC:  # noqa: E741
-        plane_a = _signed(half_a[i])[:, None]  # (2, 1, n): x_i on the two faces of A
+        plane_a = _list_signs(half_a[i])[:, None]  # (2, 1, n): x_i on the two faces of A
         for j, *others in CYCLIC:
             sine = np.hypot(axes[k, j], axes[l, j])
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
             normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # of the line, within A's face
             # rho (2, 2, n): signed distance of the line from the foot of A's centre; x = rho normal + tau tangent.
-            rho = (offset[j] + _signed(half_b[j])[None] - axes[i, j] * plane_a) * inverse
+            rho = (offset[j] + _list_signs(half_b[j])[None] - axes[i, j] * plane_a) * inverse
             clip = _Clip(-np.inf, np.inf)
             clip.slab(rho * normal_k, -normal_l, half_a[k])
             clip.slab(rho * normal_l, normal_k, half_a[l])
@@ -209,7 +209,7 @@ class _Clip:
         return np.maximum(self.high - self.low, 0)
 
 
-def _signed(half: np.ndarray) -> np.ndarray:
+def _list_signs(half: np.ndarray) -> np.ndarray:
     """(2, n): the two faces, negative side first."""
     return np.stack([-half, half])
 
@@ -217,7 +217,7 @@ def _signed(half: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- sampled, ellipsoids
 
 
-def ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
+def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     """(n,) IoU3D of the ellipsoids inscribed in a[i] and b[i], estimated on a fixed set of BALL_POINTS points.
 
     The share of the smaller ellipsoid's points that lie in the larger one. Deterministic; not exact: the error is at
@@ -230,24 +230,24 @@ def ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     large_from_world = np.swapaxes(large.rotation, 1, 2) / np.maximum(large.size_m / 2, 1e-12)[:, :, None]
     large_from_small = large_from_world @ (small.rotation * (small.size_m / 2)[:, None, :])
     shift = np.einsum("nij,nj->ni", large_from_world, small.center_m - large.center_m)
-    ball = ball_points(BALL_POINTS).T
+    ball = sample_ball_points(BALL_POINTS).T
     share = np.empty(len(swap))
     for i in range(len(swap)):
         point = large_from_small[i] @ ball + shift[i, :, None]
         share[i] = np.mean(np.einsum("ij,ij->j", point, point) <= 1)
     volume_small, volume_large = np.pi / 6 * small.volume_m3, np.pi / 6 * large.volume_m3
-    return _iou(share * volume_small, volume_small, volume_large)
+    return _compute_iou(share * volume_small, volume_small, volume_large)
 
 
-def ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
+def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
     """(n, m) IoU3D of every ellipsoid of a with every one of b, sampled as in `ellipsoid_iou3d_pairs`."""
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
-    i, j = overlapping_bounds(a, b)
-    matrix[i, j] = ellipsoid_iou3d_pairs(a.take(i), b.take(j))
+    i, j = find_overlapping_bounds(a, b)
+    matrix[i, j] = compute_ellipsoid_iou3d_pairs(a.take(i), b.take(j))
     return matrix
 
 
-def ball_points(count: int) -> np.ndarray:
+def sample_ball_points(count: int) -> np.ndarray:
     """(count, 3) evenly spread points in the unit ball: Roberts' R3 low-discrepancy sequence, mapped by volume."""
     root = 1.2207440846057596  # the real root of x^4 = x + 1
     unit = (0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1

@@ -1,7 +1,7 @@
-"""Denoising diffusion on layout latents (paper, supplement B.3): schedule, training target and the one sampler.
+"""Denoising diffusion on layout latents (paper, supplement B.3): noise schedule and samplers.
 
-States are counted on the visited timesteps: state i means "noised to timestep visited[i]", state -1 means clean.
-Plain sampling walks n-1, n-2, ..., 0, -1; RePaint walks the same road with detours (repaint.py).
+States are counted on the visited timesteps: state i has the noise of timestep `timesteps[i]`, state -1 is clean.
+Sampling passes the states n-1, n-2, ..., 0, -1; RePaint adds jumps back to noisier states (repaint.py).
 """
 
 from __future__ import annotations
@@ -9,16 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from diffusers import SchedulerMixin
 from jaxtyping import Float, Int
 from torch import Tensor
 
+if TYPE_CHECKING:
+    from diffusers import SchedulerMixin
+
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
-Key = int | tuple[int, ...]  # a scene's number, or several numbers that tell it from others
-OnStep = Callable[[int, int, Tensor], Tensor]  # number of the step from 0, its timestep, latent -> latent to go on with
+SceneKey = int | tuple[int, ...]  # a scene's index, or several numbers that identify it
+OnStep = Callable[[int, int, Tensor], Tensor]  # index of the step, its timestep, latent -> latent of the next step
 
 
 @dataclass(frozen=True)
@@ -34,64 +37,69 @@ class Diffusion:
         """(T,) float64 cumulative product of 1 - beta_t."""
         return np.cumprod(1 - np.linspace(self.beta_start, self.beta_end, self.num_timesteps, dtype=np.float64))
 
-    def visited(self, num_steps: int) -> np.ndarray:
-        """(num_steps,) ascending timesteps, "leading" spacing: 0, 4, ..., 996 for 250 of 1000.
+    def select_timesteps(self, num_inference_steps: int) -> np.ndarray:
+        """Select ascending timesteps (n,) with "leading" spacing: 0, 4, ..., 996 for 250 of 1000.
 
-        Raises ValueError for a number that leaves more than a tenth of them unvisited: 600 steps of 1 begin at 599, where
-        the network expects two tenths of the signal, and would be given none.
+        Raises:
+            ValueError: The number is out of range, or the timesteps would cover less than nine tenths of the schedule.
+                600 timesteps with a spacing of 1 begin at 599, where the network expects two tenths of the signal and
+                would receive pure noise.
         """
-        if not 1 <= num_steps <= self.num_timesteps:
-            raise ValueError(f"num_steps is {num_steps}, expected 1 to {self.num_timesteps}")
-        apart = self.num_timesteps // num_steps
-        if num_steps * apart < 0.9 * self.num_timesteps:
-            near = self.num_timesteps // (apart + 1), self.num_timesteps // apart
+        if not 1 <= num_inference_steps <= self.num_timesteps:
+            raise ValueError(f"num_inference_steps is {num_inference_steps}, expected 1 to {self.num_timesteps}")
+        spacing = self.num_timesteps // num_inference_steps
+        if num_inference_steps * spacing < 0.9 * self.num_timesteps:
+            near = self.num_timesteps // (spacing + 1), self.num_timesteps // spacing
             raise ValueError(
-                f"num_steps is {num_steps}: {apart} apart, they would begin at {(num_steps - 1) * apart} of "
-                f"{self.num_timesteps}; expected {near[0]} or {near[1]}"
+                f"num_inference_steps is {num_inference_steps}: with a spacing of {spacing} they would begin at "
+                f"{(num_inference_steps - 1) * spacing} of {self.num_timesteps}; expected {near[0]} or {near[1]}"
             )
-        return np.arange(num_steps) * apart
+        return np.arange(num_inference_steps) * spacing
 
     def add_noise(
-        self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, b]
+        self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, " b"]
     ) -> Float[Tensor, "b c h w"]:
         """z_t = sqrt(alpha_bar_t) z_0 + sqrt(1 - alpha_bar_t) eps."""
         alpha_bar = torch.from_numpy(self.alpha_bar).to(clean.device)[timestep][:, None, None, None]
         return alpha_bar.sqrt().to(clean.dtype) * clean + (1 - alpha_bar).sqrt().to(clean.dtype) * noise
 
 
-class Walk:
-    """The visited timesteps of one sampling run, with every transition between their states.
+class SamplingSchedule:
+    """The visited timesteps of one sampling run and the transitions between their states.
 
-    `eta` is DDIM's (Song et al., 2021): how much of the noise of DDPM's steps there is, 1 in the paper, 0 for none.
+    Args:
+        diffusion: The noise schedule.
+        num_inference_steps: Number of visited timesteps.
+        eta: Share of the noise of DDPM's steps (DDIM; Song et al., 2021): 1 in the paper, 0 for none.
     """
 
-    def __init__(self, diffusion: Diffusion, num_steps: int, eta: float = 1.0) -> None:
-        self.timesteps, self.eta = diffusion.visited(num_steps), eta
+    def __init__(self, diffusion: Diffusion, num_inference_steps: int, eta: float = 1.0) -> None:
+        self.timesteps, self.eta = diffusion.select_timesteps(num_inference_steps), eta
         self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # [-1] is the clean state
 
     def __len__(self) -> int:
         return len(self.timesteps)
 
-    def plain(self) -> list[tuple[int, int]]:
-        """(from, to) states of sampling without detours."""
+    def descending_transitions(self) -> list[tuple[int, int]]:
+        """Transitions (from, to) without jumps."""
         return [(i, i - 1) for i in reversed(range(len(self)))]
 
-    def to_state(self, clean: Tensor, noise: Tensor, state: int) -> Tensor:
-        """Noise a clean latent to a state; state -1 returns it bit for bit."""
+    def noise_to_state(self, clean: Tensor, noise: Tensor, state: int) -> Tensor:
+        """Add noise to a clean latent up to a state; state -1 returns it bit for bit."""
         if state == -1:
             return clean
         a = self.alpha_bar[state]
         return a**0.5 * clean + (1 - a) ** 0.5 * noise
 
-    def up(self, latent: Tensor, noise: Tensor, state: int, to: int) -> Tensor:
-        """q(z_to | z_state) for to > state: add the noise between two states."""
+    def step_up(self, latent: Tensor, noise: Tensor, state: int, to: int) -> Tensor:
+        """Sample q(z_to | z_state) for to > state: add the noise between two states."""
         ratio = self.alpha_bar[to] / self.alpha_bar[state]
         return ratio**0.5 * latent + (1 - ratio) ** 0.5 * noise
 
-    def down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
-        """p(z_{state-1} | z_state): with eta 1 mean and variance of the posterior, from the predicted noise.
+    def step_down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
+        """Sample p(z_{state-1} | z_state). With eta 1 it has the mean and the variance of DDPM's posterior.
 
-        Written through z_0 so that it holds for spaced timesteps (beta = 1 - alpha_bar_i / alpha_bar_{i-1}).
+        Written through z_0, so that it holds for spaced timesteps (beta = 1 - alpha_bar_i / alpha_bar_{i-1}).
         """
         a, a_prev = self.alpha_bar[state], self.alpha_bar[state - 1]
         variance = self.eta**2 * (1 - a_prev) / (1 - a) * (1 - a / a_prev)
@@ -100,28 +108,28 @@ class Walk:
         return mean if state == 0 else mean + variance**0.5 * noise
 
 
-# What noise is drawn for: the same scene number must not start generation and outpainting from the same noise.
+# Purposes of noise: generation and outpainting of the same scene index must start from different noise.
 GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 
 
 class SceneNoise:
     """Standard normal noise keyed by (seed, scene index, purpose): each scene draws its own sequence.
 
-    The same scene comes out whatever the batch size, the number of workers or the scenes beside it. `seed` is one for
-    all, or one per scene.
+    A scene therefore does not depend on the batch size, the number of workers or the other scenes of its batch.
+    `seed` is one number for all scenes, or one per scene.
     """
 
     def __init__(
         self,
         seed: int | Sequence[int],
-        indices: Sequence[Key],
+        indices: Sequence[SceneKey],
         shape: tuple[int, ...],
         device: torch.device | str,
         purpose: int = GENERATE,
     ) -> None:
         seeds = [seed] * len(indices) if isinstance(seed, int) else seed
         keys = [(index,) if isinstance(index, int) else index for index in indices]
-        self.generators = [keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
+        self.generators = [make_keyed_generator(one, *key, purpose) for one, key in zip(seeds, keys, strict=True)]
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:
@@ -129,15 +137,15 @@ class SceneNoise:
         return noise.to(self.device)
 
 
-def keyed_generator(*key: int) -> torch.Generator:
+def make_keyed_generator(*key: int) -> torch.Generator:
     """A CPU generator that depends on every number of the key, and on nothing else."""
     # SeedSequence takes [a] and [a, 0] for the same: the length goes in too.
     state = np.random.SeedSequence([len(key), *(k & 0xFFFFFFFF for k in key)]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
 
-def guided(model: Denoiser, null_label: int, scale: float) -> Denoiser:
-    """Classifier-free guidance; at scale 1 the model itself, without a second half of the batch."""
+def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
+    """Add classifier-free guidance to a model; at scale 1 it is returned unchanged and evaluated once per step."""
     if scale == 1.0:
         return model
 
@@ -149,11 +157,11 @@ def guided(model: Denoiser, null_label: int, scale: float) -> Denoiser:
     return predict
 
 
-def rescaled(model: Denoiser, noise_scaling: float) -> Denoiser:
-    """The noise that a model predicts, divided by a number near 1; at 1 the model itself.
+def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
+    """Divide the noise that a model predicts by a number near 1; at 1 the model is returned unchanged.
 
-    Epsilon scaling (Ning et al., ICLR 2024): along a run a network meets its own errors, which it takes for noise; a little less
-    of what it predicts is taken away. Keeps in what is drawn the deviation that the data have.
+    Epsilon scaling (Ning et al., ICLR 2024): during sampling a network takes its own errors for noise. Dividing its
+    prediction compensates for that, so that samples keep the standard deviation of the data.
     """
     if noise_scaling == 1.0:
         return model
@@ -161,8 +169,8 @@ def rescaled(model: Denoiser, noise_scaling: float) -> Denoiser:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What must stay: clean latents and a mask, 1 = generate, 0 = keep (paper, Eqs. "z_known" ff.)."""
+class InpaintCondition:
+    """Clean known latents and a mask, 1 = generate, 0 = keep (paper, Eqs. "z_known" ff.)."""
 
     latent: Float[Tensor, "b c h w"]
     mask: Float[Tensor, "b c h w"]
@@ -171,80 +179,95 @@ class Known:
 @torch.no_grad()
 def sample(
     model: Denoiser,
-    walk: Walk,
+    schedule: SamplingSchedule,
     noise: SceneNoise,
-    label: Int[Tensor, b],
+    label: Int[Tensor, " b"],
     transitions: list[tuple[int, int]] | None = None,
-    known: Known | None = None,
+    condition: InpaintCondition | None = None,
     on_step: OnStep | None = None,
-    known_guidance: float = 0.0,
+    guidance_weight: float = 0.0,
 ) -> Float[Tensor, "b c h w"]:
-    """Clean latents, by ancestral sampling along `transitions` (plain by default): DDPM's, or the walk's eta of its noise.
+    """Sample clean latents by ancestral sampling along `transitions`.
 
-    Downward, the model denoises; upward, noise is added back (RePaint). With `known`, the known part is noised to
-    the state just reached and pasted in after each downward step. Differs from the paper, which prints the level
-    just left (Eq. "z_known"): the two parts would not match. At the end the known part is z_0, bit for bit.
-    `known_guidance` times what `explaining` says is added to the part that is made; not in the paper.
-    `on_step` is called after every evaluation of the model.
+    Downward transitions denoise; upward ones add noise back (RePaint). With a condition, the known part is noised to
+    the state just reached and pasted in after each downward step. Differs from the paper, which prints the level just
+    left (Eq. "z_known"): the two parts would have different noise levels. In the end the known part is z_0 bit for bit.
+
+    Args:
+        model: Predicts the noise in a latent.
+        schedule: Visited timesteps and the noise of each step.
+        noise: The scenes' random numbers.
+        label: Class index of each scene.
+        transitions: Pairs (from, to) of states (default: descending, without jumps).
+        condition: Known part of the latents.
+        on_step: Called after every evaluation of the model; returns the latent to continue with.
+        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part; not in the paper.
     """
     latent, evaluations = noise.draw(), 0
-    for state, to in transitions or walk.plain():
+    for state, to in transitions or schedule.descending_transitions():
         if to > state:
-            latent = walk.up(latent, noise.draw(), state, to)
+            latent = schedule.step_up(latent, noise.draw(), state, to)
             continue
-        timestep = int(walk.timesteps[state])
-        pull: Tensor | float = 0.0
-        if known is not None and known_guidance:
-            predicted, pull = explaining(model, latent, timestep, label, walk.alpha_bar[state], known)
+        timestep = int(schedule.timesteps[state])
+        direction: Tensor | float = 0.0
+        if condition is not None and guidance_weight:
+            predicted, direction = pseudoinverse_guidance(
+                model, latent, timestep, label, schedule.alpha_bar[state], condition
+            )
         else:
             predicted = model(latent, torch.full_like(label, timestep), label)
         step_noise = noise.draw() if to >= 0 else torch.zeros_like(latent)
-        latent = walk.down(latent, predicted, step_noise, state) + known_guidance * pull
-        if known is not None:
-            kept = walk.to_state(known.latent, noise.draw() if to >= 0 else known.latent, to)
-            latent = torch.where(known.mask.bool(), latent, kept)
+        latent = schedule.step_down(latent, predicted, step_noise, state) + guidance_weight * direction
+        if condition is not None:
+            kept = schedule.noise_to_state(condition.latent, noise.draw() if to >= 0 else condition.latent, to)
+            latent = torch.where(condition.mask.bool(), latent, kept)
         if on_step:
             latent = on_step(evaluations, timestep, latent)
         evaluations += 1
     return latent
 
 
-def explaining(
-    model: Denoiser, latent: Tensor, timestep: int, label: Int[Tensor, b], alpha_bar: float, known: Known
-) -> tuple[Tensor, Tensor]:
-    """The model's noise, and which way to move the latent for the clean one it stands for to meet what is known.
+def pseudoinverse_guidance(
+    model: Denoiser,
+    latent: Float[Tensor, "b c h w"],
+    timestep: int,
+    label: Int[Tensor, " b"],
+    alpha_bar: float,
+    condition: InpaintCondition,
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
+    """Predict the noise, and the direction that moves the estimate of the clean latent towards the known part.
 
-    Pseudo-inverse guidance (Song et al., ICLR 2023) with a mask for the measurement: the Jacobian's transpose of the clean
-    estimate, times what that lacks in the known part, times sqrt(alpha_bar). Pasting alone leaves the made part ignorant of
-    the known one wherever a network has not learnt to look. Costs a step about what a second evaluation would.
+    Pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement: the transposed Jacobian of the clean
+    estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting alone does not inform the
+    generated part where a network has not learnt to. One call costs about as much as two evaluations.
     """
     with torch.enable_grad():
         latent = latent.detach().requires_grad_()
         predicted = model(latent, torch.full_like(label, timestep), label)
         clean = (latent - (1 - alpha_bar) ** 0.5 * predicted) / alpha_bar**0.5
-        lacking = ((1 - known.mask) * (known.latent - clean)).detach()
-        (direction,) = torch.autograd.grad(clean, latent, lacking)
+        difference = ((1 - condition.mask) * (condition.latent - clean)).detach()
+        (direction,) = torch.autograd.grad(clean, latent, difference)
     return predicted.detach(), alpha_bar**0.5 * direction
 
 
 @torch.no_grad()
-def solve(
+def sample_with_scheduler(
     model: Denoiser,
-    solver: SchedulerMixin,
+    scheduler: SchedulerMixin,
     noise: SceneNoise,
-    label: Int[Tensor, b],
+    label: Int[Tensor, " b"],
     on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
-    """Clean latents by one of diffusers' schedulers that take noise from outside or none, as DPM-Solver++ and DDIM.
+    """Sample clean latents with a scheduler of diffusers, such as DPM-Solver++ or DDIM, after its `set_timesteps`.
 
-    Takes the steps that `solver.set_timesteps` has set.
+    Schedulers that add noise must accept it as an argument, so that each scene keeps its own random numbers.
     """
-    latent = noise.draw() * solver.init_noise_sigma
-    stochastic = str(solver.config.get("algorithm_type")).startswith("sde-")
-    for number, timestep in enumerate(solver.timesteps):
-        predicted = model(solver.scale_model_input(latent, timestep), timestep.expand(len(label)), label)
-        drawn = {"variance_noise": noise.draw()} if stochastic else {}
-        latent = solver.step(predicted, timestep, latent, **drawn).prev_sample
+    latent = noise.draw() * scheduler.init_noise_sigma
+    stochastic = str(scheduler.config.get("algorithm_type")).startswith("sde-")
+    for number, timestep in enumerate(scheduler.timesteps):
+        predicted = model(scheduler.scale_model_input(latent, timestep), timestep.expand(len(label)), label)
+        variance_noise = {"variance_noise": noise.draw()} if stochastic else {}
+        latent = scheduler.step(predicted, timestep, latent, **variance_noise).prev_sample
         if on_step:
             latent = on_step(number, int(timestep), latent)
     return latent

@@ -24,14 +24,17 @@ from torch import Tensor, nn
 
 from models.geometry.encodings import Encoding
 from models.layout import Bounds
-from models.lvae import INITIAL_LOGVAR, Posterior, logit
-from models.sampling.diffusion import keyed_generator
-from models.scene import yaw_rotation
-from models.training import Optimisation
-from models.vae.losses import KL_WEIGHT, MEDIUM, kl_loss
+from models.lvae import INITIAL_LOGVAR, compute_clamped_logit
+from models.sampling.diffusion import make_keyed_generator
+from models.scene import make_yaw_rotation
+from models.training import OptimizerConfig
+from models.vae.config import ObjectConfig
+from models.vae.losses import KL_WEIGHT, MEDIUM, compute_kl_loss
 from models.vae.objects import CATEGORY_EMBEDDING, ObjectDecoder, ObjectEncoder
+from models.vae.outputs import Posterior
 
-GRID, LATENT_CHANNELS, WIDTH, LAYERS, HEADS, HIDDEN, HEAD_HIDDEN = 2, 16, 128, 1, 4, 256, 128
+GRID, LATENT_CHANNELS = 2, 16
+NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
 MARGIN = 0.05  # of an entry's training range, on both sides: a sigmoid does not reach 0 and 1
 STILL, LEAST_RANGE = 1e-6, 1.0  # an entry that changes by less stands still, and is given this range
 
@@ -39,7 +42,7 @@ STILL, LEAST_RANGE = 1e-6, 1.0  # an entry that changes by less stands still, an
 # ------------------------------------------------------------------------------------------------------- boxes
 
 
-class CentredBoxes(NamedTuple):
+class CenteredBoxes(NamedTuple):
     """n boxes centred at zero: axes as columns of `rotation` (n, 3, 3), full extents `size_m` (n, 3)."""
 
     rotation: np.ndarray
@@ -47,7 +50,7 @@ class CentredBoxes(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Things:
+class BoxDistribution:
     """Ranges of what is drawn uniformly: length and height in metres, width as a share of the length."""
 
     length_m: tuple[float, float]
@@ -56,20 +59,22 @@ class Things:
 
 
 THINGS = {
-    "vehicle": Things((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # the paper's study
-    "any": Things((1.0, 6.0), (0.4, 1.0), (0.5, 4.0)),  # up to square footprints, where the scatter matrix has no yaw
+    "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # the paper's study
+    "any": BoxDistribution(
+        (1.0, 6.0), (0.4, 1.0), (0.5, 4.0)
+    ),  # up to square footprints, where the scatter matrix has no yaw
 }
 
 
-def draw_boxes(things: Things, count: int, *key: int) -> CentredBoxes:
+def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
     """Upright boxes with yaw anywhere in [-pi, pi). The first n of a larger draw of the same key are the draw of n."""
-    unit = torch.rand(count, 4, generator=keyed_generator(*key), dtype=torch.float64).numpy()
+    unit = torch.rand(count, 4, generator=make_keyed_generator(*key), dtype=torch.float64).numpy()
     low, high = np.array([things.length_m, things.width_share, things.height_m, (-np.pi, np.pi)]).T
     length, share, height, yaw = (low + unit * (high - low)).T
-    return CentredBoxes(yaw_rotation(yaw), np.stack([length, share * length, height], axis=1))
+    return CenteredBoxes(make_yaw_rotation(yaw), np.stack([length, share * length, height], axis=1))
 
 
-def code_bounds(code: np.ndarray) -> Bounds:
+def compute_code_bounds(code: np.ndarray) -> Bounds:
     """Bounds of each entry of (n, entries) training codes, with a margin."""
     low, high = code.min(axis=0), code.max(axis=0)
     middle, reach = (low + high) / 2, (0.5 + MARGIN) * (high - low)
@@ -85,10 +90,10 @@ class OneObjectAutoencoder(nn.Module):
 
     def __init__(self, entries: int) -> None:
         super().__init__()
-        body = (LATENT_CHANNELS, GRID, WIDTH, LAYERS, HEADS, HIDDEN)
-        self.encoder, self.decoder = ObjectEncoder((1,), *body), ObjectDecoder((1,), *body, HEAD_HIDDEN)
-        self.encoder.project_in = nn.Linear(3 + entries + CATEGORY_EMBEDDING + 1, WIDTH)
-        self.decoder.heads[0].features[-1] = nn.Linear(HEAD_HIDDEN, entries)
+        self.encoder = ObjectEncoder((1,), LATENT_CHANNELS, GRID, NETWORK)
+        self.decoder = ObjectDecoder((1,), LATENT_CHANNELS, GRID, NETWORK)
+        self.encoder.project_in = nn.Linear(3 + entries + CATEGORY_EMBEDDING + 1, NETWORK.width)
+        self.decoder.heads[0].features[-1] = nn.Linear(NETWORK.head_hidden, entries)
         with torch.no_grad():
             self.encoder.grid[LATENT_CHANNELS:] = INITIAL_LOGVAR
 
@@ -102,7 +107,7 @@ class OneObjectAutoencoder(nn.Module):
 
 
 @dataclass(frozen=True)
-class Settings:
+class StudyConfig:
     """How an autoencoder is trained, the same for every encoding.
 
     The batch is the paper's for the layout VAE. On 1,200 vehicles of a seed that the study does not use, mean IoU3D at
@@ -114,9 +119,9 @@ class Settings:
     learning_rate: float = 5e-4
     weight_decay: float = 5e-4
 
-    def optimisation(self, count: int) -> Optimisation:
+    def optimisation(self, count: int) -> OptimizerConfig:
         """The layout VAE's schedule for `count` samples: the rate falls to a tenth along a cosine."""
-        return Optimisation(
+        return OptimizerConfig(
             steps=self.epochs * -(-count // self.batch_size),
             learning_rate=self.learning_rate,
             weight_decay=self.weight_decay,
@@ -125,7 +130,7 @@ class Settings:
         )
 
 
-class Fitted(NamedTuple):
+class TrainedStudy(NamedTuple):
     """A trained autoencoder, with what its numbers mean."""
 
     model: OneObjectAutoencoder
@@ -134,30 +139,32 @@ class Fitted(NamedTuple):
     kept: np.ndarray  # (entries,) bool: what the autoencoder sees; the rest stays where it was in training
 
     @torch.no_grad()
-    def rebuild(self, boxes: CentredBoxes) -> tuple[CentredBoxes, float]:
+    def rebuild(self, boxes: CenteredBoxes) -> tuple[CenteredBoxes, float]:
         """The boxes that come out (from the latent mean), and the mean error of a normalised number."""
         code = self.bounds.normalise(self.encoding.encode(*boxes))
         given = torch.from_numpy(code[:, self.kept]).float()
         out = self.model.decode(self.model.encode(given).mean)
         code[:, ~self.kept], code[:, self.kept] = 0.5, out.double().numpy()
-        return CentredBoxes(*self.encoding.decode(self.bounds.restore(code))), float((out - given).abs().mean())
+        return CenteredBoxes(*self.encoding.decode(self.bounds.restore(code))), float((out - given).abs().mean())
 
 
-def fit(encoding: Encoding, boxes: CentredBoxes, settings: Settings, seed: int, moving_only: bool = False) -> Fitted:
+def train_autoencoder(
+    encoding: Encoding, boxes: CenteredBoxes, settings: StudyConfig, seed: int, moving_only: bool = False
+) -> TrainedStudy:
     """An autoencoder trained on the boxes. Same seed, same initial body, order of samples and noise."""
     numbers = encoding.encode(*boxes)
-    bounds = code_bounds(numbers)
+    bounds = compute_code_bounds(numbers)
     kept = (np.ptp(numbers, axis=0) >= STILL) | (not moving_only)
     code = torch.from_numpy(bounds.normalise(numbers)[:, kept]).float()
     torch.manual_seed(seed)
     model = OneObjectAutoencoder(code.shape[1])
     with torch.no_grad():
-        model.decoder.start_at(logit(code.mean(dim=0))[None], torch.ones(1))
+        model.decoder.init_from_data(compute_clamped_logit(code.mean(dim=0))[None], torch.ones(1))
     schedule = settings.optimisation(len(code))
     optimiser = torch.optim.AdamW(
         model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )
-    generator, step = keyed_generator(seed, len(code)), 0
+    generator, step = make_keyed_generator(seed, len(code)), 0
     for _ in range(settings.epochs):
         for batch in code[torch.randperm(len(code), generator=generator)].split(settings.batch_size):
             rate, beta1 = schedule.at(step)
@@ -166,9 +173,9 @@ def fit(encoding: Encoding, boxes: CentredBoxes, settings: Settings, seed: int, 
             posterior = model.encode(batch)
             noise = torch.randn(posterior.mean.shape, generator=generator)
             distance = (model.decode(posterior.sample(noise)) - batch).abs().sum(dim=1).mean()
-            loss = MEDIUM[2] * distance + KL_WEIGHT * kl_loss(posterior)
+            loss = MEDIUM[2] * distance + KL_WEIGHT * compute_kl_loss(posterior)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
             step += 1
-    return Fitted(model, bounds, encoding, kept)
+    return TrainedStudy(model, bounds, encoding, kept)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.layout import FEATURES
+from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
 REACH_CELLS = 0.5  # how far outside its cell a proposal's centre may lie
@@ -26,17 +27,16 @@ SPARE = 16  # proposals per slot, where MAX_PER_CELL allows them: primitives cro
 class CellDecoder(nn.Module):
     """Object latent -> normalised features in [0, 1] and existence logits of `proposals[k]` primitives per category.
 
-    SPARE times as many proposals as slots where cells allow it, `least_per_cell` to MAX_PER_CELL per cell and category:
+    SPARE times as many proposals as slots where cells allow it, `min_proposals_per_cell` to MAX_PER_CELL per cell and category:
     rare things, too, come in groups. Cells are read one by one, by the same small network: its neighbours know nothing
     of a primitive that the cell does not.
     """
 
-    def __init__(
-        self, slots: tuple[int, ...], latent_channels: int, latent_size: int, hidden: int, least_per_cell: int = 1
-    ) -> None:
+    def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:
         super().__init__()
+        hidden = config.head_hidden
         cells = latent_size**2
-        wanted = (max(least_per_cell, math.ceil(SPARE * count / cells)) for count in slots)
+        wanted = (max(config.min_proposals_per_cell, math.ceil(SPARE * count / cells)) for count in slots)
         self.per_cell = tuple(min(MAX_PER_CELL, count) for count in wanted)
         self.proposals = tuple(count * cells for count in self.per_cell)
         self.match_weights = MatchWeights(existence=1.0)
@@ -64,7 +64,7 @@ class CellDecoder(nn.Module):
         # (b, k, cells) in this order: category by category, since k is.
         return features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1)
 
-    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, categories]) -> None:
+    def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
         """Set the last bias: the middle of the cell, mean height and shape per category, existence by `count`."""
         existence = (count / count.new_tensor(self.proposals)).clamp(0.001, 0.99).logit()
         bias = torch.cat([existence[:, None], torch.zeros_like(feature_logit[:, :2]), feature_logit[:, 2:]], dim=1)

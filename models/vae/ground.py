@@ -1,4 +1,4 @@
-"""Ground branch of the layout VAE: diffusers' convolutional VAE on raster maps (paper, supplement B.2)."""
+"""Ground branch of the layout VAE: a convolutional autoencoder of raster maps (paper, supplement B.2)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models.vae.config import GroundConfig
+from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
+
 LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # of distance from the border: the linear start takes the best
 HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell, in the linear start
 
@@ -14,127 +17,103 @@ HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell
 class GroundEncoder(nn.Module):
     """Raster maps [H; B] -> mean and log-variance of the ground latent, stacked along the channels.
 
-    Blocks of fold x fold pixels first become channels (1 in the paper: no folding); then each entry of `channels` but
-    the last halves the resolution once: four entries give the paper's factor 8. `attention` is the paper's, over all cells in
-    the middle of the network. With `shortcut`, the mean is the network's plus a linear map of the cell's `smooth_maps`,
-    solved in closed form (`start_at`). Not in the paper.
+    With `shortcut`, the mean is the network's plus a linear map of the cell's `smooth_maps`, solved in closed form
+    (`init_from_data`). Not in the paper.
     """
 
-    def __init__(
-        self,
-        num_classes: int,
-        latent_channels: int,
-        channels: tuple[int, ...],
-        norm_groups: int,
-        fold: int,
-        attention: bool,
-        shortcut: bool,
-    ) -> None:
-        from diffusers.models.autoencoders.vae import Encoder  # imports for a second, which only this needs
-
+    def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
         super().__init__()
-        self.fold = nn.PixelUnshuffle(fold)
-        self.net = Encoder(
-            in_channels=2 * num_classes * fold**2,
-            out_channels=latent_channels,
-            down_block_types=("DownEncoderBlock2D",) * len(channels),
-            block_out_channels=channels,
-            layers_per_block=1,
-            mid_block_add_attention=attention,
-            norm_num_groups=norm_groups,
-            double_z=True,
+        self.unshuffle = nn.PixelUnshuffle(config.pixel_unshuffle)
+        self.net = ConvolutionalEncoder(
+            2 * num_classes * config.pixel_unshuffle**2,
+            2 * latent_channels,
+            tuple(config.channels),
+            config.norm_groups,
+            config.attention,
         )
-        cell = fold * 2 ** (len(channels) - 1)
+        cell = config.cell_px
         self.shortcut = nn.Conv2d(2 * num_classes, latent_channels, cell, stride=cell) if shortcut else None
 
     def forward(self, maps: Float[Tensor, "batch maps rows cols"]) -> Float[Tensor, "batch moments h w"]:
-        moments = self.net(self.fold(maps * 2 - 1))
+        moments = self.net(self.unshuffle(maps * 2 - 1))
         if self.shortcut is None:
             return moments
         mean, logvar = moments.chunk(2, dim=1)
-        smooth = smooth_maps(*maps.chunk(2, dim=1), self.shortcut.stride[0])
+        smooth = compute_smooth_maps(*maps.chunk(2, dim=1), self.shortcut.stride[0])
         return torch.cat([mean + self.shortcut(smooth), logvar], dim=1)
 
 
 class GroundDecoder(nn.Module):
     """Ground latent -> normalised heights and occupancy logits, stacked along the channels."""
 
-    def __init__(
-        self,
-        num_classes: int,
-        latent_channels: int,
-        channels: tuple[int, ...],
-        norm_groups: int,
-        fold: int,
-        attention: bool,
-        shortcut: bool,
-    ) -> None:
-        from diffusers.models.autoencoders.vae import Decoder  # imports for a second, which only this needs
-
+    def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
         super().__init__()
-        self.net = Decoder(
-            in_channels=latent_channels,
-            out_channels=2 * num_classes * fold**2,
-            up_block_types=("UpDecoderBlock2D",) * len(channels),
-            block_out_channels=channels,
-            layers_per_block=1,
-            mid_block_add_attention=attention,
-            norm_num_groups=norm_groups,
+        self.net = ConvolutionalDecoder(
+            latent_channels,
+            2 * num_classes * config.pixel_unshuffle**2,
+            tuple(config.channels),
+            config.norm_groups,
+            config.attention,
         )
-        self.unfold = nn.PixelShuffle(fold)
-        cell = fold * 2 ** (len(channels) - 1)
+        self.shuffle = nn.PixelShuffle(config.pixel_unshuffle)
+        cell = config.cell_px
         self.shortcut = nn.ConvTranspose2d(latent_channels, 2 * num_classes, cell, stride=cell) if shortcut else None
 
     def forward(self, latent: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch maps rows cols"]:
-        maps = self.unfold(self.net(latent))
+        maps = self.shuffle(self.net(latent))
         return maps if self.shortcut is None else maps + self.shortcut(latent)
 
 
 @torch.no_grad()
-def start_at(
+def init_from_data(
     encoder: GroundEncoder,
     decoder: GroundDecoder,
     height: Float[Tensor, "batch ground rows cols"],
     occupied: Float[Tensor, "batch ground rows cols"],
 ) -> None:
-    """Start where linear algebra can: outputs at their means; with shortcuts, at the best linear autoencoder.
+    """Initialise outputs to their means; with shortcuts, initialise to the best linear autoencoder.
 
-    The shortcuts become the principal components of a cell's `smooth_maps`, scaled to unit variance, distances being
-    read as logits, and the networks start at zero beside them. On the town at 256 pixels it starts at a ground IoU
-    of 99.4 % (BENCHMARKS.md).
+    The shortcuts become the principal components of a cell's `smooth_maps`, scaled to unit variance, with distances
+    read as logits; the networks' outputs start at zero. On the town at 256 pixels the initial ground IoU is 99.4 %
+    (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights on the objects' channels become zero.
     """
     count = occupied.sum(dim=(0, 2, 3)).clamp(min=1)
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count
     mean_logit = occupied.mean(dim=(0, 2, 3)).clamp(0.01, 0.99).logit()
-    bias = torch.cat([mean_height, mean_logit]).repeat_interleave(decoder.unfold.upscale_factor**2)
+    bias = torch.cat([mean_height, mean_logit]).repeat_interleave(decoder.shuffle.upscale_factor**2)
     decoder.net.conv_out.bias.copy_(bias)
-    if encoder.shortcut is None:
+    if encoder.shortcut is None or decoder.shortcut is None:
         return
     cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
-    maps = _cells(smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
+    maps = _split_cells(compute_smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
     heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
     weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # in the principal components
     mean = maps.mean(dim=0)
-    components, deviation = principal_components((maps - mean) * weight, latent)
+    components, deviation = compute_principal_components((maps - mean) * weight, latent)
     encode = weight[:, None] * components / deviation
     decode = (deviation * components).T / weight
     rebuilt = (maps - mean) @ encode @ decode + mean
-    inside = (_cells(occupied, cell) > 0.5).to(maps.dtype)
+    inside = (_split_cells(occupied, cell) > 0.5).to(maps.dtype)
     error = {
-        logit: F.binary_cross_entropy_with_logits(logit * reach(cell) * rebuilt[:, maps.shape[1] // 2 :], inside)
+        logit: F.binary_cross_entropy_with_logits(
+            logit * compute_edge_reach_px(cell) * rebuilt[:, maps.shape[1] // 2 :], inside
+        )
         for logit in LOGITS_PER_PX
     }
-    unit = torch.cat([heights, min(error, key=error.get) * reach(cell) * distances])  # of the decoder's outputs
+    unit = torch.cat(
+        [heights, min(error, key=error.get) * compute_edge_reach_px(cell) * distances]
+    )  # of the decoder's outputs
     encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
     encoder.shortcut.bias.copy_(-mean @ encode)
-    decoder.shortcut.weight.copy_((decode * unit).reshape(latent, -1, cell, cell))
+    decoder.shortcut.weight[:latent].copy_((decode * unit).reshape(latent, -1, cell, cell))
+    decoder.shortcut.weight[latent:].zero_()
     decoder.shortcut.bias.copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
     encoder.net.conv_out.weight[:latent].zero_()
     decoder.net.conv_out.weight.zero_()
     decoder.net.conv_out.bias.zero_()
 
 
-def smooth_maps(
+def compute_smooth_maps(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch maps rows cols"]:
     """Raster maps as few numbers can carry them: heights that go on where nothing is occupied, distances for 0 and 1.
@@ -142,16 +121,18 @@ def smooth_maps(
     A border through a cell is a step in occupancy, which takes many linear components, and a plane in distance from
     the border, which takes three. Distances are in units of `reach`, within [-1, 1].
     """
-    distance = signed_distance_px(occupied > 0.5, reach(cell)) / reach(cell)
-    return torch.cat([filled(height, occupied, cell), distance.to(height.dtype)], dim=1)
+    distance = compute_signed_distance_px(occupied > 0.5, compute_edge_reach_px(cell)) / compute_edge_reach_px(cell)
+    return torch.cat([fill_heights(height, occupied, cell), distance.to(height.dtype)], dim=1)
 
 
-def reach(cell: int) -> int:
+def compute_edge_reach_px(cell: int) -> int:
     """Pixels from a border up to which distances are told apart: half a cell."""
     return max(1, cell // 2)
 
 
-def signed_distance_px(inside: Bool[Tensor, "*batch rows cols"], most: int) -> Float[Tensor, "*batch rows cols"]:
+def compute_signed_distance_px(
+    inside: Bool[Tensor, "*batch rows cols"], most: int
+) -> Float[Tensor, "*batch rows cols"]:
     """Euclidean distance from pixel centres to the border, positive inside, exact up to `most` pixels and cut there.
 
     The border lies half a pixel before the nearest pixel of the other kind (Felzenszwalb & Huttenlocher 2012, on a
@@ -169,13 +150,13 @@ def signed_distance_px(inside: Bool[Tensor, "*batch rows cols"], most: int) -> F
     return torch.where(inside, to_outside - 0.5, 0.5 - to_inside)
 
 
-def _cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
+def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
     """The pixels of each latent cell, (map, row, col) in C order, float64."""
     pixels = F.pixel_unshuffle(maps, cell)
     return pixels.permute(0, 2, 3, 1).reshape(-1, pixels.shape[1]).double()
 
 
-def filled(
+def fill_heights(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch ground rows cols"]:
     """Heights, and where nothing is occupied and so any height will do, the cell's mean or the scene's."""
@@ -186,9 +167,9 @@ def filled(
     return torch.where(occupied > 0, height, mean)
 
 
-def principal_components(
+def compute_principal_components(
     centred: Float[Tensor, "n p"], count: int
-) -> tuple[Float[Tensor, "p count"], Float[Tensor, count]]:
+) -> tuple[Float[Tensor, "p count"], Float[Tensor, " count"]]:
     """The directions of largest variance, and the standard deviations along them (at least 0.01)."""
     variance, directions = torch.linalg.eigh(centred.T @ centred / len(centred))
     return directions[:, -count:], variance[-count:].clamp(min=1e-4).sqrt()

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from models.batch import LayoutBatch
 from models.layout import LayoutSpec
-from models.lvae import LayoutOutput, Posterior
-from models.vae.matching import match
+from models.vae.matching import match_primitives
+from models.vae.outputs import LayoutOutput, Posterior
 
 OCCUPANCY_WEIGHT, HEIGHT_WEIGHT, KL_WEIGHT = 1.0, 9.0, 1e-6
 
@@ -52,12 +52,12 @@ class LVAELoss:
         return {name: getattr(self, name) for name in self.__dataclass_fields__} | {"loss": self.total}
 
 
-def occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]) -> Float[Tensor, ""]:
+def compute_occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]) -> Float[Tensor, ""]:
     """Binary cross-entropy, mean over pixels, classes and batch."""
     return F.binary_cross_entropy_with_logits(logit, occupied)
 
 
-def height_loss(
+def compute_height_loss(
     height: Float[Tensor, "b g h w"], truth: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]
 ) -> Float[Tensor, ""]:
     """L1 over occupied pixels, per sample, mean over the batch."""
@@ -65,7 +65,7 @@ def height_loss(
     return (total / occupied.sum(dim=(1, 2, 3)).clamp(min=1)).mean()
 
 
-def object_losses(
+def compute_object_losses(
     features: Float[Tensor, "b n 9"],
     existence_logit: Float[Tensor, "b n"],
     truth: Float[Tensor, "b slots 9"],
@@ -93,7 +93,7 @@ def object_losses(
     )
 
 
-def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
+def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
     """KL to the standard normal: sum over channels and positions, mean over the batch.
 
     The paper leaves open what happens to the positions; they are summed, as latent diffusion does.
@@ -102,20 +102,22 @@ def kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
     return -0.5 * (1 + logvar - mean.square() - logvar.exp()).sum(dim=(1, 2, 3)).mean()
 
 
-def lvae_loss(
+def compute_lvae_loss(
     output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec, kl_weight: float = KL_WEIGHT
 ) -> LVAELoss:
     """The total objective of stage 1 and its parts; zero where the ground branch is left out."""
     ground = float(output.branches != "objects")
     unit = batch.features.new_tensor(output.feature_unit)
     proposed, truth = (output.features / unit, output.existence_logit), batch.features / unit
-    assignment = match(*proposed, truth, batch.real, spec.slots, output.proposals, output.match_weights)
-    existence, center, cholesky = object_losses(*proposed, truth, batch.real, assignment, spec, output.proposals)
+    assignment = match_primitives(*proposed, truth, batch.real, spec.slots, output.proposals, output.match_weights)
+    existence, center, cholesky = compute_object_losses(
+        *proposed, truth, batch.real, assignment, spec, output.proposals
+    )
     return LVAELoss(
-        occupancy=ground * OCCUPANCY_WEIGHT * occupancy_loss(output.occupancy_logit, batch.occupied),
-        height=ground * HEIGHT_WEIGHT * height_loss(output.height, batch.height, batch.occupied),
+        occupancy=ground * OCCUPANCY_WEIGHT * compute_occupancy_loss(output.occupancy_logit, batch.occupied),
+        height=ground * HEIGHT_WEIGHT * compute_height_loss(output.height, batch.height, batch.occupied),
         existence=existence,
         center=center,
         cholesky=cholesky,
-        kl=kl_weight * kl_loss(posterior),
+        kl=kl_weight * compute_kl_loss(posterior),
     )

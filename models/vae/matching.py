@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
-class NotFiniteError(ValueError):
+class NonFiniteCostError(ValueError):
     """Predictions that are not numbers cannot be matched."""
 
 
@@ -37,7 +37,7 @@ class MatchWeights(NamedTuple):
 PAPER_WEIGHTS = MatchWeights()
 
 
-def match_cost(
+def compute_match_cost(
     features: Float[Tensor, "batch n 9"],
     existence_logit: Float[Tensor, "batch n"],
     truth: Float[Tensor, "batch m 9"],
@@ -49,7 +49,7 @@ def match_cost(
 
 
 @torch.no_grad()
-def match(
+def match_primitives(
     features: Float[Tensor, "batch proposals 9"],
     existence_logit: Float[Tensor, "batch proposals"],
     truth: Float[Tensor, "batch slots 9"],
@@ -73,7 +73,9 @@ def match(
                 slice(first_slot[k], first_slot[k] + most),
                 slice(first_proposal[k], first_proposal[k] + proposals[k]),
             )
-            costs.append(match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs], weights).flatten())
+            costs.append(
+                compute_match_cost(features[:, mine], existence_logit[:, mine], truth[:, theirs], weights).flatten()
+            )
             blocks.append((k, most, start))
             start += costs[-1].numel()
     assignment = np.full(existence_logit.shape, -1)
@@ -81,7 +83,7 @@ def match(
         return torch.from_numpy(assignment).to(real.device)
     flat = torch.cat(costs).cpu().double().numpy()
     if not np.isfinite(flat).all():
-        raise NotFiniteError("predicted primitives are not finite; lower the learning rate or look at this batch")
+        raise NonFiniteCostError("predicted primitives are not finite; lower the learning rate or look at this batch")
 
     def solve(sample: int) -> None:
         for k, most, start in blocks:
@@ -91,10 +93,10 @@ def match(
                 rows, cols = linear_sum_assignment(cost)
                 assignment[sample, first_proposal[k] + cols] = first_slot[k] + rows
 
-    deque(_threads(torch.get_num_threads()).map(solve, range(len(assignment))), maxlen=0)
+    deque(_count_threads(torch.get_num_threads()).map(solve, range(len(assignment))), maxlen=0)
     return torch.from_numpy(assignment).to(real.device)
 
 
 @cache
-def _threads(count: int) -> ThreadPoolExecutor:
+def _count_threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="matching")

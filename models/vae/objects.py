@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from models.layout import FEATURES
+from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
 CATEGORY_EMBEDDING = 10  # paper, Sec. 3.2: 9 features + 10 + padding flag = 20
@@ -38,7 +39,7 @@ class Attention(nn.Module):
         return self.out(F.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2))
 
 
-def feed_forward(width: int, hidden: int) -> nn.Sequential:
+def make_feed_forward(width: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width))
 
 
@@ -47,7 +48,7 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
-        self.attention, self.mlp = Attention(width, heads), feed_forward(width, hidden)
+        self.attention, self.mlp = Attention(width, heads), make_feed_forward(width, hidden)
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
 
     def forward(self, x: Float[Tensor, "batch n d"], mask: Bool[Tensor, "batch n"]) -> Float[Tensor, "batch n d"]:
@@ -61,7 +62,7 @@ class DecoderLayer(nn.Module):
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
         self.self_attention, self.cross_attention = Attention(width, heads), Attention(width, heads)
-        self.mlp = feed_forward(width, hidden)
+        self.mlp = make_feed_forward(width, hidden)
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
 
     def forward(self, x: Tensor, query_position: Tensor, memory: Tensor, memory_key: Tensor) -> Tensor:
@@ -72,7 +73,7 @@ class DecoderLayer(nn.Module):
         return self.norm3(x + self.mlp(x))
 
 
-def grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -> tuple[Tensor, Tensor]:
+def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -> tuple[Tensor, Tensor]:
     """Row and column of the latent cell under each normalised centre (x forward = up, y left = left).
 
     The latent grid lies like the rasters: row 0 farthest ahead, column 0 leftmost.
@@ -96,18 +97,16 @@ class ObjectEncoder(nn.Module):
         slots: tuple[int, ...],
         latent_channels: int,
         latent_size: int,
-        width: int,
-        layers: int,
-        heads: int,
-        hidden: int,
+        config: ObjectConfig,
         shortcut: bool = False,
     ) -> None:
         super().__init__()
+        width, heads, hidden = config.width, config.heads, config.hidden
         slot_category = torch.tensor([category for category, count in enumerate(slots) for _ in range(count)])
         self.register_buffer("slot_category", slot_category, persistent=False)
         self.category = nn.Embedding(len(slots), CATEGORY_EMBEDDING)
         self.project_in = nn.Linear(FEATURES + CATEGORY_EMBEDDING + 1, width)
-        self.layers = nn.ModuleList(EncoderLayer(width, heads, hidden) for _ in range(layers))
+        self.layers = nn.ModuleList(EncoderLayer(width, heads, hidden) for _ in range(config.layers))
         self.project_out = nn.Linear(width, 2 * latent_channels)
         self.grid = nn.Parameter(torch.zeros(2 * latent_channels, latent_size, latent_size))
         self.shortcut = None
@@ -134,7 +133,7 @@ class ObjectEncoder(nn.Module):
         for layer in self.layers:
             x = layer(x, visible)
         x = self.project_out(x)  # (b, n, moments)
-        row, col = grid_cells(features[..., :3], rows, cols)
+        row, col = find_grid_cells(features[..., :3], rows, cols)
         if self.shortcut is not None:
             mean, logvar = x.chunk(2, dim=-1)
             x = torch.cat([mean + self.shortcut(self.seen_from_cell(features, row, col, category)), logvar], dim=-1)
@@ -162,7 +161,7 @@ class ObjectEncoder(nn.Module):
         return picked, real.gather(1, order), self.slot_category[order]
 
 
-def sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]:
+def make_sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]:
     """DETR's normalised sine positions of a grid, row-major: half the channels for the row, half for the column."""
 
     def axis(n: int) -> Tensor:
@@ -175,7 +174,7 @@ def sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]
     return torch.cat([row[:, None].expand(-1, cols, -1), col[None].expand(rows, -1, -1)], dim=2).flatten(0, 1)
 
 
-class Heads(nn.Module):
+class OutputHeads(nn.Module):
     """One category's outputs: a 3-layer network for the nine features, a linear layer for existence."""
 
     def __init__(self, width: int, hidden: int) -> None:
@@ -189,25 +188,16 @@ class Heads(nn.Module):
 class ObjectDecoder(nn.Module):
     """Object latent -> normalised features in [0, 1] and existence logits for every slot (DETR)."""
 
-    def __init__(
-        self,
-        slots: tuple[int, ...],
-        latent_channels: int,
-        latent_size: int,
-        width: int,
-        layers: int,
-        heads: int,
-        hidden: int,
-        head_hidden: int,
-    ) -> None:
+    def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:
         super().__init__()
+        width, heads, hidden = config.width, config.heads, config.hidden
         self.proposals = tuple(slots)
         self.match_weights = MatchWeights()
         self.project_in = nn.Linear(latent_channels, width)  # patch size 1
         self.queries = nn.Parameter(torch.randn(sum(slots), width))
-        self.layers = nn.ModuleList(DecoderLayer(width, heads, hidden) for _ in range(layers))
-        self.heads = nn.ModuleList(Heads(width, head_hidden) for _ in slots)
-        self.register_buffer("positions", sine_positions(latent_size, latent_size, width), persistent=False)
+        self.layers = nn.ModuleList(DecoderLayer(width, heads, hidden) for _ in range(config.layers))
+        self.heads = nn.ModuleList(OutputHeads(width, config.head_hidden) for _ in slots)
+        self.register_buffer("positions", make_sine_positions(latent_size, latent_size, width), persistent=False)
 
     def forward(
         self, latent: Float[Tensor, "batch c h w"]
@@ -222,7 +212,7 @@ class ObjectDecoder(nn.Module):
         existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence
 
-    def start_at(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, categories]) -> None:
+    def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
         """Set the last biases: mean features per category, existence as often as `count` per scene."""
         for head, mean, expected, offered in zip(self.heads, feature_logit, count, self.proposals, strict=True):
             head.features[-1].bias.copy_(mean)

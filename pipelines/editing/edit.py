@@ -19,11 +19,18 @@ import numpy as np
 import pyarrow as pa
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from models.composition.inpaint import polygon_contains
-from models.scene import CATEGORIES, CATEGORY_INDEX, Scene, canonical_boxes, joined, yaw_rotation
-from pipelines.editing.repair import GroundFaults, apart, onto_ground, superfluous
+from models.composition.inpaint import contains_points
+from models.scene import (
+    CATEGORIES,
+    CATEGORY_INDEX,
+    Scene,
+    canonicalize_boxes,
+    concatenate_primitives,
+    make_yaw_rotation,
+)
+from pipelines.editing.repair import GroundFaults, find_removable_objects, separate_objects, snap_to_ground
 from pipelines.metrics.validity import SLAB_OFFSET_M
-from pipelines.schema.tables import PRIMITIVES, primitives_table
+from pipelines.schema.tables import PRIMITIVES, make_primitives_table
 
 SIZES_M = (1e-3, 1e3)  # what an edit may leave
 
@@ -49,22 +56,22 @@ class Select:
         """Raises ValueError for what no scene can answer: nothing named, no such category, a condition that is none."""
         self._check_names()
         if self.where:
-            _where(PRIMITIVES.empty_table(), self.where)
+            _evaluate_where(PRIMITIVES.empty_table(), self.where)
 
     def _check_names(self) -> None:
         if self == Select():
             raise ValueError("no primitives are chosen: give category, primitives, instances, polygon-m or where")
         for name in self.category:
-            _category(name)
+            _parse_category(name)
         if len(self.polygon_m) % 2:
             raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
 
-    def chosen(self, scene: Scene) -> np.ndarray:
+    def select_primitives(self, scene: Scene) -> np.ndarray:
         """(n,) bool. Raises ValueError as `check` does, or for primitives the scene does not have."""
         self._check_names()
         fits = np.ones(len(scene), bool)
         if self.category:
-            fits &= np.isin(scene.category, [_category(name) for name in self.category])
+            fits &= np.isin(scene.category, [_parse_category(name) for name in self.category])
         if self.primitives:
             numbers = ", ".join(map(str, self.primitives))
             if not -1 < min(self.primitives) <= max(self.primitives) < len(scene):
@@ -73,13 +80,13 @@ class Select:
         if self.instances:
             fits &= np.isin(scene.instance_id, self.instances)
         if self.polygon_m:
-            fits &= polygon_contains(np.reshape(self.polygon_m, (-1, 2)), *scene.center_m[:, :2].T)
+            fits &= contains_points(np.reshape(self.polygon_m, (-1, 2)), *scene.center_m[:, :2].T)
         if self.where:
-            fits &= _where(primitives_table([scene]), self.where)
+            fits &= _evaluate_where(make_primitives_table([scene]), self.where)
         return fits
 
 
-def _where(table: pa.Table, condition: str) -> np.ndarray:
+def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
     """(n,) bool: rows of a primitives table that a condition in SQL holds for."""
     table = table.append_column("row", pa.array(np.arange(len(table))))
     with duckdb.connect(config={"enable_external_access": False}) as connection:
@@ -110,28 +117,28 @@ class Edit(ABC):
         self.select.check()
 
     @abstractmethod
-    def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+    def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
         """The scene with its chosen (n,) primitives changed, and which primitive each of its own (m,) was before.
 
         Raises ValueError for a broken result.
         """
 
 
-class Change(Edit):
+class ObjectEdit(Edit):
     """An edit after which every primitive is still there, in its place of the list."""
 
     @abstractmethod
-    def changed(self, part: Scene) -> Scene:
+    def transform(self, part: Scene) -> Scene:
         """A scene of the chosen primitives only -> what they become. Its ground is the whole scene's."""
 
-    def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        part = require_sound(self.changed(scene.select(chosen)))
+    def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        part = require_valid_objects(self.transform(scene.select(chosen)))
         place = np.arange(len(scene))
         place[chosen] = len(scene) + np.arange(len(part))
-        return replace(scene, **joined([scene, part])).select(place), np.arange(len(scene))
+        return replace(scene, **concatenate_primitives([scene, part])).select(place), np.arange(len(scene))
 
 
-def require_sound(part: Scene) -> Scene:
+def require_valid_objects(part: Scene) -> Scene:
     """The same scene. Raises ValueError if a primitive is nowhere, or no size for a thing."""
     size_m = part.size_m
     if not (np.isfinite(part.center_m).all() and ((size_m >= SIZES_M[0]) & (size_m <= SIZES_M[1])).all()):
@@ -143,7 +150,7 @@ def require_sound(part: Scene) -> Scene:
 class Remove(Edit):
     """Take primitives out."""
 
-    def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+    def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
         return scene.select(~chosen), np.flatnonzero(~chosen)
 
 
@@ -158,14 +165,16 @@ class Duplicate(Edit):
         super().check()
         _check_way(self.by_m)
 
-    def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        copies = require_sound(Translate(by_m=self.by_m).changed(scene.select(chosen)))
+    def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        copies = require_valid_objects(Translate(by_m=self.by_m).transform(scene.select(chosen)))
         copies = replace(copies, instance_id=np.full(len(copies), -1, np.int64))
-        return replace(scene, **joined([scene, copies])), np.append(np.arange(len(scene)), np.flatnonzero(chosen))
+        return replace(scene, **concatenate_primitives([scene, copies])), np.append(
+            np.arange(len(scene)), np.flatnonzero(chosen)
+        )
 
 
 @dataclass(frozen=True)
-class Translate(Change):
+class Translate(ObjectEdit):
     """Move."""
 
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -177,7 +186,7 @@ class Translate(Change):
         super().check()
         _check_way(self.by_m)
 
-    def changed(self, part: Scene) -> Scene:
+    def transform(self, part: Scene) -> Scene:
         way_m = np.broadcast_to(np.array(self.by_m, float), (len(part), 3))
         if self.along == "own":
             ahead = np.stack([np.cos(part.heading_rad), np.sin(part.heading_rad), np.zeros(len(part))], axis=1)
@@ -188,7 +197,7 @@ class Translate(Change):
 
 
 @dataclass(frozen=True)
-class Rotate(Change):
+class Rotate(ObjectEdit):
     """Turn about the vertical, counter-clockwise seen from above."""
 
     by_deg: float = 0.0
@@ -200,10 +209,10 @@ class Rotate(Change):
         if not np.isfinite(self.by_deg) or self.by_deg % 360 == 0:
             raise ValueError(f"rotate by {self.by_deg} degrees turns nothing")
 
-    def changed(self, part: Scene) -> Scene:
+    def transform(self, part: Scene) -> Scene:
         by_rad = np.deg2rad(self.by_deg)
-        turn = yaw_rotation(by_rad)
-        rotation, size_m = canonical_boxes(turn @ part.rotation.astype(float), part.size_m)
+        turn = make_yaw_rotation(by_rad)
+        rotation, size_m = canonicalize_boxes(turn @ part.rotation.astype(float), part.size_m)
         center_m = part.center_m
         if self.about_m is not None:
             axis_m = np.array([*self.about_m, 0.0])
@@ -219,7 +228,7 @@ class Rotate(Change):
 
 
 @dataclass(frozen=True)
-class Scale(Change):
+class Scale(ObjectEdit):
     """Make larger or smaller along a primitive's own axes."""
 
     by: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -232,17 +241,17 @@ class Scale(Change):
         if not all(np.isfinite(self.by)) or min(self.by) <= 0 or set(self.by) == {1}:
             raise ValueError(f"scale by {list(self.by)}: expected factors above 0, not all of them 1")
 
-    def changed(self, part: Scene) -> Scene:
-        rotation, size_m = canonical_boxes(part.rotation, part.size_m * np.array(self.by, np.float32))
+    def transform(self, part: Scene) -> Scene:
+        rotation, size_m = canonicalize_boxes(part.rotation, part.size_m * np.array(self.by, np.float32))
         part_scaled = replace(part, rotation=rotation, size_m=size_m)
         if self.hold == "centre":
             return part_scaled
         up_m = part.bottom_m - part_scaled.bottom_m
-        return replace(part_scaled, center_m=_raised(part, up_m))
+        return replace(part_scaled, center_m=_raise_objects(part, up_m))
 
 
 @dataclass(frozen=True)
-class Relabel(Change):
+class Relabel(ObjectEdit):
     """Give another category; vegetation_ellipsoid makes ellipsoids, every other cuboids."""
 
     category: str = "object"
@@ -251,24 +260,24 @@ class Relabel(Change):
 
     def check(self) -> None:
         super().check()
-        _category(self.category)
+        _parse_category(self.category)
 
-    def changed(self, part: Scene) -> Scene:
-        index, label = _category(self.category), self.label or self.category
+    def transform(self, part: Scene) -> Scene:
+        index, label = _parse_category(self.category), self.label or self.category
         return replace(part, category=np.full_like(part.category, index), label=np.full(len(part), label, object))
 
 
 @dataclass(frozen=True)
-class Snap(Change):
+class Snap(ObjectEdit):
     """Put the lowest point on the ground under the centre; what is over no known ground stays."""
 
     slab_offset_m: float = SLAB_OFFSET_M
     """How far the ground's heights lie above the surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2."""
 
-    def changed(self, part: Scene) -> Scene:
+    def transform(self, part: Scene) -> Scene:
         height_m, _ = part.ground_under()
         above_m = part.bottom_m - (height_m - self.slab_offset_m)
-        return replace(part, center_m=_raised(part, -np.nan_to_num(above_m)))
+        return replace(part, center_m=_raise_objects(part, -np.nan_to_num(above_m)))
 
 
 @dataclass(frozen=True)
@@ -293,18 +302,18 @@ class Repair(Edit):
         if not 0 < self.shrink <= 1:
             raise ValueError(f"shrink is {self.shrink}, expected a share of the size above 0, at most 1 (no shrinking)")
 
-    def applied(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        scene = onto_ground(scene, chosen, self.slab_offset_m, self.ground)
-        scene = require_sound(apart(scene, chosen, self.push_m, self.shrink))
-        scene = onto_ground(scene, chosen, self.slab_offset_m, self.ground)  # where a push led over a slope
-        gone = superfluous(scene, chosen) if self.drop else np.zeros(len(scene), bool)
+    def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)
+        scene = require_valid_objects(separate_objects(scene, chosen, self.push_m, self.shrink))
+        scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)  # where a push led over a slope
+        gone = find_removable_objects(scene, chosen) if self.drop else np.zeros(len(scene), bool)
         return scene.select(~gone), np.flatnonzero(~gone)
 
 
 EDITS = {kind.__name__.lower(): kind for kind in (Remove, Duplicate, Translate, Rotate, Scale, Relabel, Snap, Repair)}
 
 
-def _raised(part: Scene, up_m: np.ndarray) -> np.ndarray:
+def _raise_objects(part: Scene, up_m: np.ndarray) -> np.ndarray:
     """(n, 3) centres moved up by up_m (n,)."""
     return (part.center_m + up_m[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)
 
@@ -314,13 +323,13 @@ def _check_way(by_m: Sequence[float]) -> None:
         raise ValueError(f"by_m is {list(by_m)}: expected metres along x, y and z, not all 0")
 
 
-def _category(name: str) -> int:
+def _parse_category(name: str) -> int:
     if name not in CATEGORY_INDEX:
         raise ValueError(f"category {name!r} is unknown, expected one of: {', '.join(CATEGORIES)}")
     return CATEGORY_INDEX[name]
 
 
-class Done(NamedTuple):
+class ObjectChange(NamedTuple):
     """What an edit did, a row per primitive it touched; numbers are those before it."""
 
     primitive: np.ndarray  # (k,) int, index into the scene before
@@ -330,7 +339,7 @@ class Done(NamedTuple):
     resized: np.ndarray  # (k,) float64, the largest change of an extent as a share of what it was
 
 
-def done_between(before: Scene, after: Scene, origin: np.ndarray) -> Done:
+def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectChange:
     """What became of the primitives of a scene; origin (m,): the number that each of `after` had there."""
     removed = np.setdiff1d(np.arange(len(before)), origin)
     copied = np.ones(len(origin), bool)
@@ -343,7 +352,7 @@ def done_between(before: Scene, after: Scene, origin: np.ndarray) -> Done:
     touched = copied | (moved_m > 0) | (turned_rad > 0) | (resized > 0) | (after.category != was.category)
     touched |= (after.label != was.label) | ((after.heading_rad != was.heading_rad) & ~np.isnan(was.heading_rad))
     nothing = np.zeros(len(removed))
-    return Done(
+    return ObjectChange(
         np.append(removed, origin[touched]),
         np.append(np.full(len(removed), "removed"), np.where(copied, "copied", "changed")[touched]),
         np.append(nothing, moved_m[touched]),
@@ -352,7 +361,7 @@ def done_between(before: Scene, after: Scene, origin: np.ndarray) -> Done:
     )
 
 
-def replayed(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[Done]]:
+def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[ObjectChange]]:
     """The scene after all edits, and what each of them changed.
 
     Numbers are those of the moment: after a removal the primitives behind it move up. Raises ValueError, naming the edit.
@@ -360,28 +369,28 @@ def replayed(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[Done]]:
     done = []
     for step, edit in enumerate(edits):
         try:
-            after, origin = edit.applied(scene, edit.select.chosen(scene))
+            after, origin = edit.apply_to(scene, edit.select.select_primitives(scene))
         except ValueError as error:
             raise ValueError(f"edit {step} ({edit.name}): {error}") from error
-        done.append(done_between(scene, after, origin))
+        done.append(compare_objects(scene, after, origin))
         scene = after
     return scene, done
 
 
-def edits_to_json(edits: Sequence[Edit]) -> list[dict]:
+def serialize_edits(edits: Sequence[Edit]) -> list[dict]:
     """Edits as JSON objects, tuples as lists; what has its default is left out."""
-    return json.loads(json.dumps([{"edit": edit.name, **_said(edit)} for edit in edits]))
+    return json.loads(json.dumps([{"edit": edit.name, **_describe_value(edit)} for edit in edits]))
 
 
-def _said(value: Edit | Select) -> dict:
+def _describe_value(value: Edit | Select) -> dict:
     plain = {f.name: f.default for f in fields(value)}
     said = {name: content for name, content in asdict(value).items() if content != plain[name]}
     if isinstance(value, Edit):
-        said["select"] = _said(value.select)
+        said["select"] = _describe_value(value.select)
     return said
 
 
-def edits_from_json(content: object) -> list[Edit]:
+def parse_edits(content: object) -> list[Edit]:
     """The edits of a JSON list. Raises ValueError that names the edit and what is wrong with it."""
     if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
         raise ValueError("a list of edits is a JSON list of objects, each with 'edit' and 'select'")

@@ -11,9 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from models.geometry.iou3d import Boxes, boxes_of, iou3d_matrix, iou3d_pairs
+from models.geometry.iou3d import Boxes, compute_iou3d_matrix, compute_iou3d_pairs, extract_boxes
 from models.scene import Scene
-from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, faults
+from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, find_faults
 
 # A little less than what is a fault: rounded as tables store it, what was none would else become one.
 GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
@@ -28,9 +28,9 @@ CANDIDATES = 6  # directions of the shortest pushes that are tried against every
 GroundFaults = Literal["both", "floating", "sunken", "none"]
 
 
-def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
+def snap_to_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
     """Chosen (n,) primitives that float or are sunken, with their lowest point on the surface."""
-    found = faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
+    found = find_faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
     wrong = np.zeros(len(scene), bool)
     for name in ("floating", "sunken"):
         wrong |= chosen & found[name][0] & (which in ("both", name))
@@ -40,23 +40,23 @@ def onto_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: G
     return replace(scene, center_m=center_m.astype(np.float32))
 
 
-def overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
+def find_overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
     """(p, 2) indices i < j of solid boxes that overlap by more than validity allows, the least overlap first."""
     index = np.flatnonzero(solid)
     part = boxes.take(index)
-    iou = np.triu(iou3d_matrix(part, part), 1)
+    iou = np.triu(compute_iou3d_matrix(part, part), 1)
     i, j = np.nonzero(iou > OVERLAP_IOU3D)
     order = np.argsort(iou[i, j], kind="stable")
     return np.stack([index[i], index[j]], axis=1)[order]
 
 
-def apart(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
+def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
     """Chosen (n,) solid primitives that overlap, pushed apart sideways by at most most_m each.
 
     Of all ways to part two the shortest that puts neither into a third; the smaller one goes farther. Where that is not
     enough both shrink about their centres, to no less than `shrink` of their size.
     """
-    parting = _Parting(scene, chosen, most_m, shrink)
+    parting = _Separation(scene, chosen, most_m, shrink)
     for _ in range(ROUNDS):
         if not parting.round():
             break
@@ -64,17 +64,17 @@ def apart(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Sce
     return replace(scene, center_m=center_m.astype(np.float32), size_m=size_m.astype(np.float32))
 
 
-class _Parting:
+class _Separation:
     """Boxes being pushed: where they are now, where they were given, and who may be moved."""
 
     def __init__(self, scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> None:
-        self.given, self.now = boxes_of(scene), boxes_of(scene)
-        self.chosen, self.solid = chosen, np.isin(scene.category, SOLID)
+        self.given, self.now = extract_boxes(scene), extract_boxes(scene)
+        self.select_primitives, self.solid = chosen, np.isin(scene.category, SOLID)
         self.most_m, self.shrink = most_m, shrink
 
     def round(self) -> bool:
         """Part what can be parted, each box once; did anything move?"""
-        pairs = overlapping_pairs(self.now, self.solid)
+        pairs = find_overlapping_pairs(self.now, self.solid)
         moved = np.zeros(len(self.solid), bool)
         for scale in (1.0, self.shrink):
             pairs = pairs[~moved[pairs].any(axis=1)]
@@ -93,10 +93,12 @@ class _Parting:
         log-concave), so a direction whose longest push does not part them is given up at once.
         """
         start = self.now.take(pairs)  # (p, 2, ...)
-        share = self.chosen[pairs] * start.size_m.prod(axis=2)[:, ::-1]
+        share = self.select_primitives[pairs] * start.size_m.prod(axis=2)[:, ::-1]
         share /= np.maximum(share.max(axis=1, keepdims=True), 1e-300)
         least_m = self.shrink * self.given.size_m[pairs]
-        size_m = np.where(self.chosen[pairs][..., None], np.maximum(scale * start.size_m, least_m), start.size_m)
+        size_m = np.where(
+            self.select_primitives[pairs][..., None], np.maximum(scale * start.size_m, least_m), start.size_m
+        )
         angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
         directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(DIRECTIONS)], axis=1)
         pushes_m = directions[:, None] * (np.arange(1, STEPS + 1) * (self.most_m / STEPS))[:, None]
@@ -111,7 +113,7 @@ class _Parting:
             pair, *_ = np.nonzero(where)
             a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
             found = where.copy()
-            found[where] = iou3d_pairs(a, b) < GOAL_IOU3D
+            found[where] = compute_iou3d_pairs(a, b) < GOAL_IOU3D
             return found
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
@@ -129,18 +131,18 @@ class _Parting:
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
-        then = iou3d_matrix(Boxes(*(part.reshape(-1, *part.shape[2:]) for part in ways)), around)
+        then = compute_iou3d_matrix(Boxes(*(part.reshape(-1, *part.shape[2:]) for part in ways)), around)
         then = then.reshape(len(ways.center_m), 2, len(around.center_m))
         over = then > GOAL_IOU3D
         if over.any():
-            over &= then > iou3d_matrix(self.now.take(pair), around)
+            over &= then > compute_iou3d_matrix(self.now.take(pair), around)
         return over.any(axis=(1, 2))
 
 
-def superfluous(scene: Scene, chosen: np.ndarray) -> np.ndarray:
+def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:
     """(n,) bool: as few chosen primitives as parting all overlaps takes; of two, the less certain, then the smaller."""
     gone = np.zeros(len(scene), bool)
-    pairs = overlapping_pairs(boxes_of(scene), np.isin(scene.category, SOLID))
+    pairs = find_overlapping_pairs(extract_boxes(scene), np.isin(scene.category, SOLID))
     while len(pairs := pairs[(chosen[pairs] & ~gone[pairs]).any(axis=1) & ~gone[pairs].any(axis=1)]):
         often = np.bincount(pairs.ravel(), minlength=len(scene))
         candidates = np.flatnonzero(chosen & (often == often[chosen].max()))

@@ -15,10 +15,10 @@ import ray.data
 import torch
 
 from models.geometry.encodings import ENCODINGS
-from models.geometry.iou3d import boxes, iou3d_pairs
-from models.studies.orientation_study import THINGS, CentredBoxes, Settings, draw_boxes, fit
-from pipelines.reporting.chart import Chart, chart_svg
-from pipelines.reporting.dataset_report import Drawing, Drawings, page_html
+from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
+from models.studies.orientation_study import THINGS, CenteredBoxes, StudyConfig, draw_boxes, train_autoencoder
+from pipelines.reporting.chart import Chart, draw_chart_svg
+from pipelines.reporting.dataset_report import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
 from pipelines.runtime import storage
 
@@ -27,10 +27,10 @@ TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
 SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # of width to length; scores of the "any" boxes are also given per bin
 
 
-def iou3d(truth: CentredBoxes, other: CentredBoxes) -> np.ndarray:
+def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray:
     """(n,) exact IoU3D of boxes centred at zero."""
     center = np.zeros_like(truth.size_m)
-    return iou3d_pairs(boxes(center, *truth), boxes(center, *other))
+    return compute_iou3d_pairs(make_boxes(center, *truth), make_boxes(center, *other))
 
 
 # ---------------------------------------------------------------------------------------------------- encodings
@@ -51,7 +51,7 @@ class Trial:
         return f"{self.things}-{self.encoding}-{self.numbers}-{self.count:05d}-seed{self.seed}"
 
 
-def trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
+def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
     """Every encoding at every training size, one seed after the other; the longest first. ValueError for none."""
     if not counts or min(counts) < 2 or seeds < 1:
         raise ValueError(f"training sizes {list(counts)} and {seeds} seeds: expected sizes of 2 or more, and a seed")
@@ -59,21 +59,21 @@ def trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all")
     return [Trial(things, e, count, seed, numbers) for seed in range(seeds) for count in sizes for e in ENCODINGS]
 
 
-def training_boxes(trial: Trial) -> CentredBoxes:
+def draw_training_boxes(trial: Trial) -> CenteredBoxes:
     """The boxes that a trial trains on. The larger set of a seed begins with the smaller one."""
     return draw_boxes(THINGS[trial.things], trial.count, TRAIN_KEY, trial.seed)
 
 
-def run_trial(row: dict, directory: str, settings: Settings, test_count: int) -> dict:
+def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int) -> dict:
     """Row in: a Trial. Row out: its name. Trains, scores on the shared test set and writes DIRECTORY/<name>.json."""
     torch.set_num_threads(1)
     trial, started = Trial(**row), time.perf_counter()
     moving_only = trial.numbers == "moving"
-    fitted = fit(ENCODINGS[trial.encoding], training_boxes(trial), settings, trial.seed, moving_only)
+    fitted = train_autoencoder(ENCODINGS[trial.encoding], draw_training_boxes(trial), settings, trial.seed, moving_only)
     seconds = time.perf_counter() - started
     truth = draw_boxes(THINGS[trial.things], test_count, TEST_KEY)
     rebuilt, error = fitted.rebuild(truth)
-    iou = iou3d(truth, rebuilt)
+    iou = compute_mean_iou3d(truth, rebuilt)
     bins = np.digitize(truth.size_m[:, 1] / truth.size_m[:, 0], SHARE_EDGES[1:-1])
     scores = {
         "iou": float(iou.mean()),
@@ -83,14 +83,14 @@ def run_trial(row: dict, directory: str, settings: Settings, test_count: int) ->
         "parameters": sum(p.numel() for p in fitted.model.parameters()),
         "seconds": seconds,
     }
-    storage.write_json(asdict(trial) | scores, storage.join(directory, f"{trial.name}.json"))
+    storage.write_json(asdict(trial) | scores, storage.join_uri(directory, f"{trial.name}.json"))
     return {"name": trial.name}
 
 
-def rebuild_boxes(
+def reconstruct_boxes(
     wanted: Sequence[Trial],
     directory: str,
-    settings: Settings,
+    settings: StudyConfig,
     test_count: int = TEST_COUNT,
     parallel: int | None = None,
     on_trial: Callable[[], None] | None = None,
@@ -99,7 +99,7 @@ def rebuild_boxes(
 
     `parallel` bounds how many run at a time. Fan-out: one task per trial.
     """
-    paths = {trial: storage.join(directory, f"{trial.name}.json") for trial in wanted}
+    paths = {trial: storage.join_uri(directory, f"{trial.name}.json") for trial in wanted}
     missing = [trial for trial in wanted if not storage.exists(paths[trial])]
     for trial in wanted:
         if on_trial and trial not in missing:
@@ -117,7 +117,7 @@ def rebuild_boxes(
     return [storage.read_json(path) for path in paths.values()]
 
 
-def by_size(scores: Iterable[dict]) -> list[dict]:
+def average_by_size(scores: Iterable[dict]) -> list[dict]:
     """Mean IoU3D and its spread over seeds, per kind of boxes, numbers regressed, encoding and training size."""
 
     def key(row: dict) -> tuple:
@@ -155,7 +155,7 @@ SHARES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
 LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # 0.7935: a square with itself, turned by any yaw; see below
 
 
-def square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
+def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
     """IoU of a square (or of an upright box on it) with itself turned by 0 <= turn <= pi/2: 1 / (sin + cos).
 
     Its mean over all turns is LOST_YAW_IOU3D: what is left if the yaw of a square footprint is arbitrary.
@@ -164,12 +164,12 @@ def square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
 
 
 @cache
-def ranges(encoding: str) -> np.ndarray:
+def find_ranges(encoding: str) -> np.ndarray:
     """(entries,) by how much each number of an encoding changes over "any" boxes."""
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(THINGS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
-def yaw_loss(row: dict, count: int) -> dict:
+def compute_yaw_loss(row: dict, count: int) -> dict:
     """Row in: encoding, width_share, noise. Row out: with it what that noise costs `count` boxes of that footprint.
 
     Gaussian noise on the numbers of a box, in shares of each entry's range over "any" boxes; entries that never change
@@ -177,15 +177,18 @@ def yaw_loss(row: dict, count: int) -> dict:
     them) minus IoU3D as decoded: what the angle alone costs.
     """
     torch.set_num_threads(1)
-    encoding, scale = ENCODINGS[row["encoding"]], ranges(row["encoding"])
+    encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
     truth = draw_boxes(THINGS["any"], count, NOISE_KEY)
     truth.size_m[:, 1] = row["width_share"] * truth.size_m[:, 0]
     rng = np.random.default_rng(0)
     noisy = encoding.encode(*truth) + row["noise"] * scale * rng.standard_normal((count, encoding.entries))
-    decoded = CentredBoxes(*encoding.decode(noisy))
+    decoded = CenteredBoxes(*encoding.decode(noisy))
     turned = np.swapaxes(truth.rotation, 1, 2) @ decoded.rotation  # decoded axes in the truth's frame
     along = np.einsum("nij,nj,nij->ni", turned, decoded.size_m, turned)
-    iou, iou_aligned = iou3d(truth, decoded), iou3d(truth, CentredBoxes(truth.rotation, along))
+    iou, iou_aligned = (
+        compute_mean_iou3d(truth, decoded),
+        compute_mean_iou3d(truth, CenteredBoxes(truth.rotation, along)),
+    )
     flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # a horizontal axis
     x, y = (turned[np.arange(count), k, flat] for k in (0, 1))
     error = np.abs((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
@@ -196,11 +199,11 @@ def yaw_loss(row: dict, count: int) -> dict:
     }
 
 
-def yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
+def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
     """`yaw_loss` of every encoding, footprint and noise. Fan-out: one task per encoding and footprint."""
     rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
     graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
-    found = list(graph.map(yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
+    found = list(graph.map(compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
     return sorted(found, key=lambda r: (list(ENCODINGS).index(r["encoding"]), r["width_share"], r["noise"]))
 
 
@@ -255,13 +258,13 @@ MEASURES = {"ground_iou": "ground", "height_mse_normalised": "ground", "height_r
 MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
 
 
-def measured(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
+def average_measurements(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
     """The scores of `rebuild.rebuild` that mean something for a variant; None for the branch that it lacks."""
     kept = variant.architecture.get("branches", "both")
     return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
 
 
-def by_variant(scores: Iterable[dict]) -> list[dict]:
+def group_by_variant(scores: Iterable[dict]) -> list[dict]:
     """Mean, lowest and highest of each measure over seeds, per variant."""
     rows, scores = [], list(scores)
     for variant in dict.fromkeys(row["variant"] for row in scores):
@@ -282,29 +285,30 @@ def by_variant(scores: Iterable[dict]) -> list[dict]:
 # --------------------------------------------------------------------------------------------- tables, drawings
 
 
-def encoding_table(rows: Sequence[dict]) -> Table:
+def build_encoding_table(rows: Sequence[dict]) -> Table:
     columns = ("boxes", "numbers", "encoding", "training size", "seeds")
     columns += ("mean IoU3D", "± std", "lowest", "highest", "worst tenth")
     names = ("boxes", "numbers", "encoding", "training_size", "seeds")
     names += ("iou3d_mean", "iou3d_std", "iou3d_min", "iou3d_max", "iou3d_worst_tenth")
     note = "IoU3D on the shared test set: mean over boxes, and over the worst tenth of them; then over seeds."
-    return Table("Encodings", columns, [[_rounded(row[name]) for name in names] for row in rows], note=note)
+    return Table("Encodings", columns, [[_round_values(row[name]) for name in names] for row in rows], note=note)
 
 
-def share_table(rows: Sequence[dict]) -> Table | None:
+def build_share_table(rows: Sequence[dict]) -> Table | None:
     """Mean IoU3D by width / length, of the kinds of boxes that have them all; None if none has."""
     kept = [row for row in rows if None not in row["iou3d_per_share"]]
     if not kept:
         return None
     bins = [f"{a:.1f} to {b:.1f}" for a, b in zip(SHARE_EDGES[:-1], SHARE_EDGES[1:], strict=True)]
     cells = [
-        [row["boxes"], row["encoding"], row["training_size"], *map(_rounded, row["iou3d_per_share"])] for row in kept
+        [row["boxes"], row["encoding"], row["training_size"], *map(_round_values, row["iou3d_per_share"])]
+        for row in kept
     ]
     columns = ("boxes", "encoding", "training size", *bins)
     return Table("Encodings by footprint", columns, cells, note="Mean IoU3D by width / length of the true box.")
 
 
-def yaw_table(rows: Sequence[dict]) -> Table:
+def build_yaw_table(rows: Sequence[dict]) -> Table:
     """A row per encoding and footprint; per noise the IoU3D that is lost with the angle, and the error of the angle."""
     noises = sorted({row["noise"] for row in rows})
     columns = ["encoding", "width / length"]
@@ -312,7 +316,7 @@ def yaw_table(rows: Sequence[dict]) -> Table:
     cells = []
     for (encoding, share), found in groupby(rows, lambda row: (row["encoding"], row["width_share"])):
         found = list(found)
-        lost = [_rounded(row["iou3d_lost_with_yaw"]) for row in found]
+        lost = [_round_values(row["iou3d_lost_with_yaw"]) for row in found]
         cells.append([encoding, share, *lost, *(round(row["yaw_error_deg"], 2) for row in found)])
     note = (
         "Per noise (in shares of each number's range): IoU3D with the true axes minus IoU3D as decoded, and the mean error "
@@ -322,7 +326,7 @@ def yaw_table(rows: Sequence[dict]) -> Table:
     return Table("What the angle costs", columns, cells, note=note)
 
 
-def variant_table(rows: Sequence[dict]) -> Table:
+def build_variant_table(rows: Sequence[dict]) -> Table:
     names = {
         "ground_iou": "ground IoU, %",
         "height_mse_normalised": "height MSE x 100",
@@ -347,7 +351,7 @@ def variant_table(rows: Sequence[dict]) -> Table:
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
 
-def curve_chart(scores: Sequence[dict]) -> Chart:
+def draw_curve_chart(scores: Sequence[dict]) -> Chart:
     """AP3D on the first held-out scenes while training, against minutes: a line per variant and seed."""
     series = {}
     for row in scores:
@@ -357,29 +361,29 @@ def curve_chart(scores: Sequence[dict]) -> Chart:
     return Chart("AP3D while training", series, "minutes", "AP3D of 32 held-out scenes")
 
 
-def _rounded(value: float | str | None) -> float | str | None:
+def _round_values(value: float | str | None) -> float | str | None:
     return round(value, 4) if isinstance(value, float) else value
 
 
-def size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> Chart:
+def draw_size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> Chart:
     """The paper's figure: mean IoU3D against training size, a line per encoding with whiskers over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (things, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
         chosen = [row for row in rows if row["encoding"] == encoding]
         aside = 1 + 0.012 * (k - 1)  # so that whiskers do not hide each other
-        points = [p for row in chosen for p in _whisker(row["training_size"] * aside, row)]
+        points = [p for row in chosen for p in _draw_whisker(row["training_size"] * aside, row)]
         series[encoding] = tuple(zip(*points, strict=True)) if points else ((), ())
     title = f"mean IoU3D of rebuilt boxes ({things}, {numbers} numbers): mean, lowest and highest over seeds"
     return Chart(title, series, "training samples", "mean IoU3D")
 
 
-def _whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
+def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
     """Up to the highest, down to the lowest and back to the mean, where the line goes on."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
-def share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
+def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
     middle = (SHARE_EDGES[1:] + SHARE_EDGES[:-1]) / 2
     chosen = [row for row in rows if row["boxes"] == things and row["training_size"] == count]
     series = {row["encoding"]: (middle, [np.nan if v is None else v for v in row["iou3d_per_share"]]) for row in chosen}
@@ -391,7 +395,7 @@ def share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
     )
 
 
-def yaw_chart(rows: Sequence[dict]) -> Chart:
+def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
     """IoU3D lost with the angle against width / length: Cholesky at each noise, the others at the largest."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
@@ -405,8 +409,14 @@ def yaw_chart(rows: Sequence[dict]) -> Chart:
     return Chart("IoU3D lost with the angle, by footprint", series, "width / length", "IoU3D lost")
 
 
-def page(title: str, subtitle: str, tables: Sequence[Table], charts: Sequence[Chart], text: Sequence[str] = ()) -> str:
+def render_page(
+    title: str, subtitle: str, tables: Sequence[Table], charts: Sequence[Chart], text: Sequence[str] = ()
+) -> str:
     """A self-contained page: charts, tables, and words on how it was made."""
-    sections: list = [Drawings("Figures", [Drawing(chart_svg(c), c.title) for c in charts], "pairs")] if charts else []
+    sections: list = (
+        [DrawingsSection("Figures", [CaptionedSvg(draw_chart_svg(c), c.title) for c in charts], "pairs")]
+        if charts
+        else []
+    )
     sections += list(tables)
-    return page_html(title, [*sections, *([Text("How", list(text))] if text else [])], subtitle)
+    return render_page_html(title, [*sections, *([Text("How", list(text))] if text else [])], subtitle)

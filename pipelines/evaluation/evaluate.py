@@ -15,12 +15,27 @@ import ray
 
 from models.scene import CATEGORIES
 from pipelines.metrics import distributions, statistics, validity
-from pipelines.metrics.adm_npz import Gaussian, ReferenceMoments
-from pipelines.metrics.frechet import frechet_distance, frechet_influence, influence_maps, moments, transport
-from pipelines.metrics.inception_score import inception_score
-from pipelines.metrics.intervals import Estimate, mean_estimate, moved, ratio_estimates
-from pipelines.metrics.kernel_distance import kernel_distance
-from pipelines.metrics.neighbours import Neighbourhood, Side, ball_radii, comparable, judged, nearest, prepare, within
+from pipelines.metrics.adm_npz import ReferenceMoments, StoredGaussian
+from pipelines.metrics.frechet import (
+    compute_frechet_distance,
+    compute_frechet_influence,
+    compute_influence_maps,
+    compute_moments,
+    compute_transport,
+)
+from pipelines.metrics.inception_score import compute_inception_score
+from pipelines.metrics.intervals import Estimate, estimate_from_influence, estimate_mean, estimate_ratios
+from pipelines.metrics.kernel_distance import compute_kernel_distance
+from pipelines.metrics.neighbours import (
+    FeatureSet,
+    NeighbourhoodScores,
+    compute_ball_radii,
+    find_nearest,
+    find_within,
+    judge_neighbours,
+    prepare_features,
+    require_comparable,
+)
 
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
@@ -28,7 +43,7 @@ NEIGHBOURS = 3  # of each generated scene that are named
 MEMORISED_QUANTILE = 0.01  # of real scenes' distances to their nearest other
 
 
-def compare(
+def compare_datasets(
     real: Described,
     generated: Described,
     ground_classes: Sequence[str] = (),
@@ -42,55 +57,56 @@ def compare(
     """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
     if "statistics" in real and "statistics" in generated:
-        layout = statistics.standardised(real["statistics"], generated["statistics"])
-        scores |= {"layout_frechet": frechet(*layout), "layout_mmd": kernel_distance(*layout)}
-        scores |= layout_scores(real, generated, ground_classes)
+        layout = statistics.standardize_statistics(real["statistics"], generated["statistics"])
+        scores |= {"layout_frechet": estimate_frechet(*layout), "layout_mmd": compute_kernel_distance(*layout)}
+        scores |= compute_layout_scores(real, generated, ground_classes)
     scores |= {
-        f"random_{name}": value for name, value in feature_scores(real["random"], generated["random"], k).items()
+        f"random_{name}": value
+        for name, value in compute_feature_scores(real["random"], generated["random"], k).items()
     }
     if "pool3" in real and "pool3" in generated:
         names = {"frechet": "fid", "mmd": "kid"}
-        found = feature_scores(real["pool3"], generated["pool3"], k)
+        found = compute_feature_scores(real["pool3"], generated["pool3"], k)
         scores |= {names.get(name, name): value for name, value in found.items()}
-        scores["sfid"] = frechet(real["spatial"], generated["spatial"])
+        scores["sfid"] = estimate_frechet(real["spatial"], generated["spatial"])
         if reference:
-            scores["fid"] = frechet_to(reference.pool3, generated["pool3"])
-            scores["sfid"] = frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
-        scores["inception_score"] = inception_score(generated["logits"])
-        scores["inception_score_real"] = inception_score(real["logits"])
+            scores["fid"] = compute_frechet_to(reference.pool3, generated["pool3"])
+            scores["sfid"] = compute_frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
+        scores["inception_score"] = compute_inception_score(generated["logits"])
+        scores["inception_score_real"] = compute_inception_score(real["logits"])
     return scores
 
 
 # ----------------------------------------------------------------------------------------------------- features
 
 
-def frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    a, b = moments(real), moments(generated)
-    between = transport(a, b)
-    by_real, by_generated = influence_maps(b, between)
+def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
+    a, b = compute_moments(real), compute_moments(generated)
+    between = compute_transport(a, b)
+    by_real, by_generated = compute_influence_maps(b, between)
     influences = [
-        frechet_influence(real, a, b.mean, by_real),
-        frechet_influence(generated, b, a.mean, by_generated),
+        compute_frechet_influence(real, a, b.mean, by_real),
+        compute_frechet_influence(generated, b, a.mean, by_generated),
     ]
-    return moved(frechet_distance(a, b, between), influences)
+    return estimate_from_influence(compute_frechet_distance(a, b, between), influences)
 
 
-def frechet_to(reference: Gaussian, generated: np.ndarray) -> Estimate:
+def compute_frechet_to(reference: StoredGaussian, generated: np.ndarray) -> Estimate:
     """Distance to moments that are given; only the generated samples vary."""
-    b = moments(generated)
-    between = transport(reference, b)
-    influence = frechet_influence(generated, b, reference.mean, influence_maps(b, between)[1])
-    return moved(frechet_distance(reference, b, between), [influence])
+    b = compute_moments(generated)
+    between = compute_transport(reference, b)
+    influence = compute_frechet_influence(generated, b, reference.mean, compute_influence_maps(b, between)[1])
+    return estimate_from_influence(compute_frechet_distance(reference, b, between), [influence])
 
 
-def feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
+def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
     """frechet, mmd, and `neighbourhood_scores`. ValueError for features that are not finite, naming side and sample."""
-    real, generated = comparable(real, generated, at_least=2)
-    found = {"frechet": frechet(real, generated), "mmd": kernel_distance(real, generated)}
-    return found | neighbourhood_scores(real, generated, k)
+    real, generated = require_comparable(real, generated, at_least=2)
+    found = {"frechet": estimate_frechet(real, generated), "mmd": compute_kernel_distance(real, generated)}
+    return found | compute_neighbourhood_scores(real, generated, k)
 
 
-def neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
+def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
     """precision_k3, recall_k3, density_k3 and coverage_k3, for each k. ValueError if there are too few samples for it.
 
     Intervals are over the judged samples; the balls are held fixed, as a sample drawn twice would be its own neighbour.
@@ -101,80 +117,80 @@ def neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[in
             "give a smaller one or more scenes"
         )
     found = {}
-    for one in spread_neighbourhoods(real, generated, k):
-        found[f"precision_k{one.k}"] = mean_estimate(one.in_real > 0, key=1)
-        found[f"recall_k{one.k}"] = mean_estimate(one.in_generated)
-        found[f"density_k{one.k}"] = mean_estimate(one.in_real / one.k, key=1)
-        found[f"coverage_k{one.k}"] = mean_estimate(one.covered)
+    for one in map_neighbourhoods(real, generated, k):
+        found[f"precision_k{one.k}"] = estimate_mean(one.in_real > 0, key=1)
+        found[f"recall_k{one.k}"] = estimate_mean(one.in_generated)
+        found[f"density_k{one.k}"] = estimate_mean(one.in_real / one.k, key=1)
+        found[f"coverage_k{one.k}"] = estimate_mean(one.covered)
     return found
 
 
-def spread_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[Neighbourhood]:
+def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
     """`neighbours.neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each; features are shared, not copied."""
-    sides = prepare(real, generated, k)
+    sides = prepare_features(real, generated, k)
     shared = [ray.put(side) for side in sides]
     radii = [
-        np.concatenate(ray.get([radii_task.remote(part, rows, k) for rows in row_parts(len(side))]), axis=1)
+        np.concatenate(ray.get([compute_radii_task.remote(part, rows, k) for rows in split_rows(len(side))]), axis=1)
         for part, side in zip(shared, sides, strict=True)
     ]
     balls = [ray.put(part) for part in radii]
-    return judged(k, ray.get([within_task.remote(*shared, *balls, rows) for rows in row_parts(len(real))]))
+    return judge_neighbours(k, ray.get([find_within_task.remote(*shared, *balls, rows) for rows in split_rows(len(real))]))
 
 
-def row_parts(count: int) -> list[range]:
+def split_rows(count: int) -> list[range]:
     return [range(start, min(start + ROWS_PER_TASK, count)) for start in range(0, count, ROWS_PER_TASK)]
 
 
 @ray.remote(num_cpus=1)
-def radii_task(side: Side, rows: range, k: Sequence[int]) -> np.ndarray:
-    return ball_radii(side, rows, k)
+def compute_radii_task(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
+    return compute_ball_radii(side, rows, k)
 
 
 @ray.remote(num_cpus=1)
-def within_task(*arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return within(*arguments)
+def find_within_task(*arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return find_within(*arguments)
 
 
-def memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
+def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
     """Distances of generated samples to the nearest real ones, beside those of real samples to their nearest other.
 
     `memorised`: share of generated samples nearer to a real one than all but 1 % of real samples are to another;
     `nearest` (m, 3) real rows and `distance` (m, 3) of each generated sample, nearest first (paper, supplement).
     """
-    sides = prepare(real, generated, (NEIGHBOURS,))
-    squared, index = nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
-    own = np.sqrt(nearest(sides[0], sides[0], range(len(real)), 1, themselves=True)[0][:, 0])
+    sides = prepare_features(real, generated, (NEIGHBOURS,))
+    squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
+    own = np.sqrt(find_nearest(sides[0], sides[0], range(len(real)), 1, themselves=True)[0][:, 0])
     distance = np.sqrt(squared)
     found = {}
     for name, values in (("generated", distance[:, 0]), ("real", own)):
         found[name] = {
-            "mean": mean_estimate(values),
+            "mean": estimate_mean(values),
             "median": float(np.median(values)),
             "minimum": float(values.min()),
             "maximum": float(values.max()),
         }
     limit = np.quantile(own, MEMORISED_QUANTILE)
-    found["memorised"] = mean_estimate(distance[:, 0] < limit)
-    found["copies"] = mean_estimate(distance[:, 0] == 0)
+    found["memorised"] = estimate_mean(distance[:, 0] < limit)
+    found["copies"] = estimate_mean(distance[:, 0] == 0)
     return found | {"nearest": index, "distance": distance}
 
 
 # ------------------------------------------------------------------------------------------------------ layouts
 
 
-def layout_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict:
+def compute_layout_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict:
     """Statistics and validity of both sides, their distances, and whether scenes are what was asked for."""
-    names = statistics.statistic_names(ground_classes)
+    names = statistics.list_statistic_names(ground_classes)
     sides = {"real": real, "generated": generated}
-    means = {side: scene_means(part["statistics"]) for side, part in sides.items()}
-    rates = {side: pair_ratios(part["validity"]) for side, part in sides.items()}
+    means = {side: compute_scene_means(part["statistics"]) for side, part in sides.items()}
+    rates = {side: compute_pair_ratios(part["validity"]) for side, part in sides.items()}
     categories = slice(0, len(CATEGORIES))
     # What two halves of the real scenes differ by: no source can come nearer than about that.
     halves = real["statistics"][::2], real["statistics"][1::2]
-    floor = distributions.histogram_distances(real["histograms"][::2], real["histograms"][1::2])
-    distances = distributions.histogram_distances(real["histograms"], generated["histograms"])
-    counts = distributions.count_distances(*(part["statistics"][:, categories] for part in sides.values()))
-    count_floor = distributions.count_distances(*(half[:, categories] for half in halves))
+    floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
+    distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
+    counts = distributions.compute_count_distances(*(part["statistics"][:, categories] for part in sides.values()))
+    count_floor = distributions.compute_count_distances(*(half[:, categories] for half in halves))
     return {
         "statistics": {name: {side: means[side][i] for side in sides} for i, name in enumerate(names)},
         "count_distance": {name: {"between": counts[name], "within_real": count_floor[name].value} for name in counts},
@@ -183,30 +199,30 @@ def layout_scores(real: Described, generated: Described, ground_classes: Sequenc
             for name, found in distances.items()
         },
         "validity": {name: {side: rates[side][i] for side in sides} for i, name in enumerate(validity.MEASURES)},
-        "label_fidelity": dict(zip(validity.LABEL_MEASURES, pair_ratios(generated["fidelity"]), strict=True)),
+        "label_fidelity": dict(zip(validity.LABEL_MEASURES, compute_pair_ratios(generated["fidelity"]), strict=True)),
     }
 
 
-def scene_means(values: np.ndarray) -> list[Estimate | None]:
+def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
     """Column means over the scenes that have a value (NaN: it has none); None where no scene has."""
     known = np.isfinite(values)
-    return ratio_estimates(np.where(known, values, 0), known)
+    return estimate_ratios(np.where(known, values, 0), known)
 
 
-def pair_ratios(records: np.ndarray) -> list[Estimate | None]:
+def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
     """Rates of measures from records (n, 2 measures): numerator and denominator in turn."""
-    return ratio_estimates(records[:, ::2], records[:, 1::2])
+    return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 
 # ------------------------------------------------------------------------------------------------------ writing
 
 
-def flattened(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
+def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
     """Nested scores as one level, names joined by dots; None, arrays and what is not finite left out."""
     flat: dict[str, Estimate | float] = {}
     for name, value in scores.items():
         if isinstance(value, Mapping):
-            flat |= flattened(value, f"{prefix}{name}.")
+            flat |= flatten_scores(value, f"{prefix}{name}.")
         elif isinstance(value, Estimate):
             flat[prefix + name] = value
         elif isinstance(value, int | float) and np.isfinite(value):
@@ -214,7 +230,7 @@ def flattened(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
     return flat
 
 
-def plain(scores: Mapping) -> dict:
+def convert_estimates(scores: Mapping) -> dict:
     """Nested scores for JSON: an Estimate as value, low and high; arrays left out; what is not finite as null."""
 
     def number(value: float) -> float | None:
@@ -222,7 +238,7 @@ def plain(scores: Mapping) -> dict:
 
     def converted(value: Any) -> Any:
         if isinstance(value, Mapping):
-            return plain(value)
+            return convert_estimates(value)
         if isinstance(value, Estimate):
             return {name: number(part) for name, part in value._asdict().items()}
         return number(float(value)) if isinstance(value, np.floating | float) else value

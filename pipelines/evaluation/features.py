@@ -16,14 +16,14 @@ import pyarrow as pa
 import torch
 
 from models.scene import Scene
-from models.tensors import ground_on_grid
+from models.tensors import resample_scene_ground
 from pipelines.metrics import distributions, inception, statistics, validity
-from pipelines.metrics.adm_npz import pictures_in_npz
-from pipelines.rendering.render import bev_picture
+from pipelines.metrics.adm_npz import iterate_pictures
+from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import fan_out, numbered, per_row
+from pipelines.runtime.ray_tasks import make_numbered_rows, map_actors, map_rows
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
 READER_CPUS = 0.5
@@ -31,7 +31,7 @@ PICTURES_PER_PART = 512
 VERSION = 1  # of what a description holds; another one is made anew
 PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
 # The columns besides scene_id: rows of numbers, of these types.
-DESCRIBED = {
+FEATURE_TYPES = {
     "statistics": np.float64,
     "histograms": np.uint32,
     "validity": np.float64,
@@ -44,7 +44,7 @@ DESCRIBED = {
 
 
 @dataclass(frozen=True)
-class Looks:
+class FeatureConfig:
     """How pictures are made and seen: mean of supersample^2 points a pixel; Inception weights of this file, if any."""
 
     supersample: int = 1
@@ -52,7 +52,7 @@ class Looks:
 
 
 @dataclass(frozen=True)
-class PictureFile:
+class ImageFile:
     """The first `limit` pictures of an .npz in ADM's form."""
 
     path: str
@@ -63,105 +63,105 @@ class PictureFile:
         return self.path
 
 
-Side = Selection | PictureFile  # of a comparison
+SceneSet = SceneSubset | ImageFile  # of a comparison
 
 
-def features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
+def compute_features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
     """Features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and with a network Inception's."""
-    named = {"random": inception.random_features(pictures)}
+    named = {"random": inception.compute_random_features(pictures)}
     if network is not None:
-        named |= inception.inception_features(network, pictures)._asdict()
+        named |= inception.compute_inception_features(network, pictures)._asdict()
     return named
 
 
-def scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
+def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
     """Statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes, over the dataset's ground classes."""
-    slab_offset_m = validity.slab_offset_m(dataset.spec.surface)
+    slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
     for scene in scenes:
         classes = dataset.spec.ground_classes
-        height, occupied = ground_on_grid(scene, classes, scene.grid)
+        height, occupied = resample_scene_ground(scene, classes, scene.grid)
         scene = replace(scene, ground_classes=classes, height_m=height, occupied=occupied)
-        rows["statistics"].append(statistics.layout_statistics(scene))
-        rows["histograms"].append(distributions.scene_histograms(scene))
-        rows["validity"].append(validity.scene_validity(scene, slab_offset_m).ravel())
-        rows["fidelity"].append(label_fidelity(scene, dataset).ravel())
+        rows["statistics"].append(statistics.compute_layout_statistics(scene))
+        rows["histograms"].append(distributions.compute_scene_histograms(scene))
+        rows["validity"].append(validity.compute_scene_validity(scene, slab_offset_m).ravel())
+        rows["fidelity"].append(compute_label_fidelity(scene, dataset).ravel())
     return {name: np.stack(values) for name, values in rows.items()}
 
 
-def label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
+def compute_label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
     """(3, 2) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels, or without a dataset."""
     if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
         return np.zeros((len(validity.LABEL_MEASURES), 2))
-    return validity.label_fidelity(scene, dataset.vegetation, dataset.vehicle)
+    return validity.compute_label_fidelity(scene, dataset.vegetation, dataset.vehicle)
 
 
-def describe_part(
-    number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: Looks, directory: str
+def compute_part(
+    number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: FeatureConfig, directory: str
 ) -> dict:
     """Ray task. Number of a part, a shard with rows, in; the number of its scenes out. Writes the part's file."""
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
-    pictures = np.stack([bev_picture(scene, PICTURE_PX, looks.supersample) for scene in scenes])
-    columns = features(pictures, network_of(looks))
+    pictures = np.stack([render_bev(scene, PICTURE_PX, looks.supersample) for scene in scenes])
+    columns = compute_features(pictures, load_network(looks))
     if dataset:
-        columns = scene_rows(scenes, dataset) | columns
+        columns = compute_scene_rows(scenes, dataset) | columns
     write_part(directory, number, [scene.scene_id for scene in scenes], columns)
     return {"scenes": len(scenes)}
 
 
-def network_of(looks: Looks) -> inception.Inception | None:
+def load_network(looks: FeatureConfig) -> inception.Inception | None:
     """Loaded once a process, until the file changes."""
-    return loaded_inception(*storage.fingerprint(looks.inception)) if looks.inception else None
+    return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
 
 
 @lru_cache(maxsize=1)
-def loaded_inception(path: str, *_: str | int) -> inception.Inception:
+def load_cached_inception(path: str, *_: str | int) -> inception.Inception:
     return inception.load_inception(path)
 
 
-class PictureDescriber:
+class ImageFeatureExtractor:
     """Actor. Row in: number of a part, a range of pictures of an .npz. Row out: their number. Writes the part's file.
 
     The file is read forward, past what other actors describe; a part before the last one begins it anew.
     """
 
-    def __init__(self, path: str, parts: list[range], looks: Looks, directory: str) -> None:
+    def __init__(self, path: str, parts: list[range], looks: FeatureConfig, directory: str) -> None:
         torch.set_num_threads(1)
         self.path, self.parts, self.directory = path, parts, directory
-        self.network = network_of(looks)
+        self.network = load_network(looks)
         self.batches, self.next_part = iter(()), len(parts)
 
     def __call__(self, row: dict) -> dict:
         number = row["id"]
         if number < self.next_part:
-            self.batches, self.next_part = pictures_in_npz(self.path, PICTURES_PER_PART), 0
+            self.batches, self.next_part = iterate_pictures(self.path, PICTURES_PER_PART), 0
         while self.next_part <= number:
             pictures = next(self.batches)
             self.next_part += 1
         part = self.parts[number]
         names = [f"{index:07d}" for index in part]
-        write_part(self.directory, number, names, features(pictures[: len(part)], self.network))
+        write_part(self.directory, number, names, compute_features(pictures[: len(part)], self.network))
         return {"scenes": len(part)}
 
 
-def part_path(directory: str, number: int) -> str:
-    return storage.join(directory, f"part-{number:05d}.parquet")
+def make_part_path(directory: str, number: int) -> str:
+    return storage.join_uri(directory, f"part-{number:05d}.parquet")
 
 
 def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
     """One row per scene: its id and lists of numbers."""
     arrays = {"scene_id": pa.array(scene_ids, pa.string())}
     for name, values in columns.items():
-        flat = pa.array(np.ascontiguousarray(values, DESCRIBED[name]).ravel())
+        flat = pa.array(np.ascontiguousarray(values, FEATURE_TYPES[name]).ravel())
         arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-    storage.write_parquet(pa.table(arrays), part_path(directory, number))
+    storage.write_parquet(pa.table(arrays), make_part_path(directory, number))
 
 
 def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
     """All parts, in order: scene_id (n,) and the columns (n, width)."""
-    table = pa.concat_tables([storage.read_parquet(part_path(directory, number)) for number in range(count)])
+    table = pa.concat_tables([storage.read_parquet(make_part_path(directory, number)) for number in range(count)])
     described = {"scene_id": table["scene_id"].to_numpy()}
     for name in table.column_names[1:]:
         column = table[name].combine_chunks()
@@ -169,10 +169,10 @@ def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
     return described
 
 
-def describe(
-    side: Side,
+def compute_scene_features(
+    side: SceneSet,
     dataset: Dataset | None,
-    looks: Looks,
+    looks: FeatureConfig,
     directory: str,
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
@@ -183,35 +183,39 @@ def describe(
     judged by. Parts that DIRECTORY holds of the same side and looks are read, the rest is made. Row in: number of a part.
     Row out: number of scenes. Fan-out: one task per shard, or per PICTURES_PER_PART.
     """
-    if isinstance(side, PictureFile):
+    if isinstance(side, ImageFile):
         parts = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
-        counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint(side.path)], None
+        counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint_file(side.path)], None
     else:
         parts = side.shards()
         counts = [len(rows) for _, rows in parts]
         tables = ("scenes", "primitives", "rasters")
-        files = [storage.fingerprint(shard.path(table)) for shard, _ in parts for table in tables]
+        files = [storage.fingerprint_file(shard.path(table)) for shard, _ in parts for table in tables]
         judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
-    claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | digest(looks))
-    missing = [number for number in range(len(parts)) if not storage.exists(part_path(directory, number))]
+    claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | make_options_record(looks))
+    missing = [number for number in range(len(parts)) if not storage.exists(make_part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
 
     def describe_scenes(row: dict) -> dict:
-        return describe_part(row["id"], parts, dataset, looks, directory)
+        return compute_part(row["id"], parts, dataset, looks, directory)
 
-    if isinstance(side, PictureFile):
+    if isinstance(side, ImageFile):
         arguments = side.path, parts, looks, directory
-        rows = fan_out(missing, PictureDescriber, arguments, num_actors, num_cpus=READER_CPUS)
+        rows = map_actors(missing, ImageFeatureExtractor, arguments, num_actors, num_cpus=READER_CPUS)
     else:
-        rows = per_row(numbered(missing), describe_scenes, READER_CPUS, num_actors).iter_rows() if missing else ()
+        rows = (
+            map_rows(make_numbered_rows(missing), describe_scenes, READER_CPUS, num_actors).iter_rows()
+            if missing
+            else ()
+        )
     for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])
     return read_parts(directory, len(parts))
 
 
-def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
+def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
     """Scenes by their number within the described selection, in the order asked for."""
     counts = np.array([len(rows) for _, rows in parts])
     starts = np.cumsum(counts) - counts
@@ -224,17 +228,17 @@ def chosen_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> 
     return [scenes[index] for index in indices]
 
 
-def digest(looks: Looks) -> dict:
+def make_options_record(looks: FeatureConfig) -> dict:
     """What tells one description from another; weights count by content, not by name."""
     return asdict(looks) | {
         "version": VERSION,
-        "inception": inception.weights_sha256(looks.inception) if looks.inception else "",
+        "inception": inception.hash_weights(looks.inception) if looks.inception else "",
     }
 
 
 def claim(directory: str, options: dict) -> None:
     """Empty a directory of parts unless they were made with the same options."""
-    record = storage.join(directory, "described.json")
+    record = storage.join_uri(directory, "described.json")
     if storage.exists(record) and storage.read_json(record) == options:
         return
     storage.delete_directory(directory)

@@ -17,9 +17,9 @@ import torch
 
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
-from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, ground_on_grid, layout_batch, scene_from_layout
-from pipelines.evaluation.features import READER_CPUS, label_fidelity
-from pipelines.geometry.voxels import NUM_CLASSES, Outside, VoxelGrid, outside, voxelise
+from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, decode_layout, make_layout_batch, resample_scene_ground
+from pipelines.evaluation.features import READER_CPUS, compute_label_fidelity
+from pipelines.geometry.voxels import NUM_CLASSES, OutsideCounts, VoxelGrid, count_outside, voxelize
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
     MEMORY,
@@ -28,23 +28,23 @@ from pipelines.metrics.reconstruction import (
     GroundSums,
     Matches,
     PairSums,
-    detection_scores,
-    ground_scores,
-    ground_sums,
+    compute_detection_scores,
+    compute_ground_scores,
+    compute_pair_scores,
+    compute_voxel_confusion,
+    compute_voxel_scores,
     join_matches,
     match_scene,
-    memory_bytes,
-    pair_scores,
-    pair_sums,
-    voxel_confusion,
-    voxel_scores,
+    measure_memory_bytes,
+    sum_ground,
+    sum_pairs,
 )
-from pipelines.metrics.validity import LABEL_MEASURES, validity_rates
-from pipelines.rendering.render import bev_picture, picture_3d
+from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
+from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import gpus_per_actor
+from pipelines.runtime.ray_tasks import count_gpus_per_actor
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 from pipelines.training.latents import load_lvae
 
@@ -76,17 +76,17 @@ SCENE_SCORES = pa.schema(
 )
 
 
-def voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
+def make_voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
     """The paper's 256 x 256 x 32 over the crop, whatever the rasters' resolution."""
     return VoxelGrid(spec.with_resolution(VOXEL_PX).grid, *range_m)
 
 
-def chunks_of(selection: Selection, size: int) -> list[Chunk]:
+def split_chunks(selection: SceneSubset, size: int) -> list[Chunk]:
     """A selection in pieces of at most `size` scenes."""
     return [(shard, rows[k : k + size]) for shard, rows in selection.shards() for k in range(0, len(rows), size)]
 
 
-class Rebuilder:
+class Reconstructor:
     """Actor. Row in: number of a chunk. Row out: the chunk's latent means and what they are decoded to, stacked."""
 
     def __init__(self, chunks: list[Chunk], lvae: str) -> None:
@@ -97,14 +97,14 @@ class Rebuilder:
     @torch.no_grad()
     def __call__(self, row: dict) -> dict:
         shard, rows = self.chunks[row["id"]]
-        latent = self.model.encode(layout_batch(shard.scenes(rows), self.model.spec).to(self.device)).mean
+        latent = self.model.encode(make_layout_batch(shard.scenes(rows), self.model.spec).to(self.device)).mean
         layouts = self.model.decode(latent).layouts()
         fields = DecodedLayout.__dataclass_fields__
         stacked = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in fields}
         return {"id": row["id"], "latent": latent.float().cpu().numpy()} | stacked
 
 
-def unstacked(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
+def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
     """Row of the shard, true scene, decoded layout and latent, scene by scene, of what a Rebuilder put out."""
     shard, rows = chunks[row["id"]]
     for k, (number, scene) in enumerate(zip(rows, shard.scenes(rows), strict=True)):
@@ -121,7 +121,7 @@ class SceneRecord:
     matches: Matches
     pairs: PairSums
     confusion: np.ndarray  # (classes, classes) voxels
-    outside: Outside
+    outside: OutsideCounts
     memory: np.ndarray  # bytes of each of MEMORY
     labels: np.ndarray  # (measures, 2) label fidelity: is the reconstruction's own label the truth's? Zeros: not known
 
@@ -145,13 +145,13 @@ class SceneRecord:
             matches=part("matches", Matches, hit=(-1, len(THRESHOLDS))),
             pairs=part("pairs", PairSums),
             confusion=np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES),
-            outside=part("outside", Outside, objects=(-1, 3)),
+            outside=part("outside", OutsideCounts, objects=(-1, 3)),
             memory=np.asarray(row["memory"]),
             labels=np.asarray(row["labels"]).reshape(-1, 2),
         )
 
 
-def scene_record(
+def make_scene_record(
     truth: Scene,
     layout: DecodedLayout,
     latent: np.ndarray,
@@ -165,22 +165,22 @@ def scene_record(
     the scene that the decoder means, above the existence threshold.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
-    rebuilt = scene_from_layout(layout, spec, truth)
+    rebuilt = decode_layout(layout, spec, truth)
     everywhere = replace(rebuilt, height_m=decoded_m, occupied=np.ones_like(rebuilt.occupied))
-    true_height_m, true_occupied = ground_on_grid(truth, spec.ground_classes, truth.grid)
-    _, occupied = ground_on_grid(rebuilt, spec.ground_classes, truth.grid)
-    height_m, _ = ground_on_grid(everywhere, spec.ground_classes, truth.grid)
-    coarse_height_m, coarse_occupied = ground_on_grid(truth, spec.ground_classes, spec.grid)
-    true_voxels = voxelise(truth, voxels)
+    true_height_m, true_occupied = resample_scene_ground(truth, spec.ground_classes, truth.grid)
+    _, occupied = resample_scene_ground(rebuilt, spec.ground_classes, truth.grid)
+    height_m, _ = resample_scene_ground(everywhere, spec.ground_classes, truth.grid)
+    coarse_height_m, coarse_occupied = resample_scene_ground(truth, spec.ground_classes, spec.grid)
+    true_voxels = voxelize(truth, voxels)
     return SceneRecord(
-        ground=ground_sums(true_occupied, true_height_m, occupied, height_m),
-        raster=ground_sums(coarse_occupied, coarse_height_m, rebuilt.occupied, decoded_m),
-        matches=match_scene(truth, scene_from_layout(layout, spec, truth, threshold=-1.0)),
-        pairs=pair_sums(truth, rebuilt),
-        confusion=voxel_confusion(true_voxels, voxelise(rebuilt, voxels)),
-        outside=outside(truth, voxels),
-        memory=memory_bytes(layout_batch([truth], spec), latent, true_voxels),
-        labels=label_fidelity(rebuilt, dataset),
+        ground=sum_ground(true_occupied, true_height_m, occupied, height_m),
+        raster=sum_ground(coarse_occupied, coarse_height_m, rebuilt.occupied, decoded_m),
+        matches=match_scene(truth, decode_layout(layout, spec, truth, threshold=-1.0)),
+        pairs=sum_pairs(truth, rebuilt),
+        confusion=compute_voxel_confusion(true_voxels, voxelize(rebuilt, voxels)),
+        outside=count_outside(truth, voxels),
+        memory=measure_memory_bytes(make_layout_batch([truth], spec), latent, true_voxels),
+        labels=compute_label_fidelity(rebuilt, dataset),
     )
 
 
@@ -190,28 +190,28 @@ def score_chunk(
     """Row in: what a Rebuilder put out. Rows out: one record per scene."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
-        | scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
-        for number, scene, layout, latent in unstacked(row, chunks)
+        | make_scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
+        for number, scene, layout, latent in unstack_layouts(row, chunks)
     ]
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
     """Row in: what a Rebuilder put out. Rows out: per scene its pictures, (H, W, 3) uint8, all of one size."""
     out = []
-    for _, scene, layout, _ in unstacked(row, chunks):
-        sides = {"truth": scene, "rebuilt": scene_from_layout(layout, spec, scene)}
-        above = {f"{name}_above": bev_picture(side, PICTURE_PX, supersample=2) for name, side in sides.items()}
-        oblique = {f"{name}_oblique": picture_3d(side, PICTURE_PX, PICTURE_PX) for name, side in sides.items()}
+    for _, scene, layout, _ in unstack_layouts(row, chunks):
+        sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}
+        above = {f"{name}_above": render_bev(side, PICTURE_PX, supersample=2) for name, side in sides.items()}
+        oblique = {f"{name}_oblique": render_3d(side, PICTURE_PX, PICTURE_PX) for name, side in sides.items()}
         out.append({"scene_id": scene.scene_id} | above | oblique)
     return out
 
 
-def rebuilt_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
+def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
     """Graph: chunks through the LVAE, by one actor per GPU, or by actors that leave half of the CPUs to what follows."""
-    per_actor, cluster = gpus_per_actor(), ray.cluster_resources()
+    per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
     room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
     return ray.data.range(len(chunks), override_num_blocks=len(chunks)).map(
-        Rebuilder,
+        Reconstructor,
         fn_constructor_args=(chunks, lvae),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chunks), room)),
         num_gpus=per_actor,
@@ -220,7 +220,7 @@ def rebuilt_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.
 
 
 @dataclass(frozen=True, eq=False)
-class Rebuilt:
+class Reconstruction:
     """Reconstruction scores of a dataset, and of each scene."""
 
     scores: dict  # nested plain numbers
@@ -228,22 +228,22 @@ class Rebuilt:
     places: list[Chunk]  # where each of them lies, a chunk of one
 
 
-def rebuild(
-    selection: Selection,
+def evaluate_reconstruction(
+    selection: SceneSubset,
     lvae: str,
     num_actors: int = 1,
     batch_size: int = 8,
     voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
     dataset: Dataset | None = None,
     on_scene: Callable[[], None] | None = None,
-) -> Rebuilt:
+) -> Reconstruction:
     """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
 
     With a dataset, whose thresholds labels go by, also whether reconstructions keep their density labels.
     """
-    spec, chunks = load_lvae(lvae).spec, chunks_of(selection, batch_size)
-    voxels = voxel_grid(spec, voxel_range_m)
-    graph = rebuilt_chunks(chunks, lvae, num_actors).flat_map(
+    spec, chunks = load_lvae(lvae).spec, split_chunks(selection, batch_size)
+    voxels = make_voxel_grid(spec, voxel_range_m)
+    graph = reconstruct_chunks(chunks, lvae, num_actors).flat_map(
         score_chunk,
         fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset},
         num_cpus=READER_CPUS,
@@ -255,16 +255,18 @@ def rebuild(
             on_scene()
     rows.sort(key=lambda row: (row["id"], row["row"]))
     records = [SceneRecord.from_row(row) for row in rows]
-    scores = reconstruction_scores(records, spec, voxels)
-    scores["memory_bytes"]["tables"] = table_bytes(chunks)
-    table = scene_scores([row["scene_id"] for row in rows], records)
+    scores = compute_reconstruction_scores(records, spec, voxels)
+    scores["memory_bytes"]["tables"] = measure_table_bytes(chunks)
+    table = compute_scene_scores([row["scene_id"] for row in rows], records)
     order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")  # NaN, where all is empty, last
-    return Rebuilt(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
+    return Reconstruction(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
 
 
-def draw(places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None) -> list[dict]:
+def draw_scenes(
+    places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None
+) -> list[dict]:
     """Pictures of scenes and of their reconstructions, in order: truth and rebuilt, above and oblique."""
-    graph = rebuilt_chunks(places, lvae, num_actors).flat_map(
+    graph = reconstruct_chunks(places, lvae, num_actors).flat_map(
         draw_chunk, fn_kwargs={"chunks": places, "spec": load_lvae(lvae).spec}, num_cpus=READER_CPUS
     )
     drawn = {}
@@ -275,15 +277,15 @@ def draw(places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable
     return [drawn[shard.scenes(rows)[0].scene_id] for shard, rows in places]
 
 
-def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
+def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
     """Scores of all scenes together, as nested plain numbers; per class or category under names that say so."""
     low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
     ground, raster = (
-        ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
+        compute_ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
         for parts in ((r.ground for r in records), (r.raster for r in records))
     )
     matches = join_matches([r.matches for r in records])
-    detection = {name: detection_scores(matches, **options) for name, options in AP_VARIANTS.items()}
+    detection = {name: compute_detection_scores(matches, **options) for name, options in AP_VARIANTS.items()}
     left_out = _sum(r.outside for r in records)
     num_objects, num_partly, num_wholly = left_out.objects.T
     present = np.flatnonzero(num_objects)
@@ -314,8 +316,8 @@ def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: 
             }
             for name, found in detection.items()
         },
-        "matched": asdict(pair_scores(_sum(r.pairs for r in records))),
-        "voxels": asdict(voxel_scores(np.sum([r.confusion for r in records], axis=0)))
+        "matched": asdict(compute_pair_scores(_sum(r.pairs for r in records))),
+        "voxels": asdict(compute_voxel_scores(np.sum([r.confusion for r in records], axis=0)))
         | {
             "bottom_m": voxels.bottom_m,
             "top_m": voxels.top_m,
@@ -326,7 +328,7 @@ def reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: 
             "category_outside": {CATEGORIES[c]: float(num_wholly[c] / num_objects[c]) for c in present},
         },
         "memory_bytes": dict(zip(MEMORY, np.mean([r.memory for r in records], axis=0).tolist(), strict=True)),
-        "label_fidelity": validity_rates(np.stack([r.labels for r in records]), LABEL_MEASURES),
+        "label_fidelity": compute_validity_rates(np.stack([r.labels for r in records]), LABEL_MEASURES),
         "truths": {CATEGORIES[c]: int(num_objects[c]) for c in present},
     }
 
@@ -335,7 +337,7 @@ def _sum(parts: Iterable):
     return reduce(operator.add, parts)
 
 
-def scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
+def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
     """A row per scene; null where a score is undefined, as a height error without ground."""
 
     def share(part: float, whole: float) -> float | None:
@@ -346,7 +348,7 @@ def scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
         ground, boxes = r.ground, list(SCORED)
         pairs, iou = r.pairs.pairs[boxes].sum(), r.pairs.iou[boxes].sum()
         filled = r.confusion.sum() > r.confusion[0, 0]
-        voxel = voxel_scores(r.confusion) if filled else None
+        voxel = compute_voxel_scores(r.confusion) if filled else None
         mean_square_m2 = share(ground.squared_m2.sum(), ground.pixels.sum())
         rows.append(
             {
@@ -366,11 +368,11 @@ def scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=SCENE_SCORES)
 
 
-def table_bytes(chunks: list[Chunk]) -> float:
+def measure_table_bytes(chunks: list[Chunk]) -> float:
     """Mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
     total, scenes = 0.0, 0
     for shard, rows in chunks:
-        written = sum(storage.file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))
+        written = sum(storage.measure_file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))
         total += written / shard.read("scenes", ["scene_id"]).num_rows * len(rows)
         scenes += len(rows)
     return total / scenes

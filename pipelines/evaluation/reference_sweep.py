@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.evaluation.evaluate import neighbourhood_scores
+from pipelines.evaluation.evaluate import compute_neighbourhood_scores
 from pipelines.reporting.chart import Chart
-from pipelines.reporting.report import Charts, Table, Text, report_html
-from pipelines.schema.scene_subset import apart, balanced, farthest
+from pipelines.reporting.report import Charts, Table, Text, render_report_html
+from pipelines.schema.scene_subset import select_apart, select_balanced, select_farthest
 
 MEASURES = ("precision", "recall", "density", "coverage")
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceSet:
     """Real scenes, by row (n,), and how they were chosen."""
 
     strategy: str  # "farthest" or "apart"
@@ -25,26 +25,26 @@ class Reference:
     rows: np.ndarray
 
 
-def references(
+def list_references(
     xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
-) -> Iterator[Reference]:
+) -> Iterator[ReferenceSet]:
     """Choices among poses (n, 2) of `least` to `most` scenes; sizes beyond what there is are left out."""
     fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
-    order = farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
+    order = select_farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
     for size in fitting:
-        yield Reference("farthest", size, order[:size])
+        yield ReferenceSet("farthest", size, order[:size])
     for distance_m in sorted(distances_m, reverse=True):
-        rows = apart(xy_m, world, distance_m)
+        rows = select_apart(xy_m, world, distance_m)
         if least <= len(rows) <= most:
-            yield Reference("apart", distance_m, rows)
+            yield ReferenceSet("apart", distance_m, rows)
 
 
 def score_reference(
-    reference: Reference, real: np.ndarray, generated: np.ndarray, labels: np.ndarray, k: Sequence[int]
+    reference: ReferenceSet, real: np.ndarray, generated: np.ndarray, labels: np.ndarray, k: Sequence[int]
 ) -> list[dict]:
     """A row for each k: features (n, d) of the reference against as many generated ones, labels (m,) in equal parts."""
     count = len(reference.rows)
-    found = neighbourhood_scores(real[reference.rows], generated[balanced(labels, count)], k)
+    found = compute_neighbourhood_scores(real[reference.rows], generated[select_balanced(labels, count)], k)
     rows = []
     for size in k:
         row = {"strategy": reference.strategy, "setting": float(reference.setting), "samples": count, "k": size}
@@ -55,7 +55,7 @@ def score_reference(
     return rows
 
 
-def sweep_charts(rows: Sequence[dict]) -> list[Chart]:
+def draw_sweep_charts(rows: Sequence[dict]) -> list[Chart]:
     """Precision and recall over the number of scenes, a chart per strategy, as in the paper's figure."""
     charts = []
     for strategy, title in (("apart", "Poses apart by a distance"), ("farthest", "Farthest poses")):
@@ -69,7 +69,7 @@ def sweep_charts(rows: Sequence[dict]) -> list[Chart]:
     return charts
 
 
-def sweep_table(rows: Sequence[dict]) -> Table:
+def build_sweep_table(rows: Sequence[dict]) -> Table:
     def shown(row: dict, name: str) -> str:
         return f"{row[name]:.3f} ({row[f'{name}_low']:.3f} to {row[f'{name}_high']:.3f})"
 
@@ -86,16 +86,16 @@ def sweep_table(rows: Sequence[dict]) -> Table:
     return Table("Scores by reference", ("real scenes", "on each side", "k", *MEASURES), cells)
 
 
-def sweep_html(rows: Sequence[dict], how: Sequence[str]) -> str:
-    sections = [Charts("Precision and recall", sweep_charts(rows)), sweep_table(rows), Text("How", how)]
-    return report_html("Precision and recall by reference", sections)
+def render_sweep_html(rows: Sequence[dict], how: Sequence[str]) -> str:
+    sections = [Charts("Precision and recall", draw_sweep_charts(rows)), build_sweep_table(rows), Text("How", how)]
+    return render_report_html("Precision and recall by reference", sections)
 
 
-def sweep(
+def sweep_references(
     real: np.ndarray,
     generated: np.ndarray,
     labels: np.ndarray,
-    chosen: Sequence[Reference],
+    chosen: Sequence[ReferenceSet],
     k: Sequence[int],
     on_reference: Callable[[], None] = lambda: None,
 ) -> list[dict]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
-from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, report_html
+from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
 # Scores of `evaluate.compare` by their place in it, with their name in words, and which are better: low, high, or close to 1.
 MEASURES = {
@@ -24,27 +24,27 @@ CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
 COMMON = 3.0  # a scene: the counts of rarer categories say little
 
 
-def count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
+def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
     """The common category whose mean count is furthest from the real one, and generated over real; None without one."""
     ratios = {}
     for name, sides in statistics.items():
         if name.startswith("num_") and sides["real"].value >= COMMON:
             ratios[name.removeprefix("num_")] = Estimate(*(end / sides["real"].value for end in sides["generated"]))
-    return max(ratios.items(), key=lambda one: off(one[1].value)) if ratios else None
+    return max(ratios.items(), key=lambda one: compute_deviation(one[1].value)) if ratios else None
 
 
-def off(ratio: float) -> float:
+def compute_deviation(ratio: float) -> float:
     """How far a ratio is from 1, either way."""
     return abs(math.log(ratio)) if ratio > 0 else math.inf
 
 
-def sampler_row(
+def make_sampler_row(
     sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
     """One row: each measure with the ends of its interval, None where it has no value; an actor's seconds, None if none were seen."""
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
-    row["count_category"], ratio = count_ratio(scores["statistics"]) or (None, None)
+    row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
     for name, (place, *_) in MEASURES.items():
         found: Mapping | Estimate | None = {**scores, "count_ratio": ratio}
         for part in place:
@@ -54,7 +54,7 @@ def sampler_row(
     return row
 
 
-def as_good_as(row: Mapping, reference: Mapping) -> bool:
+def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
     """Is every measure better than the reference's or within its interval, where both have one?"""
 
     def good(name: str, better: str) -> bool:
@@ -62,24 +62,24 @@ def as_good_as(row: Mapping, reference: Mapping) -> bool:
             return True
         not_more = row[f"{name}_low"] <= reference[f"{name}_high"]
         not_less = row[f"{name}_high"] >= reference[f"{name}_low"]
-        near = (not_more and not_less) or off(row[name]) <= off(reference[name])
+        near = (not_more and not_less) or compute_deviation(row[name]) <= compute_deviation(reference[name])
         return {"low": not_more, "high": not_less, "one": near}[better]
 
     return all(good(name, better) for name, (_, _, better) in MEASURES.items())
 
 
-def named(row: Mapping) -> str:
+def name_settings(row: Mapping) -> str:
     """The sampler, and its noise scaling where that is not 1."""
     return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] != 1 else "")
 
 
-def reference_row(rows: Sequence[Mapping]) -> Mapping:
+def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
     """The paper's sampler with the most steps there are of it; without it, the most steps of any."""
-    return max(rows, key=lambda row: (named(row) == "ddpm", row["steps"]))
+    return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 
-def sampler_table(rows: Sequence[Mapping]) -> Table:
-    reference, cells = reference_row(rows), []
+def build_sampler_table(rows: Sequence[Mapping]) -> Table:
+    reference, cells = find_reference_row(rows), []
     for row in rows:
         scores = (
             None if row[name] is None else f"{row[name]:.3g} ({row[f'{name}_low']:.3g} to {row[f'{name}_high']:.3g})"
@@ -88,39 +88,39 @@ def sampler_table(rows: Sequence[Mapping]) -> Table:
         if row["count_category"]:
             scores = [*scores]
             scores[-1] += f" {row['count_category']}"
-        good = "–" if row is reference else "yes" if as_good_as(row, reference) else "no"
+        good = "–" if row is reference else "yes" if is_as_good_as(row, reference) else "no"
         seconds = "–" if row["seconds_per_scene"] is None else f"{row['seconds_per_scene']:.2f}"
-        cells.append((named(row), row["steps"], seconds, *scores, good))
+        cells.append((name_settings(row), row["steps"], seconds, *scores, good))
     names = [words for _, words, _ in MEASURES.values()]
-    alike = f"as good as {named(reference)} of {reference['steps']}"
+    alike = f"as good as {name_settings(reference)} of {reference['steps']}"
     note = (
         "Sampler: / and a number where it divides the network's noise by that. In brackets: 95 % bootstrap intervals. Seconds: of one "
-        f"actor, weights loaded. Last column: is every score within the interval of {named(reference)} of {reference['steps']} steps, "
+        f"actor, weights loaded. Last column: is every score within the interval of {name_settings(reference)} of {reference['steps']} steps, "
         "or better?"
     )
     return Table("Scores by sampler and steps", ("sampler", "steps", "s per scene", *names, alike), cells, note=note)
 
 
-def sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
+def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
     """A chart per measure, a series per sampler, over the number of steps."""
     charts = []
     for name in CHARTED:
         series = {}
-        for sampler in dict.fromkeys(map(named, rows)):
-            points = sorted((r["steps"], r[name]) for r in rows if named(r) == sampler and r[name] is not None)
+        for sampler in dict.fromkeys(map(name_settings, rows)):
+            points = sorted((r["steps"], r[name]) for r in rows if name_settings(r) == sampler and r[name] is not None)
             series[sampler] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
         words = MEASURES[name][1]
         charts.append(Chart(words[0].upper() + words[1:], series, "steps", words))
     return charts
 
 
-def sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
+def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
     """The page; `pictures` are the same scenes in every row, `columns` of them."""
     note = "One row per sampler and number of steps; the same scene numbers and labels in each."
     sections = [
-        sampler_table(rows),
-        Charts("By number of steps", sampler_charts(rows)),
+        build_sampler_table(rows),
+        Charts("By number of steps", draw_sampler_charts(rows)),
         Pictures("Scenes", pictures, columns, note),
         Text("How", how),
     ]
-    return report_html("Samplers", sections)
+    return render_report_html("Samplers", sections)

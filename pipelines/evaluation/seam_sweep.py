@@ -6,15 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from models.pipeline import Resampling
+from models.sampling.repaint import RePaintConfig
 from models.scene import VEGETATION, Scene
 from pipelines.evaluation.seams import MEANINGS
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.seams import MEASURES
-from pipelines.reporting.report import Picture, Pictures, Table, Text, report_html
+from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
 
 
-def objects_per_ha(scenes: Iterable[Scene]) -> float:
+def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
     """How many objects other than plants stand on a hectare of all the ground that scenes cover."""
     objects, area_m2 = 0, 0.0
     for scene in scenes:
@@ -23,15 +23,17 @@ def objects_per_ha(scenes: Iterable[Scene]) -> float:
     return objects / area_m2 * 10_000
 
 
-def seam_row(resampling: Resampling, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]) -> dict:
+def make_seam_row(
+    repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
+) -> dict:
     """One row: the setting, what a block costs, and each ratio with the ends of its interval; None where there is none."""
     row = {
-        "steps": resampling.num_steps,
-        "jump_length": resampling.jump_length,
-        "resamplings": resampling.resamplings,
-        "known_guidance": resampling.known_guidance,
-        "eta": resampling.eta,
-        "evaluations": resampling.evaluations,
+        "steps": repaint.num_inference_steps,
+        "jump_length": repaint.jump_length,
+        "resamplings": repaint.resamplings,
+        "known_guidance": repaint.pseudoinverse_guidance,
+        "eta": repaint.eta,
+        "evaluations": repaint.num_evaluations,
         "objects_per_ha": objects_per_ha,
         "seams": seams,
     }
@@ -41,7 +43,7 @@ def seam_row(resampling: Resampling, seams: int, objects_per_ha: float, ratios: 
     return row
 
 
-def seam_table(rows: Sequence[Mapping]) -> Table:
+def build_seam_table(rows: Sequence[Mapping]) -> Table:
     def shown(row: Mapping, name: str) -> str | None:
         return None if row[name] is None else f"{row[name]:.2f} ({row[f'{name}_low']:.2f} to {row[f'{name}_high']:.2f})"
 
@@ -63,8 +65,8 @@ def seam_table(rows: Sequence[Mapping]) -> Table:
     return Table("Across seams over nearby lines", columns, cells, note=note)
 
 
-def seam_sweep_html(rows: Sequence[Mapping], pictures: Sequence[Picture], how: Sequence[str]) -> str:
+def render_seam_sweep_html(rows: Sequence[Mapping], pictures: Sequence[Picture], how: Sequence[str]) -> str:
     """The page; `pictures` are the first scene of every row."""
     meanings = [f"{name.replace('_', ' ').capitalize()}: {words}." for name, words in MEANINGS.items()]
-    sections = [seam_table(rows), Pictures("Scenes", pictures, columns=3), Text("How", [*how, *meanings])]
-    return report_html("Seams by effort", sections)
+    sections = [build_seam_table(rows), Pictures("Scenes", pictures, columns=3), Text("How", [*how, *meanings])]
+    return render_report_html("Seams by effort", sections)

@@ -10,12 +10,12 @@ import pyarrow as pa
 import ray.data
 
 from models.scene import Grid, Scene
-from pipelines.evaluation.features import READER_CPUS, chosen_scenes
-from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, seam_ratios, seam_record
-from pipelines.rendering.render import MARK_COLOR, bev_picture
-from pipelines.reporting.evaluation_report import written
-from pipelines.reporting.report import Picture, Pictures, Table, Text, report_html
-from pipelines.schema.scene_subset import Selection, evenly
+from pipelines.evaluation.features import READER_CPUS, load_scenes
+from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, estimate_seam_ratios, measure_scene_seams
+from pipelines.rendering.render import MARK_COLOR, render_bev
+from pipelines.reporting.evaluation_report import format_value
+from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
+from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
 BLOCK_M = 64.0  # the middle of an outpainted scene
@@ -28,7 +28,7 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class Lines:
+class SeamLines:
     """Seams in metres from a scene's far edge (rows) and left edge (cols); where neither is given, those of its middle."""
 
     rows_m: tuple[float, ...] = ()
@@ -38,7 +38,7 @@ class Lines:
         """The pixel rows and columns that they lie before. Raises ValueError for a scene with no room for any."""
         sides = [(self.rows_m, grid.rows), (self.cols_m, grid.cols)]
         if not (self.rows_m or self.cols_m):
-            sides = [(middle_m(count * grid.resolution_m), count) for _, count in sides]
+            sides = [(find_middle_m(count * grid.resolution_m), count) for _, count in sides]
         found = [[round(line / grid.resolution_m) for line in lines] for lines, _ in sides]
         if not any(found):
             raise ValueError(
@@ -47,13 +47,13 @@ class Lines:
         return found[0], found[1]
 
 
-def middle_m(extent_m: float) -> tuple[float, ...]:
+def find_middle_m(extent_m: float) -> tuple[float, ...]:
     margin_m = (extent_m - BLOCK_M) / 2
     return (margin_m, extent_m - margin_m) if margin_m > 0 else ()
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class SeamMeasurement:
     """Records (n, 4, 2, 2) of scenes, their ids, and how many seams each has."""
 
     scene_ids: list[str]
@@ -61,20 +61,20 @@ class Measured:
     seams: np.ndarray
 
 
-def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: Lines) -> list[dict]:
+def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines) -> list[dict]:
     """Row in: number of a shard with rows. Rows out: one per scene, its flat record."""
     shard, rows = parts[row["id"]]
     out = []
     for scene in shard.scenes(rows):
         across, along = lines.pixels(scene.grid)
-        record = seam_record(scene, across, along).ravel()
+        record = measure_scene_seams(scene, across, along).ravel()
         out.append({"scene_id": scene.scene_id, "seams": len(across) + len(along), "record": record})
     return out
 
 
-def measure(
-    selection: Selection, lines: Lines, num_tasks: int, on_scene: Callable[[], None] = lambda: None
-) -> Measured:
+def measure_seams(
+    selection: SceneSubset, lines: SeamLines, num_tasks: int, on_scene: Callable[[], None] = lambda: None
+) -> SeamMeasurement:
     """Fan-out: one task per shard."""
     parts = selection.shards()
     graph = ray.data.range(len(parts), override_num_blocks=len(parts)).flat_map(
@@ -89,15 +89,15 @@ def measure(
         on_scene()
     rows.sort(key=lambda row: row["scene_id"])
     records = np.stack([row["record"] for row in rows]).reshape(len(rows), len(MEASURES), 2, 2)
-    return Measured([row["scene_id"] for row in rows], records, np.array([row["seams"] for row in rows]))
+    return SeamMeasurement([row["scene_id"] for row in rows], records, np.array([row["seams"] for row in rows]))
 
 
 # ------------------------------------------------------------------------------------------------------ writing
 
 
-def join_sides(measured: Mapping[str, Measured]) -> dict:
+def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
     """By measure the ratios of each side, and how many scenes and seams they come from."""
-    ratios = {side: seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
+    ratios = {side: estimate_seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
     return {
         "scenes": {side: len(found.scene_ids) for side, found in measured.items()},
         "seams": {side: int(found.seams.sum()) for side, found in measured.items()},
@@ -105,7 +105,7 @@ def join_sides(measured: Mapping[str, Measured]) -> dict:
     }
 
 
-def seams_table(measured: Mapping[str, Measured]) -> pa.Table:
+def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
     """A row per scene: side, scene_id, seams, and of each measure numerators and denominators."""
     rows = []
     for side, found in measured.items():
@@ -118,17 +118,17 @@ def seams_table(measured: Mapping[str, Measured]) -> pa.Table:
     return pa.Table.from_pylist(rows)
 
 
-def shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
+def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
     """Of each measure its name and the ratios of both sides in words."""
     return [
-        (name.replace("_", " "), *(written(sides[side]) or "–" for side in ("generated", "real")))
+        (name.replace("_", " "), *(format_value(sides[side]) or "–" for side in ("generated", "real")))
         for name, sides in scores["ratios"].items()
     ]
 
 
-def with_lines(scene: Scene, lines: Lines, size_px: int = 512) -> np.ndarray:
+def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray:
     """The scene from above with ticks at the ends of its seams: (H, W, 3) uint8."""
-    picture = bev_picture(scene, size_px, supersample=2).copy()
+    picture = render_bev(scene, size_px, supersample=2).copy()
     scale = picture.shape[0] / scene.grid.rows
     tick = size_px // 24
     for axis, seams in enumerate(lines.pixels(scene.grid)):
@@ -139,16 +139,16 @@ def with_lines(scene: Scene, lines: Lines, size_px: int = 512) -> np.ndarray:
     return picture
 
 
-def seams_html(scores: Mapping, selection: Selection, lines: Lines, count: int) -> str:
+def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines, count: int) -> str:
     """The page: ratios with their meaning, and some scenes with their seams marked at the edges."""
     parts = selection.shards()
     total = sum(len(rows) for _, rows in parts)
-    scenes = chosen_scenes(parts, evenly(total, min(count, total)))
-    pictures = [Picture(scene.scene_id, with_lines(scene, lines), "generated") for scene in scenes]
+    scenes = load_scenes(parts, select_evenly(total, min(count, total)))
+    pictures = [Picture(scene.scene_id, draw_lines(scene, lines), "generated") for scene in scenes]
     table = Table(
         "Across seams over nearby lines",
         ("measure", "generated", "real"),
-        shown_rows(scores),
+        select_shown_rows(scores),
         meanings=list(MEANINGS.values()),
         note="1: the line does not show. In brackets: 95 % bootstrap intervals over scenes.",
     )
@@ -157,4 +157,4 @@ def seams_html(scores: Mapping, selection: Selection, lines: Lines, count: int) 
         f"{scores['seams']['real']} lines across the street in {scores['scenes']['real']} real ones. "
         f"Nearby lines are parallel ones {NEAR_M:g} to {FAR_M:g} m away, at least {NEAR_M:g} m from every seam."
     )
-    return report_html("Seams", [table, Pictures("Scenes", pictures, columns=3), Text("How", [how])])
+    return render_report_html("Seams", [table, Pictures("Scenes", pictures, columns=3), Text("How", [how])])

@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow as pa
 import ray.data
 
-from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelise
+from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.io.voxel_import import read_voxels
-from pipelines.metrics.reconstruction import voxel_confusion, voxel_scores
-from pipelines.preprocess.import_external import find_files, scene_id
+from pipelines.metrics.reconstruction import compute_voxel_confusion, compute_voxel_scores
+from pipelines.preprocess.import_external import find_files, make_scene_id
 from pipelines.runtime import storage
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.palette import EMPTY
@@ -36,7 +36,7 @@ SCENE_SCORES = pa.schema(
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruthVoxels:
     """Where the true voxels of a scene are: in a file, or in a row of a shard."""
 
     uri: str = ""
@@ -45,37 +45,39 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Pair:
+class VoxelPair:
     """One scene to score."""
 
     name: str
-    truth: Truth
+    truth: GroundTruthVoxels
     rebuilt: str
     stored: str = ""
 
 
-def true_scenes(root: str, split: str = "") -> dict[str, Truth]:
+def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]:
     """Name -> place, of a dataset directory's scenes (of one split, or all) or of the .npz files in a directory."""
-    if storage.list_files(storage.join(root, "scenes"), ".parquet"):
+    if storage.list_files(storage.join_uri(root, "scenes"), ".parquet"):
         shards = find_shards(root, split=split or None)
         ids = [shard.read("scenes", ["scene_id"])["scene_id"].to_pylist() for shard in shards]
         return {
-            name: Truth("", shard, k) for shard, names in zip(shards, ids, strict=True) for k, name in enumerate(names)
+            name: GroundTruthVoxels("", shard, k)
+            for shard, names in zip(shards, ids, strict=True)
+            for k, name in enumerate(names)
         }
     if split:
         raise ValueError(f"{root}: split {split!r} asked for, but no dataset here; leave it out to score .npz files")
-    return {name: Truth(uri) for name, uri in files_by_scene(root, ".npz").items()}
+    return {name: GroundTruthVoxels(uri) for name, uri in group_files_by_scene(root, ".npz").items()}
 
 
-def files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
+def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
     """Scene name -> URI of the files that a directory or a pattern names."""
     base, files = find_files(pattern, suffix)
-    return {scene_id(file): storage.join(base, file) for file in files}
+    return {make_scene_id(file): storage.join_uri(base, file) for file in files}
 
 
-def paired(
-    truth: dict[str, Truth], rebuilt: dict[str, str], stored: dict[str, str] | None, partial: bool
-) -> list[Pair]:
+def pair_files(
+    truth: dict[str, GroundTruthVoxels], rebuilt: dict[str, str], stored: dict[str, str] | None, partial: bool
+) -> list[VoxelPair]:
     """The scenes that all sides have, by name. Unless `partial`, each side must have them all.
 
     Raises ValueError that lists what has no counterpart, or if nothing has.
@@ -89,48 +91,48 @@ def paired(
             for side, names in missing.items()
         )
         raise ValueError(f"{told}; name files by scene, or score what there is on all sides by --partial")
-    return [Pair(name, truth[name], rebuilt[name], stored[name] if stored else "") for name in sorted(common)]
+    return [VoxelPair(name, truth[name], rebuilt[name], stored[name] if stored else "") for name in sorted(common)]
 
 
-def chunked(pairs: list[Pair]) -> list[list[Pair]]:
+def split_chunks(pairs: list[VoxelPair]) -> list[list[VoxelPair]]:
     """Pairs in chunks of at most CHUNK_SCENES whose truths lie in one shard."""
-    by_shard: dict[Shard | None, list[Pair]] = {}
+    by_shard: dict[Shard | None, list[VoxelPair]] = {}
     for pair in pairs:
         by_shard.setdefault(pair.truth.shard, []).append(pair)
     return [group[k : k + CHUNK_SCENES] for group in by_shard.values() for k in range(0, len(group), CHUNK_SCENES)]
 
 
-def true_voxels(chunk: list[Pair], grid: VoxelGrid, axes: Axes) -> list[np.ndarray]:
+def load_true_voxels(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes) -> list[np.ndarray]:
     """(256, 256, 32) class ids of each truth of a chunk."""
     shard = chunk[0].truth.shard
     if shard is None:
         return [read_voxels(pair.truth.uri, axes) for pair in chunk]
-    return [voxelise(scene, grid) for scene in shard.scenes([pair.truth.row for pair in chunk])]
+    return [voxelize(scene, grid) for scene in shard.scenes([pair.truth.row for pair in chunk])]
 
 
-def score_chunk(row: dict, chunks: list[list[Pair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
+def score_chunk(row: dict, chunks: list[list[VoxelPair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
     """Row in: number of a chunk. Rows out: per scene its confusion matrix, flat, and bytes on disk."""
     chunk = chunks[row["id"]]
     return [
         {
             "scene_id": pair.name,
-            "confusion": voxel_confusion(truth, read_voxels(pair.rebuilt, axes)).ravel(),
-            "rebuilt_bytes": storage.file_bytes(pair.rebuilt),
-            "stored_bytes": storage.file_bytes(pair.stored) if pair.stored else -1,
+            "confusion": compute_voxel_confusion(truth, read_voxels(pair.rebuilt, axes)).ravel(),
+            "rebuilt_bytes": storage.measure_file_bytes(pair.rebuilt),
+            "stored_bytes": storage.measure_file_bytes(pair.stored) if pair.stored else -1,
         }
-        for pair, truth in zip(chunk, true_voxels(chunk, grid, truth_axes), strict=True)
+        for pair, truth in zip(chunk, load_true_voxels(chunk, grid, truth_axes), strict=True)
     ]
 
 
 def score_voxels(
-    pairs: list[Pair],
+    pairs: list[VoxelPair],
     grid: VoxelGrid,
     axes: Axes,
     truth_axes: Axes,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[dict, pa.Table]:
     """Scores of all scenes together, as nested plain numbers, and a row per scene, by name."""
-    chunks = chunked(pairs)
+    chunks = split_chunks(pairs)
     graph = ray.data.range(len(chunks), override_num_blocks=len(chunks)).flat_map(
         score_chunk, fn_args=(chunks, grid, axes, truth_axes), num_cpus=1
     )
@@ -144,27 +146,27 @@ def score_voxels(
     scores = {
         "scenes": len(rows),
         "grid": {"rows": grid.shape[0], "cols": grid.shape[1], "levels": grid.shape[2]},
-        "voxels": asdict(voxel_scores(np.sum(confusions, axis=0))),
-        "rebuilt_bytes": spread([row["rebuilt_bytes"] for row in rows]),
+        "voxels": asdict(compute_voxel_scores(np.sum(confusions, axis=0))),
+        "rebuilt_bytes": spread_evenly([row["rebuilt_bytes"] for row in rows]),
     }
     if pairs[0].stored:
-        scores["stored_bytes"] = spread([row["stored_bytes"] for row in rows])
+        scores["stored_bytes"] = spread_evenly([row["stored_bytes"] for row in rows])
     table = [
         {name: row[name] for name in ("scene_id", "rebuilt_bytes")}
         | {"stored_bytes": row["stored_bytes"] if pairs[0].stored else None}
-        | scene_scores(confusion)
+        | compute_scene_scores(confusion)
         for row, confusion in zip(rows, confusions, strict=True)
     ]
     return scores, pa.Table.from_pylist(table, schema=SCENE_SCORES)
 
 
-def scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
+def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
     if confusion.sum() == confusion[EMPTY, EMPTY]:
         return {"voxel_iou": None, "voxel_miou": None}
-    scores = voxel_scores(confusion)
+    scores = compute_voxel_scores(confusion)
     return {"voxel_iou": scores.iou, "voxel_miou": scores.miou}
 
 
-def spread(sizes: list[int]) -> dict[str, float]:
+def spread_evenly(sizes: list[int]) -> dict[str, float]:
     """Mean, standard deviation, least and most of sizes in bytes."""
     return {name: float(getattr(np, name)(sizes)) for name in ("mean", "std", "min", "max")}

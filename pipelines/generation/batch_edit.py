@@ -12,16 +12,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import ray.data
 
-from models.composition.inpaint import object_region
+from models.composition.inpaint import select_around_objects
 from models.scene import Scene
-from pipelines.editing.edit import Done, Edit, edits_to_json, replayed
-from pipelines.rendering.render import bev_picture, outlined_picture
-from pipelines.reporting.report import Picture, Pictures, Section, Table, report_html
+from pipelines.editing.edit import Edit, ObjectChange, replay_edits, serialize_edits
+from pipelines.rendering.render import render_bev, render_outlined_bev
+from pipelines.reporting.report import Picture, Pictures, Section, Table, render_report_html
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import per_row
-from pipelines.schema.run_guard import claim
-from pipelines.schema.scene_subset import Selection
-from pipelines.schema.tables import EDITS, TABLES, Shard, rejects_table
+from pipelines.runtime.ray_tasks import map_rows
+from pipelines.schema.run_guard import guard_run
+from pipelines.schema.scene_subset import SceneSubset
+from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table
 
 PICTURE_PX = 512
 OUTLINE_M = 0.4  # around what an edit changed
@@ -43,7 +43,7 @@ class EditRequest:
         """Where the scenes of the given shard go; they are the run's number-th."""
         return Shard(self.output, self.source, given.split, number)
 
-    def claim(self, selection: Selection) -> None:
+    def claim(self, selection: SceneSubset) -> None:
         """Keep the source for these edits of these scenes (claims.py)."""
         chosen = {
             "input": selection.root,
@@ -51,12 +51,12 @@ class EditRequest:
             "split": selection.split,
             "limit": selection.limit,
         }
-        claim(self.output, self.source, self.run, {"edits": edits_to_json(self.edits)} | chosen)
+        guard_run(self.output, self.source, self.run, {"edits": serialize_edits(self.edits)} | chosen)
 
 
-def edited(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table]]:
+def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table]]:
     """The scene after the request's edits, and its rows of the edits table. Raises ValueError, naming the edit."""
-    after, done = replayed(scene, request.edits)
+    after, done = replay_edits(scene, request.edits)
     rows = []
     for step, (edit, changes) in enumerate(zip(request.edits, done, strict=True)):
         count = len(changes.primitive)
@@ -73,14 +73,14 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
         scenes, done, rejects = [], [EDITS.empty_table()], []
         for scene in given.scenes(rows):
             try:
-                after, changes = edited(scene, request)
+                after, changes = edit_shard(scene, request)
                 scenes.append(after)
                 done += changes
             except ValueError as error:
                 about = {"scene_id": scene.scene_id, "sequence": scene.sequence, "frame": scene.frame}
                 rejects.append(about | {"reason": str(error)})
         if rejects:
-            storage.write_parquet(rejects_table(rejects), shard.path("rejects"))
+            storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
         if scenes:
             shard.write(scenes)
         storage.write_parquet(pa.concat_tables(done), shard.path("edits"))  # last: the shard is done
@@ -89,7 +89,7 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
 
 
 @dataclass(frozen=True)
-class Edited:
+class EditResult:
     """What a run did: scenes written and rejected, and what each step of the list changed."""
 
     scenes: int
@@ -99,8 +99,8 @@ class Edited:
 
 
 def edit_scenes(
-    request: EditRequest, selection: Selection, pictures: int = 8, on_shard: Callable[[int], None] | None = None
-) -> Edited:
+    request: EditRequest, selection: SceneSubset, pictures: int = 8, on_shard: Callable[[int], None] | None = None
+) -> EditResult:
     """Write the edited tables, the edits table and a page. Goes on where it stopped.
 
     Raises ValueError if the output holds a run of other edits, for a list that no scene can take, or one that changes
@@ -114,7 +114,7 @@ def edit_scenes(
     request.claim(selection)
     rows = ray.data.from_items([{"shard": k} for k in range(len(parts))], override_num_blocks=len(parts))
     found = []
-    for row in per_row(rows, lambda row: write_edited(row, request, parts)).iter_rows():
+    for row in map_rows(rows, lambda row: write_edited(row, request, parts)).iter_rows():
         found.append(row)
         if on_shard:
             on_shard(row["scenes"])
@@ -127,20 +127,20 @@ def edit_scenes(
     changes = pa.concat_tables([shard.read("edits") for shard in shards])
     if not len(changes):
         for table in TABLES:
-            storage.delete_directory(storage.join(request.output, table, f"source={request.source}"))
+            storage.delete_directory(storage.join_uri(request.output, table, f"source={request.source}"))
         raise ValueError(
             f"nothing is changed: no primitive in {scenes} scene(s) fits the selection; nothing is written"
         )
-    table = _totals(request.edits, changes)
+    table = _sum_changes(request.edits, changes)
     sections: list[Section] = [table]
     if pictures:
-        sections.append(_before_after(request, parts, pictures))
-    page = storage.join(request.output, f"{request.run}.html")
-    storage.write_text(report_html("Edited scenes", sections, request.run), page)
-    return Edited(scenes, rejects, table, page)
+        sections.append(_draw_before_after(request, parts, pictures))
+    page = storage.join_uri(request.output, f"{request.run}.html")
+    storage.write_text(render_report_html("Edited scenes", sections, request.run), page)
+    return EditResult(scenes, rejects, table, page)
 
 
-def _totals(edits: Sequence[Edit], changes: pa.Table) -> Table:
+def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
     """A row per edit and kind of change: scenes, primitives, and how much they were changed."""
     rows = []
     for step, edit in enumerate(edits):
@@ -164,22 +164,24 @@ def _totals(edits: Sequence[Edit], changes: pa.Table) -> Table:
     return Table("Edits", columns, rows)
 
 
-def _before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
+def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
     """The first scenes that an edit changed, each as given and as edited; what was changed first is outlined."""
     shown: list[Picture] = []
-    for scene, after, changes in islice(_changed(request, parts), count):
-        region = object_region(scene, changes.primitive, OUTLINE_M)
-        shown.append(Picture(scene.scene_id, outlined_picture(scene, region, PICTURE_PX), "given"))
-        shown.append(Picture(scene.scene_id, bev_picture(after, PICTURE_PX, 2), "edited"))
+    for scene, after, changes in islice(_list_changed(request, parts), count):
+        region = select_around_objects(scene, changes.primitive, OUTLINE_M)
+        shown.append(Picture(scene.scene_id, render_outlined_bev(scene, region, PICTURE_PX), "given"))
+        shown.append(Picture(scene.scene_id, render_bev(after, PICTURE_PX, 2), "edited"))
     note = "Left as given, what the first edit changed outlined in red; right after all edits."
     return Pictures("Before and after", shown, 4, note)
 
 
-def _changed(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]) -> Iterator[tuple[Scene, Scene, Done]]:
+def _list_changed(
+    request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]
+) -> Iterator[tuple[Scene, Scene, ObjectChange]]:
     """Scenes that the edits change, before and after, and what the first edit did; one at a time."""
     for given, rows in parts:
         for scene in given.scenes(rows):
             with suppress(ValueError):  # a scene that is rejected
-                after, done = replayed(scene, request.edits)
+                after, done = replay_edits(scene, request.edits)
                 if any(len(changes.primitive) for changes in done):
                     yield scene, after, done[0]

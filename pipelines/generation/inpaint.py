@@ -7,19 +7,26 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from models.composition.extend import inpainting, region_blocks
-from models.composition.inpaint import Contents, half_plane_region, object_region, polygon_region
+from models.composition.extend import inpaint_blocks, split_region
+from models.composition.inpaint import Contents, select_around_objects, select_half_plane, select_polygon
 from models.labels import require_labels
-from models.pipeline import PrITTIPipeline, Resampling
-from models.scene import Scene, merge
-from pipelines.generation.sample import Request, at_model_resolution, claim_run, label_of, load_pipeline
-from pipelines.io.mesh_export import scene_glb
-from pipelines.metrics.reconstruction import pair_sums
-from pipelines.rendering.render import outlined_picture
-from pipelines.reporting.report import Picture, Pictures, Table, report_html
+from models.pipeline import PrITTIPipeline
+from models.sampling.repaint import RePaintConfig
+from models.scene import Scene, merge_scenes
+from pipelines.generation.sample import (
+    Request,
+    find_scene_label,
+    guard_generation_run,
+    load_pipeline,
+    resample_to_model_resolution,
+)
+from pipelines.io.mesh_export import export_glb
+from pipelines.metrics.reconstruction import sum_pairs
+from pipelines.rendering.render import render_outlined_bev
+from pipelines.reporting.report import Picture, Pictures, Table, render_report_html
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import fan_out
-from pipelines.schema.scene_subset import Selection
+from pipelines.runtime.ray_tasks import map_actors
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
 PICTURE_PX = 512
@@ -27,7 +34,7 @@ PER_ROW = 4  # pictures of a scene: as given, and its first results
 
 
 @dataclass(frozen=True)
-class Where:
+class RegionConfig:
     """The region: all that is named, together, or with `outside` all but that."""
 
     polygon_m: tuple[float, ...] = ()  # x, y, x, y, ...
@@ -42,15 +49,15 @@ class Where:
         if self.polygon_m:
             if len(self.polygon_m) % 2:
                 raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
-            found |= polygon_region(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
+            found |= select_polygon(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
         if self.half_plane:
             if len(self.half_plane) != 3:
                 raise ValueError(f"a half plane of {len(self.half_plane)} numbers: expected direction x y, and metres")
-            found |= half_plane_region(scene.grid, self.half_plane[:2], self.half_plane[2])
+            found |= select_half_plane(scene.grid, self.half_plane[:2], self.half_plane[2])
         if self.objects:
             if not -1 < min(self.objects) <= max(self.objects) < len(scene):
                 raise ValueError(f"scene {scene.scene_id} has primitives 0 to {len(scene) - 1}, not {self.objects}")
-            found |= object_region(scene, self.objects, self.margin_m)
+            found |= select_around_objects(scene, self.objects, self.margin_m)
         found = found != self.outside
         if not found.any():
             raise ValueError(f"scene {scene.scene_id}: the region holds no pixel of its {scene.grid}")
@@ -61,20 +68,20 @@ class Where:
 class InpaintRequest(Request):
     """What to make anew in scenes, `variants` times each; `label` None means each scene's own."""
 
-    where: Where
+    where: RegionConfig
     contents: Contents
     variants: int
     label: str | None
     seed: int
-    resampling: Resampling
+    repaint: RePaintConfig
     guidance_scale: float
 
 
-def drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
+def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
     """How far a raw decode is off outside the region, as sums: pixels and squared metres, primitives and their IoU3D."""
-    given, made = (merge([s], [~region], s) for s in (scene, raw))
+    given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied
-    sums = pair_sums(given, made)
+    sums = sum_pairs(given, made)
     return {
         "pixels_both": float(both.sum()),
         "pixels_either": float((given.occupied | made.occupied).sum()),
@@ -85,7 +92,7 @@ def drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
     }
 
 
-def drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
     """Of all sums together: ground IoU, height RMSE, share of the objects found again, their mean IoU3D; None for 0 / 0."""
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 
@@ -105,20 +112,20 @@ def inpaint_one(
     pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
 ) -> tuple[list[Scene], list[dict[str, float]]]:
     """All variants of scene `number` of a run, and the drift of each raw decode of a block."""
-    scene, count = at_model_resolution(scene, pipeline.spec), request.variants
+    scene, count = resample_to_model_resolution(scene, pipeline.spec), request.variants
     drifts: list[dict[str, float]] = []
-    for step in inpainting(
+    for step in inpaint_blocks(
         pipeline,
         scene,
         request.where.region(scene),
-        request.label or label_of(scene, pipeline.dit.config.label),
+        request.label or find_scene_label(scene, pipeline.dit.config.label),
         request.contents,
         request.seed,
         range(number * count, (number + 1) * count),
-        request.resampling,
+        request.repaint,
         request.guidance_scale,
     ):
-        drifts += [drift(known, raw, step.region) for known, raw in zip(step.known, step.made, strict=True)]
+        drifts += [compute_drift(known, raw, step.region) for known, raw in zip(step.known, step.made, strict=True)]
     made = [
         replace(
             canvas,
@@ -132,11 +139,11 @@ def inpaint_one(
     return made, drifts
 
 
-def made_anew(pipeline: PrITTIPipeline, scene: Scene, where: Where) -> np.ndarray:
+def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: RegionConfig) -> np.ndarray:
     """(rows, cols) pixels of a scene's region, grown to whole cells."""
     region = where.region(scene)
-    for window, part in region_blocks(pipeline, scene, region):
-        region[scene.grid.shared(window)[0]] |= part
+    for window, part in split_region(pipeline, scene, region):
+        region[scene.grid.intersect(window)[0]] |= part
     return region
 
 
@@ -149,13 +156,13 @@ class Inpainter:
 
     def __call__(self, row: dict) -> dict:
         request, shard = self.request, self.request.shard(row["id"])
-        record = storage.join(request.output, "drift", request.run, f"{row['id']:07d}.json")
+        record = storage.join_uri(request.output, "drift", request.run, f"{row['id']:07d}.json")
         if not (shard.is_written() and storage.exists(record)):
             source, position = self.chosen[row["id"]]
             made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
             for scene in made:
-                path = storage.join(request.output, "glb", request.run, f"{scene.scene_id}.glb")
-                storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
+                path = storage.join_uri(request.output, "glb", request.run, f"{scene.scene_id}.glb")
+                storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
             storage.write_json(drifts, record)
             shard.write(made)
         return {"id": row["id"], "drift": storage.read_json(record)}
@@ -163,7 +170,7 @@ class Inpainter:
 
 def inpaint_scenes(
     request: InpaintRequest,
-    selection: Selection,
+    selection: SceneSubset,
     num_actors: int = 1,
     pictures: int = 8,
     on_scene: Callable[[], None] | None = None,
@@ -175,41 +182,43 @@ def inpaint_scenes(
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
-    request.where.region(at_model_resolution(first.scenes([row])[0], pipeline.spec))  # wrong everywhere is wrong here
+    request.where.region(
+        resample_to_model_resolution(first.scenes([row])[0], pipeline.spec)
+    )  # wrong everywhere is wrong here
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
-    claim_run(
+    guard_generation_run(
         request,
         pipeline,
-        [storage.join(request.output, "drift", request.run)],
+        [storage.join_uri(request.output, "drift", request.run)],
         input=asdict(selection),
         scenes=selection.files(),
     )
     drifts = []
-    for row in fan_out(range(len(chosen)), Inpainter, (request, chosen), num_actors):
+    for row in map_actors(range(len(chosen)), Inpainter, (request, chosen), num_actors):
         drifts += row["drift"]
         if on_scene:
             on_scene()
-    scores = drift_scores(drifts)
+    scores = compute_drift_scores(drifts)
     shown = []
     for number, (source, position) in enumerate(chosen[:pictures]):
-        given = at_model_resolution(source.scenes([position])[0], pipeline.spec)
-        new = made_anew(pipeline, given, request.where)
+        given = resample_to_model_resolution(source.scenes([position])[0], pipeline.spec)
+        new = find_regenerated_pixels(pipeline, given, request.where)
         made = request.shard(number).scenes()[: PER_ROW - 1]
-        shown.append(Picture(given.scene_id, outlined_picture(given, new, PICTURE_PX), "given"))
-        shown += [Picture(scene.scene_id, outlined_picture(scene, new, PICTURE_PX), "made anew") for scene in made]
+        shown.append(Picture(given.scene_id, render_outlined_bev(given, new, PICTURE_PX), "given"))
+        shown += [Picture(scene.scene_id, render_outlined_bev(scene, new, PICTURE_PX), "made anew") for scene in made]
     columns = min(PER_ROW, 1 + request.variants)
-    note = f"Inside the red line {described(request.contents)} made anew; the rest is the given scene's."
+    note = f"Inside the red line {describe_contents(request.contents)} made anew; the rest is the given scene's."
     how = (
         "The latent outside the region is the given scene's, bit for bit, but decoders see all of it: the table says how "
         "far their raw output is off there. The scenes above and in the tables take that part from the given scene."
     )
     table = Table("Drift outside the region", tuple(scores), [tuple(scores.values())], note=how)
-    html = report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
-    page = storage.join(request.output, f"{request.run}.html")
+    html = render_report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
+    page = storage.join_uri(request.output, f"{request.run}.html")
     storage.write_text(html, page)
     return scores
 
 
-def described(contents: Contents) -> str:
+def describe_contents(contents: Contents) -> str:
     return {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}[contents]

@@ -1,4 +1,4 @@
-"""Scenes -> larger scenes: blocks as Ray tasks, each as soon as those that it must know are made."""
+"""Scenes -> larger scenes: blocks as Ray tasks, each as soon as the blocks that it depends on are done."""
 
 from __future__ import annotations
 
@@ -12,18 +12,33 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from models.composition.outpaint import Block, Lattice, Place, World, colour, height_near, outward
-from models.pipeline import Resampling
+from models.composition.outpaint import (
+    BlockComposer,
+    BlockGrid,
+    BlockIndex,
+    SceneBlock,
+    find_ground_height,
+    generate_blocks,
+    rank_four_colors,
+    rank_outward,
+)
+from models.sampling.repaint import RePaintConfig
 from models.scene import Scene
-from models.tensors import new_scene
-from pipelines.generation.sample import Request, claim_run, label_of, load_pipeline, on_model_grid
-from pipelines.io.mesh_export import scene_glb
+from models.tensors import make_empty_scene
+from pipelines.generation.sample import (
+    Request,
+    find_scene_label,
+    guard_generation_run,
+    load_pipeline,
+    resample_to_model_grid,
+)
+from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import gpus_per_actor
-from pipelines.schema.scene_subset import Selection
+from pipelines.runtime.ray_tasks import count_gpus_per_actor
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
-RANKS = {"outward": outward, "colours": colour}
+RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
 HARDLY_KNOWN = 0.1  # share of ground in what a block knew beforehand
 MAX_RETRIES = 3  # of a block whose process died
@@ -31,58 +46,60 @@ MAX_RETRIES = 3  # of a block whose process died
 
 @dataclass(frozen=True)
 class OutpaintRequest(Request):
-    """How to extend scenes; `label` None means each scene's own. `last`: blocks ahead, behind, left, right."""
+    """How to extend scenes; `label` None means each scene's own. `num_blocks`: ahead, behind, left, right."""
 
     label: str | None
     seed: int
     overlap: float
     mode: str
-    resampling: Resampling
+    repaint: RePaintConfig
     guidance_scale: float
-    last: tuple[int, int, int, int] = (1, 1, 1, 1)
+    num_blocks: tuple[int, int, int, int] = (1, 1, 1, 1)
     order: str = "outward"
     batch_size: int = 4
 
     def scene_id(self, number: int) -> str:
         return f"{self.source}-{self.seed}-{number:07d}"
 
-    def blocks(self, number: int) -> str:
-        """Directory of a scene's blocks, until they are put together."""
-        return storage.join(self.output, "blocks", self.run, f"{number:07d}")
+    def blocks_directory(self, number: int) -> str:
+        """Directory of a scene's blocks, until they are stitched together."""
+        return storage.join_uri(self.output, "blocks", self.run, f"{number:07d}")
 
-    def lattice(self, size: int) -> Lattice:
-        return Lattice.of(size, self.overlap, rank=RANKS[self.order], last=self.last)
+    def make_block_grid(self, size: int) -> BlockGrid:
+        """Blocks of `size` latent cells."""
+        return BlockGrid.from_overlap(size, self.overlap, rank=RANKS[self.order], num_blocks=self.num_blocks)
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Blocks of a scene to be made together, and those that must be made before."""
+class BlockBatch:
+    """Blocks of a scene to generate in one batch, and the blocks that they depend on."""
 
     number: int  # of the scene
-    places: tuple[Place, ...]
-    needs: frozenset[Place]
+    indices: tuple[BlockIndex, ...]
+    needs: frozenset[BlockIndex]
 
 
-def batches(lattice: Lattice, number: int, batch_size: int) -> list[Batch]:
-    """All blocks of a scene but the given one, in an order that can be worked off; always the same batches."""
-    made = []
-    for front in lattice.fronts(place for place in lattice.places() if place != (0, 0)):
-        for start in range(0, len(front), batch_size):
-            places = tuple(front[start : start + batch_size])
-            needs = frozenset(other for place in places for other, _ in lattice.known(place)) - {(0, 0)}
-            made.append(Batch(number, places, needs))
-    return made
+def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[BlockBatch]:
+    """List all blocks of a scene but the given one, in an order that respects dependencies; always the same batches."""
+    listed = []
+    for group in block_grid.group_by_rank(index for index in block_grid.indices() if index != (0, 0)):
+        for start in range(0, len(group), batch_size):
+            indices = tuple(group[start : start + batch_size])
+            needs = frozenset(other for index in indices for other, _ in block_grid.known_cells(index)) - {(0, 0)}
+            listed.append(BlockBatch(number, indices, needs))
+    return listed
 
 
 # ------------------------------------------------------------------------------------------------------------ blocks
 
 
-def block_path(directory: str, place: Place) -> str:
-    return storage.join(directory, f"{place[0]:+05d}{place[1]:+05d}.safetensors")
+def make_block_path(directory: str, index: BlockIndex) -> str:
+    """Path of a block's file."""
+    return storage.join_uri(directory, f"{index[0]:+05d}{index[1]:+05d}.safetensors")
 
 
-def write_block(block: Block, path: str) -> None:
-    """Exactly, unlike the tables: a run that was interrupted goes on as if it had not been."""
+def write_block(block: SceneBlock, path: str) -> None:
+    """Write a block exactly, unlike the tables, so that a resumed run yields the same scene."""
     arrays = {name: torch.from_numpy(getattr(block.scene, name).copy()) for name in ARRAYS}
     arrays |= {"latent": block.latent.cpu().contiguous()}
     arrays |= {"of_block": torch.tensor([block.datum_m, block.known_ground], dtype=torch.float64)}
@@ -90,7 +107,7 @@ def write_block(block: Block, path: str) -> None:
     storage.write_whole(path, lambda stream: stream.write(data))
 
 
-def read_block(path: str, empty: Scene) -> Block:
+def read_block(path: str, empty: Scene) -> SceneBlock:
     """Raises ValueError naming a file that is missing or damaged."""
     try:
         arrays = load(storage.read_bytes(path))
@@ -104,156 +121,186 @@ def read_block(path: str, empty: Scene) -> Block:
         label=None,
         **{name: value.numpy() for name, value in arrays.items()},
     )
-    return Block(scene, latent, datum_m, known_ground)
+    return SceneBlock(scene, latent, datum_m, known_ground)
 
 
 class Outpainter:
-    """Actor with a pipeline: makes blocks, and puts a scene's blocks together."""
+    """Actor with a pipeline: generates blocks and stitches a scene's blocks together."""
 
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
         self.pipeline = load_pipeline(request.model)
 
     @cached_property
-    def lattice(self) -> Lattice:
-        return self.request.lattice(self.pipeline.lvae.latent_shape[-1])
+    def block_grid(self) -> BlockGrid:
+        return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
-    def given(self, number: int) -> Scene:
+    def load_scene(self, number: int) -> Scene:
+        """The given scene on the model's grid."""
         shard, row = self.chosen[number]
-        return on_model_grid(shard.scenes([row])[0], self.pipeline.spec)
+        return resample_to_model_grid(shard.scenes([row])[0], self.pipeline.spec)
 
-    def world(self, number: int, places: Sequence[Place]) -> tuple[World, Scene, dict[Place, Block]]:
-        """A scene's world, the given scene, and its blocks at `places`; the given one is among them."""
-        given = self.given(number)
-        empty = new_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
-        made = {place: read_block(block_path(self.request.blocks(number), place), empty) for place in places}
-        made[(0, 0)] = Block(given, self.pipeline.encode([given])[0])
-        world = World(self.lattice, self.pipeline.spec, self.pipeline.encode, height_near(given, 0.0, 0.0))
-        return world, given, made
+    def load_blocks(
+        self, number: int, indices: Sequence[BlockIndex]
+    ) -> tuple[BlockComposer, Scene, dict[BlockIndex, SceneBlock]]:
+        """A scene's composer, the given scene, and its generated blocks `indices` together with the given one."""
+        given = self.load_scene(number)
+        empty = make_empty_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
+        directory = self.request.blocks_directory(number)
+        blocks = {index: read_block(make_block_path(directory, index), empty) for index in indices}
+        blocks[(0, 0)] = SceneBlock(given, self.pipeline.encode([given])[0])
+        composer = BlockComposer(
+            self.block_grid, self.pipeline.spec, self.pipeline.encode, find_ground_height(given, 0.0, 0.0)
+        )
+        return composer, given, blocks
 
-    def extend(self, batch: Batch) -> None:
-        """Make the blocks of a batch and write each."""
+    def generate(self, batch: BlockBatch) -> None:
+        """Generate the blocks of a batch and write each."""
         request = self.request
-        world, given, known = self.world(batch.number, sorted(batch.needs))
-        made = self.pipeline.extend(
-            world,
-            batch.places,
+        composer, given, known = self.load_blocks(batch.number, sorted(batch.needs))
+        blocks = generate_blocks(
+            self.pipeline,
+            composer,
+            batch.indices,
             known,
             given,
-            request.label or label_of(given, self.pipeline.dit.config.label),
+            request.label or find_scene_label(given, self.pipeline.dit.config.label),
             request.seed,
             batch.number,
             request.mode,
-            request.resampling,
+            request.repaint,
             request.guidance_scale,
         )
-        for place, block in made.items():
-            write_block(block, block_path(request.blocks(batch.number), place))
+        for index, block in blocks.items():
+            write_block(block, make_block_path(request.blocks_directory(batch.number), index))
 
     def finish(self, number: int) -> None:
         """Write a scene's tables and GLB from its blocks, and a table of the blocks; delete their files."""
         request = self.request
-        world, given, made = self.world(number, [place for place in self.lattice.places() if place != (0, 0)])
+        composer, given, blocks = self.load_blocks(
+            number, [index for index in self.block_grid.indices() if index != (0, 0)]
+        )
         name = request.scene_id(number)
         scene = replace(
-            world.stitched(made, given), scene_id=name, source=request.source, split="generated", frame=number
+            composer.stitch(blocks, given), scene_id=name, source=request.source, split="generated", frame=number
         )
-        path = storage.join(request.output, "glb", request.run, f"{name}.glb")
-        storage.write_whole(path, lambda stream: stream.write(scene_glb(scene)))
+        path = storage.join_uri(request.output, "glb", request.run, f"{name}.glb")
+        storage.write_whole(path, lambda stream: stream.write(export_glb(scene)))
         rows = [
             {"scene_id": name, "ahead": i, "left": j, "datum_m": block.datum_m, "known_ground": block.known_ground}
-            for (i, j), block in sorted(made.items())
+            for (i, j), block in sorted(blocks.items())
         ]
-        storage.write_parquet(pa.Table.from_pylist(rows), blocks_table(request, number))
+        storage.write_parquet(pa.Table.from_pylist(rows), make_blocks_table_path(request, number))
         request.shard(number).write([scene])
-        storage.delete_directory(request.blocks(number))
+        storage.delete_directory(request.blocks_directory(number))
 
 
-def blocks_table(request: OutpaintRequest, number: int) -> str:
-    return storage.join(request.output, "block_tables", request.run, f"{number:07d}.parquet")
+def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
+    return storage.join_uri(request.output, "block_tables", request.run, f"{number:07d}.parquet")
 
 
 # --------------------------------------------------------------------------------------------------------------- run
 
 
 def outpaint_scenes(
-    request: OutpaintRequest, selection: Selection, num_actors: int = 1, on_blocks: Callable[[int], None] | None = None
+    request: OutpaintRequest,
+    selection: SceneSubset,
+    num_actors: int = 1,
+    on_blocks: Callable[[int], None] | None = None,
 ) -> pa.Table:
-    """Extend the selected scenes; a row per block. Goes on where it stopped. `on_blocks` gets how many more are made.
+    """Extend the selected scenes; an interrupted run resumes.
 
-    Raises ValueError if the output holds a run made with other options.
+    Args:
+        request: How to extend them.
+        selection: The scenes.
+        num_actors: Number of pipelines that generate concurrently.
+        on_blocks: Called with the number of blocks finished since the last call.
+
+    Returns:
+        A table with a row per block.
+
+    Raises:
+        ValueError: The output holds a run made with other options.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
-    lattice = request.lattice(pipeline.lvae.latent_shape[-1])
-    parts = [storage.join(request.output, "blocks", request.run)]
-    claim_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
+    block_grid = request.make_block_grid(pipeline.latent_shape[-1])
+    parts = [storage.join_uri(request.output, "blocks", request.run)]
+    guard_generation_run(request, pipeline, parts, input=asdict(selection), scenes=selection.files())
 
     waiting, done = [], {}
     for number in range(len(chosen)):
         if request.shard(number).is_written():
             continue
-        there = {place for place in lattice.places() if storage.exists(block_path(request.blocks(number), place))}
+        directory = request.blocks_directory(number)
+        there = {index for index in block_grid.indices() if storage.exists(make_block_path(directory, index))}
         done[number] = there
-        waiting += [b for b in batches(lattice, number, request.batch_size) if not there.issuperset(b.places)]
+        waiting += [b for b in list_batches(block_grid, number, request.batch_size) if not there.issuperset(b.indices)]
     if on_blocks:
-        per_scene = len(lattice.places()) - 1
-        on_blocks(per_scene * len(chosen) - sum(len(batch.places) for batch in waiting))
+        per_scene = len(block_grid.indices()) - 1
+        on_blocks(per_scene * len(chosen) - sum(len(batch.indices) for batch in waiting))
     if done:
-        work_off(request, chosen, waiting, done, num_actors, on_blocks)
-    return pa.concat_tables(storage.read_parquet(blocks_table(request, number)) for number in range(len(chosen)))
+        run_batches(request, chosen, waiting, done, num_actors, on_blocks)
+    return pa.concat_tables(
+        storage.read_parquet(make_blocks_table_path(request, number)) for number in range(len(chosen))
+    )
 
 
-def work_off(
+def run_batches(
     request: OutpaintRequest,
     chosen: list[tuple[Shard, int]],
-    waiting: list[Batch],
-    done: dict[int, set[Place]],
+    waiting: list[BlockBatch],
+    done: dict[int, set[BlockIndex]],
     num_actors: int,
     on_blocks: Callable[[int], None] | None,
 ) -> None:
-    """Hand batches to idle actors as soon as what they need is made, and each scene that is whole to be put together."""
+    """Start actors and give them batches as soon as the blocks that they depend on are done."""
     actor = ray.remote(Outpainter).options(
-        num_cpus=1, num_gpus=gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
+        num_cpus=1, num_gpus=count_gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
-    room = int(ray.cluster_resources().get("GPU" if gpus_per_actor() else "CPU", 0))
+    room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
     count = min(num_actors, max(len(waiting), len(done)), max(1, room))  # one without room would take a killed one's
     workers = [actor.remote(request, chosen) for _ in range(count)]
     try:
-        hand_out(workers, waiting, done, on_blocks)
+        schedule_batches(workers, waiting, done, on_blocks)
     finally:  # an error's traceback would keep them, and their CPUs, alive
         for worker in workers:
             ray.kill(worker)
 
 
-def hand_out(
-    workers: list, waiting: list[Batch], done: dict[int, set[Place]], on_blocks: Callable[[int], None] | None
+def schedule_batches(
+    workers: list, waiting: list[BlockBatch], done: dict[int, set[BlockIndex]], on_blocks: Callable[[int], None] | None
 ) -> None:
-    """Until nothing is left to do. An actor works from when it is up: others may have taken its room."""
+    """Give each idle actor a batch, or a scene to stitch, until nothing is left.
+
+    An actor takes part from the moment it is ready: others may have taken its CPU.
+    """
     idle: list = []
     running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
     left = {number: sum(batch.number == number for batch in waiting) for number in done}
     whole = [number for number, batches_left in left.items() if not batches_left]
     while waiting or whole or any(task is not None for task, _ in running.values()):
-        while idle and (task := next_task(waiting, whole, done)) is not None:
+        while idle and (task := pop_ready_task(waiting, whole, done)) is not None:
             worker = idle.pop()
-            call = worker.extend if isinstance(task, Batch) else worker.finish
+            call = worker.generate if isinstance(task, BlockBatch) else worker.finish
             running[call.remote(task)] = task, worker
         (finished,), _ = ray.wait(list(running), num_returns=1)
         task, worker = running.pop(finished)
         ray.get(finished)
         idle.append(worker)
-        if isinstance(task, Batch):
-            done[task.number].update(task.places)
+        if isinstance(task, BlockBatch):
+            done[task.number].update(task.indices)
             left[task.number] -= 1
             if not left[task.number]:
                 whole.append(task.number)
             if on_blocks:
-                on_blocks(len(task.places))
+                on_blocks(len(task.indices))
 
 
-def next_task(waiting: list[Batch], whole: list[int], done: Mapping[int, set[Place]]) -> Batch | int | None:
-    """Takes the first task that can be done now out of its list."""
+def pop_ready_task(
+    waiting: list[BlockBatch], whole: list[int], done: Mapping[int, set[BlockIndex]]
+) -> BlockBatch | int | None:
+    """Remove and return the first task whose dependencies are done."""
     if whole:
         return whole.pop(0)
     for position, batch in enumerate(waiting):

@@ -9,20 +9,19 @@ from itertools import chain
 
 import numpy as np
 import torch
-from diffusers.utils.logging import disable_progress_bar
 
 from models.labels import LABELS, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import Grid, Scene
-from models.tensors import ground_on_grid
+from models.tensors import resample_scene_ground
 from pipelines.editing.edit import Repair
-from pipelines.metrics.validity import slab_offset_m
+from pipelines.metrics.validity import find_slab_offset_m
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import fan_out
-from pipelines.schema.run_guard import claim
+from pipelines.runtime.ray_tasks import map_actors
+from pipelines.schema.run_guard import guard_run
 from pipelines.schema.tables import Shard
-from pipelines.training.latents import weights_digest
+from pipelines.training.latents import digest_weights
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ class SampleRequest(Request):
 
 def load_pipeline(directory: str) -> PrITTIPipeline:
     """Raises ValueError if the directory holds no complete pipeline."""
-    disable_progress_bar()  # of three files
     try:
         pipeline = PrITTIPipeline.from_pretrained(directory)
     except (OSError, ValueError, TypeError, AttributeError) as error:
@@ -75,36 +73,36 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
     return pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def claim_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
+def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
     """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
-    options = asdict(request) | also | {"weights": f"{weights_digest(pipeline.lvae)}-{weights_digest(pipeline.dit)}"}
+    options = asdict(request) | also | {"weights": f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"}
     del options["model"]  # the same weights in another directory are the same model
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
-    if not options.get("repair"):  # runs of before it could be asked for go on
+    if not options.get("repair"):  # absent in the records of earlier versions
         options.pop("repair", None)
-    if "resampling" in options and options["resampling"]["eta"] != 1:  # then the pipeline's own scaling matters
+    if "repaint" in options and options["repaint"]["eta"] != 1:  # the noise scaling is used
         options["noise_scaling"] = pipeline.config.noise_scaling
-    claim(options.pop("output"), request.source, request.run, options, parts)
+    guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 
-def on_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
+def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
     """The scene with the model's ground classes, on the model's grid or another that covers the same ground."""
     grid = grid or spec.grid
-    height, occupied = ground_on_grid(scene, spec.ground_classes, grid)
+    height, occupied = resample_scene_ground(scene, spec.ground_classes, grid)
     return replace(scene, ground_classes=spec.ground_classes, grid=grid, height_m=height, occupied=occupied)
 
 
-def at_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
+def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
     """The scene with the model's ground classes and resolution, over all the ground that it covers.
 
     Raises ValueError for a resolution that does not divide by the model's, nor the other way about.
     """
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
-    return on_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
+    return resample_to_model_grid(scene, spec, replace(own, resolution_m=wanted_m, **sides))
 
 
-def label_of(scene: Scene, kind: str) -> str:
+def find_scene_label(scene: Scene, kind: str) -> str:
     """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
     names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
     names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
@@ -122,7 +120,7 @@ class Sampler:
         self.request, self.batch_size = request, batch_size
         self.pipeline = load_pipeline(request.model)
         self.pipeline.use_sampler(request.sampler)
-        self.repair = Repair(slab_offset_m=slab_offset_m(self.pipeline.spec.surface), drop=False)
+        self.repair = Repair(slab_offset_m=find_slab_offset_m(self.pipeline.spec.surface), drop=False)
 
     def __call__(self, row: dict) -> dict:
         request, started = self.request, time.perf_counter()
@@ -142,7 +140,7 @@ class Sampler:
                 run=request.run,
             )
         if request.repair:
-            scenes = [self.repair.applied(scene, np.ones(len(scene), bool))[0] for scene in scenes]
+            scenes = [self.repair.apply_to(scene, np.ones(len(scene), bool))[0] for scene in scenes]
         shard.write(scenes)
         return {"id": shard.number, "scenes": len(indices), "seconds": time.perf_counter() - started}
 
@@ -159,10 +157,10 @@ def sample_scenes(
     pipeline.use_sampler(request.sampler)
     request = replace(
         request,
-        noise_scaling=pipeline.scaling(request.noise_scaling),
-        existence_threshold=pipeline.threshold(request.existence_threshold),
+        noise_scaling=pipeline.resolve_noise_scaling(request.noise_scaling),
+        existence_threshold=pipeline.resolve_existence_threshold(request.existence_threshold),
     )
-    claim_run(request, pipeline)
+    guard_generation_run(request, pipeline)
     for shard in request.shards()[:1]:
         for table in ("scenes", "primitives", "rasters"):
             storage.clean_temporaries(shard.path(table).rsplit("/", 1)[0])
@@ -171,7 +169,7 @@ def sample_scenes(
     written = [shard for shard in shards if shard.number not in missing]
     rows = ({"id": shard.number, "scenes": len(request.indices(shard)), "seconds": 0.0} for shard in written)
     total = 0
-    for row in chain(rows, fan_out(missing, Sampler, (request, batch_size), num_actors)):
+    for row in chain(rows, map_actors(missing, Sampler, (request, batch_size), num_actors)):
         total += row["scenes"]
         if on_shard:
             on_shard(row)

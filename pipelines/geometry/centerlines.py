@@ -58,26 +58,26 @@ class RoadNetwork:
         return [r for road in self.roads for r in (road, road.reversed()) if r.start == node]
 
 
-def road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
+def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
     """The centrelines of a scene's roads, points about spacing_m apart; no roads where there is no road class."""
-    mask = _mask(scene)
+    mask = _make_road_mask(scene)
     margin = round(MARGIN_M / CELL_M)
     wide = np.pad(mask, margin, mode="edge")
     half_m = ndimage.distance_transform_edt(wide) * CELL_M
-    graph = _graph(skeletonize(wide))
+    graph = _trace_graph(skeletonize(wide))
     _prune(graph, half_m, margin)
     _unite_close_nodes(graph, half_m)
-    height_m = _height(scene, mask.shape)
+    height_m = _interpolate_height(scene, mask.shape)
 
     roads, ends = [], []
     for u, v, path in graph.edges(data="path"):
         path = path - margin
-        for inside, first, last in _inside(_smooth(path, SMOOTH_M / CELL_M), mask.shape):
+        for inside, first, last in _find_inside(_smooth(path, SMOOTH_M / CELL_M), mask.shape):
             if len(inside) * CELL_M < LEAST_M:
                 continue
-            line = inside if first else _leaving_straight(inside[::-1], half_m, margin)[::-1]
-            line = line if last else _leaving_straight(line, half_m, margin)
-            line = _resampled(line, spacing_m / CELL_M)
+            line = inside if first else _straighten_ends(inside[::-1], half_m, margin)[::-1]
+            line = line if last else _straighten_ends(line, half_m, margin)
+            line = _resample_line(line, spacing_m / CELL_M)
             x_m = scene.grid.front_m - (line[:, 0] + 0.5) * CELL_M
             y_m = scene.grid.left_m - (line[:, 1] + 0.5) * CELL_M
             z_m = _smooth(ndimage.map_coordinates(height_m, line.T, order=1, mode="nearest"), SMOOTH_M / spacing_m)
@@ -92,18 +92,18 @@ def road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
     return replace(network, nodes_m=np.reshape(meeting, (-1, 3)))
 
 
-def _mask(scene: Scene) -> np.ndarray:
+def _make_road_mask(scene: Scene) -> np.ndarray:
     """(h, w) bool: where the road is, in cells of CELL_M, without small holes and islands."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
     road = scene.occupied[index].any(axis=0)
     factor = max(1, round(CELL_M / scene.grid.resolution_m))
     rows, cols = (n // factor for n in road.shape)
     cells = road[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor).mean(axis=(1, 3)) >= 0.5
-    cells = ~_large(~cells, HOLE_M2, border=True)
-    return _large(cells, ISLAND_M2)
+    cells = ~_keep_large_parts(~cells, HOLE_M2, border=True)
+    return _keep_large_parts(cells, ISLAND_M2)
 
 
-def _large(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
+def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
     """The 4-connected parts of a mask that are large enough, or, if so asked, touch its border."""
     parts, count = ndimage.label(mask)
     keep = np.bincount(parts.ravel(), minlength=count + 1) * CELL_M**2 >= area_m2
@@ -113,7 +113,7 @@ def _large(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray
     return keep[parts]
 
 
-def _graph(skeleton: np.ndarray) -> nx.MultiGraph:
+def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
     """Forks and ends as nodes (`place` (2,), row and column), the lines between them as edges (`path` (k, 2) from u to v, u < v)."""
     neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1
     forks, count = ndimage.label(skeleton & (neighbours > 2), AROUND)
@@ -123,7 +123,7 @@ def _graph(skeleton: np.ndarray) -> nx.MultiGraph:
     lines, number = ndimage.label(skeleton & (forks == 0), AROUND)
     touching = ndimage.maximum_filter(forks, size=3)
     for where, line in zip(ndimage.find_objects(lines, number), range(1, number + 1), strict=True):
-        path = _ordered(np.argwhere(lines[where] == line)) + [s.start for s in where]
+        path = _order_pixels(np.argwhere(lines[where] == line)) + [s.start for s in where]
         ends = []
         for end in (0, -1):
             fork = int(touching[tuple(path[end])])
@@ -144,7 +144,7 @@ def _join(graph: nx.MultiGraph, u: int, v: int, path: np.ndarray) -> None:
     graph.add_edge(min(u, v), max(u, v), path=path if u <= v else path[::-1])
 
 
-def _ordered(pixels: np.ndarray) -> np.ndarray:
+def _order_pixels(pixels: np.ndarray) -> np.ndarray:
     """The pixels (k, 2) of an 8-connected line without forks, from one end to the other."""
     left = {tuple(p) for p in pixels.tolist()}
 
@@ -161,11 +161,11 @@ def _ordered(pixels: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _length(path: np.ndarray) -> float:
+def _measure_length(path: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) * CELL_M
 
 
-def _half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> float:
+def _measure_half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> float:
     return float(half_m[tuple(np.round(graph.nodes[node]["place"]).astype(int))])
 
 
@@ -177,9 +177,9 @@ def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
             for end, fork in ((u, v), (v, u)):
                 row, col = graph.nodes[end]["place"]
                 inner = margin <= row < half_m.shape[0] - margin and margin <= col < half_m.shape[1] - margin
-                longest = SPUR * _half_width(graph, fork, half_m)
-                if graph.degree(end) == 1 and graph.degree(fork) > 2 and inner and _length(path) < longest:
-                    spurs.append((_length(path), end, fork, key))
+                longest = SPUR * _measure_half_width(graph, fork, half_m)
+                if graph.degree(end) == 1 and graph.degree(fork) > 2 and inner and _measure_length(path) < longest:
+                    spurs.append((_measure_length(path), end, fork, key))
         if not spurs:
             return
         _, end, _, _ = min(spurs)
@@ -207,8 +207,8 @@ def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
         close = []
         for u, v, path in graph.edges(data="path"):
             if u != v and graph.degree(u) > 2 and graph.degree(v) > 2:
-                length = _length(path)
-                if length < ONE_NODE * (_half_width(graph, u, half_m) + _half_width(graph, v, half_m)):
+                length = _measure_length(path)
+                if length < ONE_NODE * (_measure_half_width(graph, u, half_m) + _measure_half_width(graph, v, half_m)):
                     close.append((length, u, v))
         if not close:
             return
@@ -234,7 +234,7 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
     return ndimage.gaussian_filter1d(long, sigma, axis=0)[reach : reach + len(line)]
 
 
-def _inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
+def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
     """The runs of a line (k, 2) inside the scene, and whether each holds the line's first and last point."""
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
@@ -242,7 +242,7 @@ def _inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarr
         yield line[start:stop], start == 0, stop == len(line)
 
 
-def _leaving_straight(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
+def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
     """A line (k, 2) whose last point is at the scene's border: near it straight on from before.
 
     Within half a width of the border the line turns towards where the mask was made to go on.
@@ -258,14 +258,14 @@ def _leaving_straight(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.n
     return np.concatenate([line[:left], ahead[: int(outside.argmax())]]) if outside.any() else line
 
 
-def _resampled(line: np.ndarray, spacing: float) -> np.ndarray:
+def _resample_line(line: np.ndarray, spacing: float) -> np.ndarray:
     """(n, 2) points of a line, evenly spaced along it, both ends among them."""
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
     wanted = np.linspace(0, along[-1], max(2, round(along[-1] / spacing) + 1))
     return np.stack([np.interp(wanted, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
+def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
     """(h, w) height of the road in cells of CELL_M; beyond it the nearest road's."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
     known = scene.occupied[index].any(axis=0)
@@ -278,7 +278,7 @@ def _height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
     return height_m[tuple(nearest)][middle, middle][: shape[0], : shape[1]]
 
 
-def drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
+def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
     """(k, 3) a way along the roads, points as far apart as theirs, on the ground, smooth; (0, 3) where no road is.
 
     It begins at the end of a road nearest to start_m, and at each node goes on along the road that turns least and has not
@@ -295,7 +295,9 @@ def drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right
         onward = [road for road in network.leaving(here.end) if road.number not in driven]
         if not onward:
             break
-        here = max(onward, key=lambda road, last=here: float(_direction(last.reversed()) @ -_direction(road)))
+        here = max(
+            onward, key=lambda road, last=here: float(_compute_direction(last.reversed()) @ -_compute_direction(road))
+        )
         ways.append(here)
         driven.add(here.number)
     line = np.concatenate([way.xyz_m for way in ways])
@@ -310,7 +312,7 @@ def drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right
     return _smooth(line, SMOOTH_M / spacing_m)
 
 
-def _direction(road: Road) -> np.ndarray:
+def _compute_direction(road: Road) -> np.ndarray:
     """(2,) of a road's first metres, away from its start."""
     way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
     return way / np.linalg.norm(way)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.geometry.rasterize import draw, integers_between, ranges
+from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, list_integers_between
 
 FILL = 0.95  # of the picture's width or height, whichever is tighter
 ROUNDING_M = 1e-6  # far more than rounding adds to a depth
@@ -27,12 +27,12 @@ class Camera:
         return points_m @ self.camera_from_scene.T
 
 
-def looking_down(view: Grid) -> Camera:
+def make_top_camera(view: Grid) -> Camera:
     """The camera of the picture from above: its frame is the scene's."""
     return Camera(np.eye(3), view)
 
 
-def looking_at(grid: Grid, width: int, height: int, azimuth_deg: float, elevation_deg: float) -> Camera:
+def make_oblique_camera(grid: Grid, width: int, height: int, azimuth_deg: float, elevation_deg: float) -> Camera:
     """The camera that has all of the grid in a picture of width x height pixels, as large as it fits.
 
     It looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg, above 0 and at most 90.
@@ -55,7 +55,7 @@ def looking_at(grid: Grid, width: int, height: int, azimuth_deg: float, elevatio
     return Camera(camera_from_scene, Grid(front_m, left_m, resolution_m, height, width))
 
 
-def facing(corners_m: np.ndarray) -> np.ndarray:
+def find_facing_sides(corners_m: np.ndarray) -> np.ndarray:
     """Indices of the triangles (t, 3, 3), counter-clockwise from outside, whose outside is seen from +z."""
     x, y, _ = corners_m.T  # (3, t) each
     return np.flatnonzero((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]) > 1e-9)
@@ -67,24 +67,24 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
     Returns depth_m (H, W) float64, z in the camera frame, -inf where nothing is hit, and primitive (H, W)
     int64, its index in the scene, -1 for none.
     """
-    pixel, chord, chords = _chords(scene, camera)
+    pixel, chord, chords = _compute_chords(scene, camera)
     shape = camera.view.rows, camera.view.cols
     depth, primitive = np.full(shape, -np.inf), np.full(shape, -1, np.int64)
-    value = _depth_m(pixel, chord, chords, camera.view)
-    draw(pixel, chords.primitive.take(chord), value, depth.reshape(-1), primitive.reshape(-1))
+    value = _compute_depth_m(pixel, chord, chords, camera.view)
+    fill_triangles(pixel, chords.primitive.take(chord), value, depth.reshape(-1), primitive.reshape(-1))
     return depth, primitive
 
 
-def ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
+def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
     """Flat indices of the pixels where `cast_ellipsoids` has more than depth_m (H, W), some more than once.
 
     The least depth of an ellipsoid decides most of its hits; the depths of the others are worked out.
     """
-    pixel, chord, chords = _chords(scene, camera)
+    pixel, chord, chords = _compute_chords(scene, camera)
     there_m = depth_m.reshape(-1).take(pixel)
     over = chords.least_m.take(chord) > there_m
     unsure = np.flatnonzero(~over)
-    over[unsure] = _depth_m(pixel.take(unsure), chord.take(unsure), chords, camera.view) > there_m.take(unsure)
+    over[unsure] = _compute_depth_m(pixel.take(unsure), chord.take(unsure), chords, camera.view) > there_m.take(unsure)
     return pixel[over]
 
 
@@ -97,7 +97,7 @@ class _Chords(NamedTuple):
     terms: tuple[np.ndarray, ...]  # (m,) each, of `_depth_m`
 
 
-def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
+def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
     """Every pixel centre over every ellipsoid: flat pixel index and chord (k,), and the chords.
 
     With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| = 1. L is lower
@@ -112,8 +112,8 @@ def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chor
     col_middle = (view.left_m - y) / view.resolution_m - 0.5
 
     reach = lower[:, 0, 0] / view.resolution_m
-    first, count = integers_between(row_middle - reach, row_middle + reach, view.rows)
-    row, primitive = ranges(first, count), np.repeat(primitive, count)
+    first, count = list_integers_between(row_middle - reach, row_middle + reach, view.rows)
+    row, primitive = concatenate_ranges(first, count), np.repeat(primitive, count)
     least_m = z - np.hypot(lower[:, 2, 0], lower[:, 2, 1]) - ROUNDING_M
     x, y, z, col_middle, least_m, l00, _, _, l10, l11, _, l20, l21, l22 = np.repeat(
         [x, y, z, col_middle, least_m, *lower.reshape(-1, 9).T], count, axis=1
@@ -121,14 +121,14 @@ def _chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chor
     s0 = (view.x_m()[row] - x) / l00
     shift, rest = l10 * s0, 1 - s0**2
     middle, reach = col_middle - shift / view.resolution_m, l11 * np.sqrt(np.maximum(rest, 0)) / view.resolution_m
-    first, count = integers_between(middle - reach, middle + reach, view.cols)
+    first, count = list_integers_between(middle - reach, middle + reach, view.cols)
     terms = y, shift, l11, rest, z + l20 * s0, l21, l22
     row_start = row * view.cols
     chord = np.repeat(np.arange(len(count)), count)
-    return ranges(row_start + first, count), chord, _Chords(primitive, row_start, least_m, terms)
+    return concatenate_ranges(row_start + first, count), chord, _Chords(primitive, row_start, least_m, terms)
 
 
-def _depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
+def _compute_depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
     """(k,) depth of the ellipsoids at flat pixels on their chords."""
     y, shift, l11, rest, middle, l21, l22 = chords.terms
     col = pixel - chords.row_start.take(chord)

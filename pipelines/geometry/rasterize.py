@@ -15,19 +15,19 @@ EDGE_PX = 1e-7  # a centre this close to an edge is inside: abutting triangles l
 STEEP = 1e3  # metres a pixel: planes of sliver triangles, whose hits are kept within their own triangle's heights
 
 
-def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Concatenated integer ranges first[i] .. first[i] + count[i] - 1; np.repeat(x, count) is x along them."""
     return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
-def integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def list_integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The first integer in [0, size) and in [low[i], high[i]], and how many there are."""
     first = np.minimum(np.maximum(np.ceil(low), 0), size)
     count = np.maximum(np.minimum(np.floor(high) + 1, size) - first, 0)
     return first.astype(np.int64), count.astype(np.int64)
 
 
-def hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every pixel centre under every triangle (t, 3, 3), in turn: flat pixel index, owner (of (t,)) and height (m,)."""
     x, y, z = np.ascontiguousarray(triangles_m.astype(np.float64).T)  # (3, t) each
     u = (grid.front_m - x) / grid.resolution_m - 0.5
@@ -35,8 +35,8 @@ def hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.nda
     # Plane z = z0 + du (u - u0) + dv (v - v0) by Cramer's rule.
     (u1, u2), (v1, v2), (z1, z2) = [(w[1] - w[0], w[2] - w[0]) for w in (u, v, z)]
     area = u1 * v2 - u2 * v1
-    first, rows = integers_between(u.min(axis=0) - EDGE_PX, u.max(axis=0) + EDGE_PX, grid.rows)
-    _, cols = integers_between(v.min(axis=0) - EDGE_PX, v.max(axis=0) + EDGE_PX, grid.cols)
+    first, rows = list_integers_between(u.min(axis=0) - EDGE_PX, u.max(axis=0) + EDGE_PX, grid.rows)
+    _, cols = list_integers_between(v.min(axis=0) - EDGE_PX, v.max(axis=0) + EDGE_PX, grid.cols)
     index = np.flatnonzero((np.abs(area) > 1e-9) & (rows > 0) & (cols > 0))
     slope_u = (z1 * v2 - z2 * v1).take(index) / area.take(index)
     slope_v = (u1 * z2 - u2 * z1).take(index) / area.take(index)
@@ -44,10 +44,10 @@ def hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.nda
     plane = [z[0] - slope_u * u[0] - slope_v * v[0], slope_u, slope_v, z.min(axis=0), z.max(axis=0)]
 
     spans = rows.take(index)
-    row = ranges(first.take(index), spans)
-    low, high = _column_intervals(row, spans, u, v)
-    first, count = integers_between(low - EDGE_PX, high + EDGE_PX, grid.cols)
-    col = ranges(first, count)
+    row = concatenate_ranges(first.take(index), spans)
+    low, high = _find_column_intervals(row, spans, u, v)
+    first, count = list_integers_between(low - EDGE_PX, high + EDGE_PX, grid.cols)
+    col = concatenate_ranges(first, count)
     # Along a row the height is linear: start + slope_v col.
     start, along_u, along_v, lowest, highest = np.repeat(plane, spans, axis=1)
     height = np.repeat(start + along_u * row, count) + np.repeat(along_v, count) * col
@@ -56,7 +56,7 @@ def hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.nda
     return np.repeat(row * grid.cols, count) + col, np.repeat(np.repeat(owner.take(index), spans), count), height
 
 
-def _column_intervals(
+def _find_column_intervals(
     row: np.ndarray, spans: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Low and high column coordinate of triangles in pixel rows (s,); spans (t,): how many of the rows are each one's.
@@ -73,7 +73,9 @@ def _column_intervals(
     return np.where(misses, np.inf, column).min(axis=0), np.where(misses, -np.inf, column).max(axis=0)
 
 
-def draw(pixel: np.ndarray, owner: np.ndarray, value: np.ndarray, height: np.ndarray, winner: np.ndarray) -> None:
+def fill_triangles(
+    pixel: np.ndarray, owner: np.ndarray, value: np.ndarray, height: np.ndarray, winner: np.ndarray
+) -> None:
     """Draws hits (m,) over what is there, in place: each pixel keeps the highest value and its owner.
 
     Of equal values the last one wins, and any of them over what was there.
@@ -83,7 +85,7 @@ def draw(pixel: np.ndarray, owner: np.ndarray, value: np.ndarray, height: np.nda
     winner[pixel[wins]] = owner[wins]
 
 
-def cast_down(
+def cast_rays_down(
     triangles_m: np.ndarray, grid: Grid, layer: np.ndarray | None = None, num_layers: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Highest hit of a vertical ray through each pixel centre, per layer.
@@ -93,18 +95,18 @@ def cast_down(
     the index of the triangle hit, -1 for none. Of equal heights the last triangle wins. Vertical triangles cast no
     shadow and are skipped.
     """
-    pixel, triangle, value = hits(triangles_m, grid, np.arange(len(triangles_m)))
+    pixel, triangle, value = find_hits(triangles_m, grid, np.arange(len(triangles_m)))
     if layer is not None:
         pixel += np.asarray(layer, np.int64)[triangle] * (grid.rows * grid.cols)
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf)
     hit = np.full(height.shape, -1, np.int64)
-    draw(pixel, triangle, value, height.reshape(-1), hit.reshape(-1))
+    fill_triangles(pixel, triangle, value, height.reshape(-1), hit.reshape(-1))
     return height, hit
 
 
-def height_map(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
+def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
     """(num_layers, H, W) float32 of `cast_down`: the heights alone, in half the memory and less time."""
-    pixel, layer_start, value = hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
+    pixel, layer_start, value = find_hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
     np.maximum.at(height.reshape(-1), layer_start + pixel, value.astype(np.float32))
     return height
@@ -118,7 +120,7 @@ def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
     beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)  # half-open: a vertex on a row counts once
-    row, edge = ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
+    row, edge = concatenate_ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])
     col = np.ceil(crossing).clip(0, grid.cols).astype(np.int64)
     toggles = np.bincount(row * (grid.cols + 1) + col, minlength=grid.rows * (grid.cols + 1))

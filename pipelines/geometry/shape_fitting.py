@@ -11,7 +11,7 @@ SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij")).reshape(3, 8)  
 Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]  # center_m (n, 3), rotation (n, 3, 3), size_m (n, 3); not canonical
 
 
-def boxes_of_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """rotation (n, 3, 3) and size_m (n, 3) of boxes whose edge vectors are the columns of edges_m (n, 3, 3).
 
     Long edges decide first: rounding turns a short edge most, and would move the far corners of a long box. Raises
@@ -34,7 +34,7 @@ def boxes_of_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarra
     return rotation, size_m
 
 
-def boxes_of_corners(corners_m: np.ndarray) -> Shapes:
+def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
     """Boxes from their eight corners each, (n, 8, 3), in any order.
 
     Of what leads from one corner to the others, the two shortest are edges; the third edge is what they leave of the
@@ -50,12 +50,12 @@ def boxes_of_corners(corners_m: np.ndarray) -> Shapes:
     apart_m = np.linalg.norm(corners_m[:, :, None] - built_m[:, None], axis=3)
     off_m = np.maximum(apart_m.min(axis=1).max(axis=1), apart_m.min(axis=2).max(axis=1))
     _refuse(~(off_m <= FIT_M), center_m, "has eight vertices that are not the corners of a box")
-    return center_m, *boxes_of_edges(edges_m, center_m)
+    return center_m, *fit_boxes_to_edges(edges_m, center_m)
 
 
-def ellipsoids_of_points(clouds: list[np.ndarray]) -> Shapes:
+def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
     """Ellipsoids through the points of each cloud (k, 3), k >= 9. Raises ValueError where there is none."""
-    fits = [_ellipsoid(points) for points in clouds]
+    fits = [_fit_ellipsoid(points) for points in clouds]
     center_m, rotation, size_m = (
         np.array([fit[k] for fit in fits]).reshape(shape) for k, shape in enumerate([(-1, 3), (-1, 3, 3), (-1, 3)])
     )
@@ -63,7 +63,7 @@ def ellipsoids_of_points(clouds: list[np.ndarray]) -> Shapes:
     return center_m, rotation, size_m
 
 
-def _ellipsoid(points_m: np.ndarray) -> Shapes:
+def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
     """The one quadric x^T M x + 2 b^T x = 1 through the points, found where they look most like a ball."""
     mean_m = points_m.mean(axis=0)
     _, spread, axes = np.linalg.svd(points_m - mean_m, full_matrices=False)

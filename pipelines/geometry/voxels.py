@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
-from pipelines.geometry.rasterize import ranges
-from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
+from pipelines.geometry.rasterize import concatenate_ranges
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
 # Fine before coarse: a sign in a crown stays a sign, a hedge in a building is the building's.
 PRECEDENCE = (
@@ -82,16 +82,16 @@ class VoxelGrid:
         return self.bottom_m + (np.arange(self.levels) + 0.5) * self.step_m
 
 
-def voxelise(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
+def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
     """(rows, cols, levels) uint8 class ids: rows and columns as in the rasters, levels upwards."""
     rows, cols, levels = voxels.shape
     below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # the bits below level k
     place = np.empty(len(CATEGORIES), np.int64)
     place[[CATEGORY_INDEX[name] for name in PRECEDENCE]] = np.arange(len(PRECEDENCE))
     filled = np.zeros((len(PRECEDENCE), rows * cols), np.uint64)
-    for part in _parts(scene, voxels):
-        for runs in (_box_runs(part, voxels), _ellipsoid_runs(part, voxels)):
-            first, beyond = _levels(runs.low_m, runs.high_m, voxels)
+    for part in _split_parts(scene, voxels):
+        for runs in (_compute_box_runs(part, voxels), _compute_ellipsoid_runs(part, voxels)):
+            first, beyond = _find_levels(runs.low_m, runs.high_m, voxels)
             layer = (place * rows * cols)[part.category].take(runs.primitive)
             np.bitwise_or.at(filled.reshape(-1), layer + runs.column, below.take(beyond) & ~below.take(first))
 
@@ -100,12 +100,12 @@ def voxelise(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
     for column, name in zip(filled, PRECEDENCE, strict=True):
         _set_class(planes, column & ~taken, int(CATEGORY_IDS[CATEGORY_INDEX[name]]))
         taken |= column
-    surface_m, class_id = _ground(scene, voxels)
+    surface_m, class_id = _voxelize_ground(scene, voxels)
     inside = (surface_m >= voxels.bottom_m) & (surface_m < voxels.top_m)
     level = np.where(inside, (surface_m - voxels.bottom_m) / voxels.step_m, 0).astype(np.int64).clip(0, levels - 1)
     column = np.where(inside, below[level + 1] ^ below[level], np.uint64(0)) & ~taken
     _set_class(planes, column, class_id)
-    return _unpacked(planes, levels).reshape(voxels.shape)
+    return _unpack_grid(planes, levels).reshape(voxels.shape)
 
 
 def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | int) -> None:
@@ -118,7 +118,7 @@ def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | in
             plane |= column
 
 
-def _unpacked(planes: np.ndarray, levels: int) -> np.ndarray:
+def _unpack_grid(planes: np.ndarray, levels: int) -> np.ndarray:
     """(columns, levels) uint8 from bit planes (bits, columns)."""
     out = np.zeros((planes.shape[1], levels), np.uint8)
     for bit, plane in enumerate(planes):
@@ -127,14 +127,14 @@ def _unpacked(planes: np.ndarray, levels: int) -> np.ndarray:
     return out
 
 
-def _levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def _find_levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """First level with its centre in [low, high] and the one beyond the last; equal where there is none."""
     first = np.ceil((low_m - EDGE_M - voxels.bottom_m) / voxels.step_m - 0.5).clip(0, voxels.levels)
     beyond = np.floor((high_m + EDGE_M - voxels.bottom_m) / voxels.step_m + 0.5).clip(0, voxels.levels)
     return first.astype(np.int8), np.maximum(first, beyond).astype(np.int8)
 
 
-def _ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """(columns,) height of the fused surface under each column's centre, NaN where there is none, and its class id."""
     grid = voxels.columns
     row, col = scene.grid.pixel(grid.x_m(), grid.y_m())
@@ -142,7 +142,7 @@ def _ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     pixels = np.ix_(row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1))
     surface_m, winner = (part[pixels].reshape(-1) for part in scene.surface())
     surface_m = np.where((winner >= 0) & within.reshape(-1), surface_m.astype(np.float64), np.nan)
-    return surface_m, ground_ids(scene).take(winner, mode="wrap")
+    return surface_m, list_ground_ids(scene).take(winner, mode="wrap")
 
 
 # ------------------------------------------------------------------------------------- vertical lines and primitives
@@ -157,7 +157,7 @@ class _Runs(NamedTuple):
     high_m: np.ndarray  # (m,)
 
 
-def _parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
+def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
     """The scene in parts of about PART_COLUMNS columns under primitives: what an untrained model says is large."""
     step_m = voxels.columns.resolution_m
     shadow_px = (np.abs(scene.rotation[:, :2]) @ scene.size_m[:, :, None])[..., 0] / step_m + 1
@@ -167,7 +167,7 @@ def _parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
         yield scene.select(index)
 
 
-def _pixels(
+def _list_pixels(
     middle_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, first_m: float, step_m: float, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels along an axis whose centres lie in [middle + low, middle + high], and the index of the interval of each.
@@ -178,10 +178,10 @@ def _pixels(
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
     beyond = (np.floor(at - (low_m - EDGE_M) / step_m) + 1).clip(0, count).astype(np.int64)
     count = (beyond - first).clip(0)
-    return ranges(first, count), np.repeat(np.arange(len(count)), count)
+    return concatenate_ranges(first, count), np.repeat(np.arange(len(count)), count)
 
 
-def _box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
+def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     """Runs of all boxes: over a column of its shadow, a box is what its three slabs have in common."""
     grid, chosen = voxels.columns, np.flatnonzero(scene.category != ELLIPSOID)
     center_m, rotation = scene.center_m[chosen].astype(np.float64), scene.rotation[chosen].astype(np.float64)
@@ -189,10 +189,10 @@ def _box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     edges_m = np.swapaxes(rotation[:, :2] * half_m[:, None], 1, 2)  # (n, 3, 2): half edges seen from above
     reach_m = np.abs(edges_m[:, :, 0]).sum(axis=1)
 
-    row, box = _pixels(center_m[:, 0], -reach_m, reach_m, grid.front_m, grid.resolution_m, grid.rows)
+    row, box = _list_pixels(center_m[:, 0], -reach_m, reach_m, grid.front_m, grid.resolution_m, grid.rows)
     dx = grid.x_m()[row] - center_m[box, 0]
-    low_m, high_m = _across_shadow(edges_m, box, dx)
-    col, span = _pixels(center_m[box, 1], low_m, high_m, grid.left_m, grid.resolution_m, grid.cols)
+    low_m, high_m = _list_shadow_pixels(edges_m, box, dx)
+    col, span = _list_pixels(center_m[box, 1], low_m, high_m, grid.left_m, grid.resolution_m, grid.cols)
     dy = grid.y_m()[col] - center_m[box, 1].take(span)
 
     # Slab j holds z within center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j|. Where R_2j is 0, it says no more
@@ -210,7 +210,7 @@ def _box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     return _Runs(row[span] * np.int32(grid.cols) + col, chosen[box].take(span), low_m, high_m)
 
 
-def _across_shadow(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends in y of the shadow of box[i] at dx_m[i] from its centre, (m,) both, relative to the centre.
 
     The shadow of a box with half edges (n, 3, 2) is a hexagon that is its own mirror image in the centre. Its upper
@@ -231,7 +231,7 @@ def _across_shadow(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tu
     return -upper(-dx_m), upper(dx_m)
 
 
-def _ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
+def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     """Runs of all ellipsoids.
 
     With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| <= 1. L is lower triangular:
@@ -243,10 +243,10 @@ def _ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     lower = np.linalg.cholesky(half @ np.swapaxes(half, 1, 2))
 
     reach_m = lower[:, 0, 0]
-    row, one = _pixels(center_m[:, 0], -reach_m, reach_m, grid.front_m, grid.resolution_m, grid.rows)
+    row, one = _list_pixels(center_m[:, 0], -reach_m, reach_m, grid.front_m, grid.resolution_m, grid.rows)
     s0 = ((grid.x_m()[row] - center_m[one, 0]) / reach_m[one]).clip(-1, 1)
     middle_m, reach_m = lower[one, 1, 0] * s0, lower[one, 1, 1] * np.sqrt(1 - s0**2)
-    col, span = _pixels(
+    col, span = _list_pixels(
         center_m[one, 1], middle_m - reach_m, middle_m + reach_m, grid.left_m, grid.resolution_m, grid.cols
     )
     one, row, s0 = one.take(span), row.take(span), s0.take(span)
@@ -260,7 +260,7 @@ def _ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 
 @dataclass(frozen=True)
-class Outside:
+class OutsideCounts:
     """What lies above or below a voxel grid, in counts that add up over scenes."""
 
     ground: np.ndarray  # (2,) int64: pixels with ground, of these the ones outside
@@ -268,13 +268,13 @@ class Outside:
         np.ndarray
     )  # (11, 3) int64: primitives per category, of these those partly or wholly and those wholly outside
 
-    def __add__(self, other: Outside) -> Outside:
-        return Outside(self.ground + other.ground, self.objects + other.objects)
+    def __add__(self, other: OutsideCounts) -> OutsideCounts:
+        return OutsideCounts(self.ground + other.ground, self.objects + other.objects)
 
 
-def outside(scene: Scene, voxels: VoxelGrid) -> Outside:
+def count_outside(scene: Scene, voxels: VoxelGrid) -> OutsideCounts:
     """Columns with ground and primitives of one scene beyond the range in z."""
-    surface_m, _ = _ground(scene, voxels)
+    surface_m, _ = _voxelize_ground(scene, voxels)
     known = np.isfinite(surface_m)
     beyond = known & ((surface_m < voxels.bottom_m) | (surface_m >= voxels.top_m))
     half_m = np.abs(scene.rotation[:, 2]).astype(np.float64) * scene.size_m / 2  # of each axis along z
@@ -283,4 +283,4 @@ def outside(scene: Scene, voxels: VoxelGrid) -> Outside:
     partly = (low_m < voxels.bottom_m) | (high_m > voxels.top_m)
     wholly = (high_m < voxels.bottom_m) | (low_m > voxels.top_m)
     counts = [np.bincount(scene.category[mask], minlength=len(CATEGORIES)) for mask in (partly | True, partly, wholly)]
-    return Outside(np.array([known.sum(), beyond.sum()]), np.stack(counts, axis=1))
+    return OutsideCounts(np.array([known.sum(), beyond.sum()]), np.stack(counts, axis=1))

@@ -6,25 +6,25 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 from models.scene import Scene
-from pipelines.io.mesh_export import scene_glb, scene_ply
-from pipelines.io.opendrive import scene_opendrive
-from pipelines.io.voxel_import import scene_voxels_npz
+from pipelines.io.mesh_export import export_glb, export_ply
+from pipelines.io.opendrive import export_opendrive
+from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import numbered, per_row
-from pipelines.schema.scene_subset import Selection
-from pipelines.schema.tables import Shard, rejects_table
+from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
+from pipelines.schema.scene_subset import SceneSubset
+from pipelines.schema.tables import Shard, make_rejects_table
 
 Format = Literal["glb", "ply", "npz", "xodr"]
 WRITERS: dict[str, Callable[[Scene], bytes]] = {
-    "glb": scene_glb,
-    "ply": scene_ply,
-    "npz": scene_voxels_npz,
-    "xodr": scene_opendrive,
+    "glb": export_glb,
+    "ply": export_ply,
+    "npz": export_voxels_npz,
+    "xodr": export_opendrive,
 }
 
 
 def export_scenes(
-    selection: Selection,
+    selection: SceneSubset,
     formats: Sequence[Format],
     output: str,
     overwrite: bool = False,
@@ -42,7 +42,7 @@ def export_scenes(
         written, rejects = [], []
         for scene in shard.scenes(rows):
             for kind in formats:
-                path = storage.join(output, kind, f"{scene.scene_id}.{kind}")
+                path = storage.join_uri(output, kind, f"{scene.scene_id}.{kind}")
                 try:
                     if overwrite or not storage.exists(path):
                         content = WRITERS[kind](scene)
@@ -53,11 +53,11 @@ def export_scenes(
                     rejects.append(about | {"reason": f"{kind}: {error}"})
         if rejects:
             target = Shard(output, shard.source, shard.split, shard.number)
-            storage.write_parquet(rejects_table(rejects), target.path("rejects"))
+            storage.write_parquet(make_rejects_table(rejects), target.path("rejects"))
         return {"scenes": len(rows), "written": written, "rejects": [(r["scene_id"], r["reason"]) for r in rejects]}
 
     counts, refused = dict.fromkeys(formats, 0), {}
-    for row in per_row(numbered(range(len(parts))), write).iter_rows():
+    for row in map_rows(make_numbered_rows(range(len(parts))), write).iter_rows():
         for kind in row["written"]:
             counts[kind] += 1
         refused |= {scene_id: reason for scene_id, reason in row["rejects"]}

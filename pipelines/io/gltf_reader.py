@@ -23,7 +23,7 @@ FAR_M = 1e6
 MAX_NUMBERS = 2**25  # vertices and corners of triangles, placed: a small file can place one mesh a million times
 
 
-class Part(NamedTuple):
+class MeshPart(NamedTuple):
     """One mesh primitive of one node, placed by the transforms above it."""
 
     extras: dict  # of the node
@@ -37,29 +37,29 @@ class Glb(NamedTuple):
     """What a file shows: the extras of its scene, and its parts in the order of the file's tree."""
 
     extras: dict
-    parts: list[Part]
+    parts: list[MeshPart]
 
 
 def read_glb(data: bytes) -> Glb:
     """The default scene of a binary glTF 2.0 file. Raises ValueError that says what is wrong with it."""
     try:
-        tree, binary = _chunks(data)
+        tree, binary = _read_chunks(data)
         _refuse(tree)
         scene = tree["scenes"][tree.get("scene", 0)]
         parts, total = [], 0
-        for node, file_from_mesh in _placed_nodes(tree, scene.get("nodes", [])):
+        for node, file_from_mesh in _list_placed_nodes(tree, scene.get("nodes", [])):
             for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
                 read = [primitive["attributes"]["POSITION"], primitive.get("indices")]
                 total += sum(tree["accessors"][index]["count"] for index in read if index is not None)
                 if total > MAX_NUMBERS:
                     raise ValueError(f"places more than {MAX_NUMBERS} vertices; export one scene per file")
-                parts.append(_part(tree, binary, node, primitive, file_from_mesh))
+                parts.append(_read_part(tree, binary, node, primitive, file_from_mesh))
         return Glb(dict(scene.get("extras", {})), parts)
     except (LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"not well-formed glTF ({error!r}); export it again") from error
 
 
-def _chunks(data: bytes) -> tuple[dict, bytes]:
+def _read_chunks(data: bytes) -> tuple[dict, bytes]:
     """The JSON chunk, read, and the binary one, empty if there is none."""
     if data[:4] != b"glTF" or len(data) < 20:
         raise ValueError(f"begins with {data[:4]!r}, not a binary glTF file; export as .glb")
@@ -85,7 +85,7 @@ def _refuse(tree: dict) -> None:
         raise ValueError(f"uses {', '.join(sorted(unread))}, which is not read; export without it")
 
 
-def _placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarray]]:
+def _list_placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarray]]:
     """Nodes and their (4, 4) file_from_node, parents first."""
     seen, todo = set(), [(root, np.eye(4)) for root in reversed(roots)]
     while todo:
@@ -94,12 +94,12 @@ def _placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarr
             raise ValueError(f"node {index} has two parents; export it again")
         seen.add(index)
         node = tree["nodes"][index]
-        file_from_node = file_from_parent @ _parent_from_node(node)
+        file_from_node = file_from_parent @ _compute_node_transform(node)
         yield node, file_from_node
         todo += [(child, file_from_node) for child in reversed(node.get("children", []))]
 
 
-def _parent_from_node(node: dict) -> np.ndarray:
+def _compute_node_transform(node: dict) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T  # column by column in the file
     transform = np.eye(4)
@@ -109,15 +109,17 @@ def _parent_from_node(node: dict) -> np.ndarray:
     return transform
 
 
-def _part(tree: dict, binary: bytes, node: dict, primitive: dict, file_from_mesh: np.ndarray) -> Part:
+def _read_part(tree: dict, binary: bytes, node: dict, primitive: dict, file_from_mesh: np.ndarray) -> MeshPart:
     attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
     if mode not in (POINTS, TRIANGLES):
         raise ValueError(f"a mesh is drawn in mode {mode}; export triangles")
-    local = _accessor(tree, binary, attributes["POSITION"])
+    local = _read_accessor(tree, binary, attributes["POSITION"])
     vertices = local @ file_from_mesh[:3, :3].T + file_from_mesh[:3, 3]
     if not (np.abs(vertices) < FAR_M).all():
         raise ValueError(f"vertices hold NaN or lie beyond {FAR_M:.0f} m; export it again, in metres")
-    corner = _accessor(tree, binary, primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(local))
+    corner = (
+        _read_accessor(tree, binary, primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(local))
+    )
     triangles = corner[: len(corner) * (mode == TRIANGLES)].astype(np.int64).reshape(-1, 3)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise ValueError(f"triangles name vertex {triangles.max()} of {len(vertices)}; export it again")
@@ -125,13 +127,13 @@ def _part(tree: dict, binary: bytes, node: dict, primitive: dict, file_from_mesh
     base = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0, 1.0, 1.0])[:3]
     color = np.tile(np.array(base, float), (len(vertices), 1))
     if "COLOR_0" in attributes:
-        color *= _accessor(tree, binary, attributes["COLOR_0"])[:, :3]
+        color *= _read_accessor(tree, binary, attributes["COLOR_0"])[:, :3]
     if not ((color >= 0) & (color <= 1)).all():
         raise ValueError("colours lie outside 0 to 1; export 8-bit colours")
-    return Part(dict(node.get("extras", {})), file_from_mesh, vertices, triangles, color)
+    return MeshPart(dict(node.get("extras", {})), file_from_mesh, vertices, triangles, color)
 
 
-def _accessor(tree: dict, binary: bytes, index: int) -> np.ndarray:
+def _read_accessor(tree: dict, binary: bytes, index: int) -> np.ndarray:
     """(count, width) numbers: float64 for floats and normalised integers, else as stored."""
     accessor = tree["accessors"][index]
     if "sparse" in accessor or "bufferView" not in accessor:

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
-from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, ground_ids
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
 GROUND = -1  # "primitive" of a ground triangle
 ABOUT = (  # what a file says of the scene as a whole
@@ -40,20 +40,20 @@ class Triangles(NamedTuple):
 
 
 @cache
-def unit_cuboid() -> tuple[np.ndarray, np.ndarray]:
+def make_unit_cuboid() -> tuple[np.ndarray, np.ndarray]:
     """Vertices (8, 3) at ±0.5 and triangles (12, 3), outward."""
     mesh = trimesh.creation.box()
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
 @cache
-def unit_ellipsoid() -> tuple[np.ndarray, np.ndarray]:
+def make_unit_ellipsoid() -> tuple[np.ndarray, np.ndarray]:
     """Vertices (642, 3) on the sphere of diameter 1 and triangles (1280, 3), outward; volume 0.99 of pi/6."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
-def scene_from_unit(scene: Scene) -> np.ndarray:
+def compute_placements(scene: Scene) -> np.ndarray:
     """(n, 4, 4) T = [R diag(l, w, h) | t] of each primitive (paper, supplement B.2)."""
     transform = np.zeros((len(scene), 4, 4))
     transform[:, :3, :3] = scene.rotation * scene.size_m[:, None, :]
@@ -62,7 +62,7 @@ def scene_from_unit(scene: Scene) -> np.ndarray:
     return transform
 
 
-def ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The fused ground surface (paper, supplement B.2).
 
     Returns vertices_m (v, 3), one per occupied pixel; triangles (t, 3), facing up, two per 2 x 2 block of
@@ -76,40 +76,40 @@ def ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     whole = occupied[:-1, :-1] & occupied[1:, :-1] & occupied[:-1, 1:] & occupied[1:, 1:]
     here, right, below, across = vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, :-1], vertex[1:, 1:]
     triangles = np.stack([v[whole] for v in (here, below, right, right, below, across)], axis=1).reshape(-1, 3)
-    return vertices, triangles, ground_ids(scene)[winner[occupied]]
+    return vertices, triangles, list_ground_ids(scene)[winner[occupied]]
 
 
-def ground_triangles(scene: Scene) -> Triangles:
+def triangulate_ground(scene: Scene) -> Triangles:
     """The triangles of `ground_mesh`."""
-    vertices, triangles, class_id = ground_mesh(scene)
+    vertices, triangles, class_id = build_ground_mesh(scene)
     return Triangles(vertices[triangles], class_id[triangles[:, 0]], np.full(len(triangles), GROUND))
 
 
-def cuboid_triangles(scene: Scene) -> Triangles:
+def triangulate_cuboids(scene: Scene) -> Triangles:
     """Twelve triangles for each primitive that is a cuboid."""
-    return _instances(scene, np.flatnonzero(scene.category != ELLIPSOID), *unit_cuboid())
+    return _add_instances(scene, np.flatnonzero(scene.category != ELLIPSOID), *make_unit_cuboid())
 
 
-def ellipsoid_triangles(scene: Scene) -> Triangles:
+def triangulate_ellipsoids(scene: Scene) -> Triangles:
     """1280 triangles for each primitive that is an ellipsoid."""
-    return _instances(scene, np.flatnonzero(scene.category == ELLIPSOID), *unit_ellipsoid())
+    return _add_instances(scene, np.flatnonzero(scene.category == ELLIPSOID), *make_unit_ellipsoid())
 
 
-def scene_triangles(scene: Scene) -> Triangles:
+def triangulate_scene(scene: Scene) -> Triangles:
     """Everything in the scene as triangles: ground, cuboids, ellipsoids."""
-    parts = ground_triangles(scene), cuboid_triangles(scene), ellipsoid_triangles(scene)
+    parts = triangulate_ground(scene), triangulate_cuboids(scene), triangulate_ellipsoids(scene)
     return Triangles(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> Triangles:
-    transform = scene_from_unit(scene)[primitive]
+def _add_instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> Triangles:
+    transform = compute_placements(scene)[primitive]
     placed = vertices @ transform[:, :3, :3].transpose(0, 2, 1) + transform[:, None, :3, 3]  # (p, v, 3)
     class_id = np.repeat(CATEGORY_IDS[scene.category[primitive]], len(triangles))
     corners = placed.take(triangles, axis=1).reshape(-1, 3, 3)
     return Triangles(corners, class_id, np.repeat(primitive, len(triangles)))
 
 
-def scene_glb(scene: Scene) -> bytes:
+def export_glb(scene: Scene) -> bytes:
     """The scene as a binary glTF 2.0 file, y up, metres.
 
     Node `scene` carries the turn from z up to y up, so that its children are in the scene frame: `ground`
@@ -121,23 +121,23 @@ def scene_glb(scene: Scene) -> bytes:
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
     world = trimesh.Scene(metadata=about)
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
-    vertices, triangles, class_id = ground_mesh(scene)
+    vertices, triangles, class_id = build_ground_mesh(scene)
     if len(vertices):
         # A triangle without area keeps pixels that have no neighbours: files leave meshes without triangles out.
         triangles = triangles if len(triangles) else np.zeros((1, 3), int)
-        world.geometry["ground"] = _painted_mesh(vertices, triangles, class_id)
+        world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
         world.graph.update("ground", "scene", matrix=np.eye(4), geometry="ground", metadata=extras)
     for category in np.unique(scene.category):
-        world.geometry[CATEGORIES[category]] = _unit_mesh(category)
-    for index, transform in enumerate(scene_from_unit(scene)):
+        world.geometry[CATEGORIES[category]] = _make_unit_mesh(category)
+    for index, transform in enumerate(compute_placements(scene)):
         name = CATEGORIES[scene.category[index]]
         node = f"{name}_{index:04d}"
-        world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_extras(scene, index))
-    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=_say_what_buffers_hold)
+        world.graph.update(node, "scene", matrix=transform, geometry=name, metadata=_make_extras(scene, index))
+    return trimesh.exchange.gltf.export_glb(world, tree_postprocessor=_set_buffer_targets)
 
 
-def _say_what_buffers_hold(tree: dict) -> None:
+def _set_buffer_targets(tree: dict) -> None:
     """glTF's hints for the GPU: which buffer views hold vertices, which indices."""
     for mesh in tree.get("meshes", ()):
         for part in mesh["primitives"]:
@@ -146,16 +146,16 @@ def _say_what_buffers_hold(tree: dict) -> None:
                 tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"] = target
 
 
-def scene_ply(scene: Scene) -> bytes:
+def export_ply(scene: Scene) -> bytes:
     """The scene as one binary PLY mesh in the scene frame, z up, metres.
 
     Vertices carry palette colours (sRGB), `class_id` and `primitive` (its number, GROUND for the ground).
     """
-    ground_m, triangles, class_id = ground_mesh(scene)
+    ground_m, triangles, class_id = build_ground_mesh(scene)
     vertices, faces, classes, primitives = [ground_m], [triangles], [class_id], [np.full(len(ground_m), GROUND)]
     count = len(ground_m)
-    for index, transform in enumerate(scene_from_unit(scene)):
-        unit, unit_faces = unit_ellipsoid() if scene.category[index] == ELLIPSOID else unit_cuboid()
+    for index, transform in enumerate(compute_placements(scene)):
+        unit, unit_faces = make_unit_ellipsoid() if scene.category[index] == ELLIPSOID else make_unit_cuboid()
         vertices.append(unit @ transform[:3, :3].T + transform[:3, 3])
         faces.append(unit_faces + count)
         classes.append(np.full(len(unit), CATEGORY_IDS[scene.category[index]]))
@@ -173,42 +173,42 @@ def write_glb(scene: Scene, path: str | Path) -> None:
     """Writes `scene_glb` to a temporary name beside `path` and moves it into place."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
-    temporary.write_bytes(scene_glb(scene))
+    temporary.write_bytes(export_glb(scene))
     os.replace(temporary, path)
 
 
-def _unit_mesh(category: int) -> trimesh.Trimesh:
-    visual = trimesh.visual.TextureVisuals(material=_material(CATEGORIES[category], CATEGORY_IDS[category]))
+def _make_unit_mesh(category: int) -> trimesh.Trimesh:
+    visual = trimesh.visual.TextureVisuals(material=_make_material(CATEGORIES[category], CATEGORY_IDS[category]))
     if category != ELLIPSOID:
-        return trimesh.Trimesh(*unit_cuboid(), visual=visual, process=False)
-    vertices, triangles = unit_ellipsoid()
+        return trimesh.Trimesh(*make_unit_cuboid(), visual=visual, process=False)
+    vertices, triangles = make_unit_ellipsoid()
     # With normals viewers shade smoothly, without them each facet flatly.
     return trimesh.Trimesh(vertices, triangles, vertex_normals=2 * vertices, visual=visual, process=False)
 
 
-def _painted_mesh(vertices_m: np.ndarray, triangles: np.ndarray, class_id: np.ndarray) -> trimesh.Trimesh:
+def _paint_mesh(vertices_m: np.ndarray, triangles: np.ndarray, class_id: np.ndarray) -> trimesh.Trimesh:
     # White: a viewer multiplies the material's colour by the vertex's.
-    visual = trimesh.visual.TextureVisuals(material=_material("ground", EMPTY))
+    visual = trimesh.visual.TextureVisuals(material=_make_material("ground", EMPTY))
     opaque = np.full((len(vertices_m), 1), 255, np.uint8)
-    visual.vertex_attributes["color"] = np.hstack([_linear(CLASS_COLORS)[class_id], opaque])
+    visual.vertex_attributes["color"] = np.hstack([_convert_to_linear(CLASS_COLORS)[class_id], opaque])
     return trimesh.Trimesh(vertices_m, triangles, visual=visual, process=False)
 
 
-def _material(name: str, class_id: int) -> trimesh.visual.material.PBRMaterial:
-    color = [*_linear(CLASS_COLORS[class_id]), 255]
+def _make_material(name: str, class_id: int) -> trimesh.visual.material.PBRMaterial:
+    color = [*_convert_to_linear(CLASS_COLORS[class_id]), 255]
     return trimesh.visual.material.PBRMaterial(
         name=name, baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.9
     )
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
+def _convert_to_linear(srgb: np.ndarray) -> np.ndarray:
     """uint8 sRGB as uint8 linear light (IEC 61966-2-1)."""
     value = np.asarray(srgb) / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)
 
 
-def _extras(scene: Scene, index: int) -> dict:
+def _make_extras(scene: Scene, index: int) -> dict:
     category = int(scene.category[index])
     heading = float(scene.heading_rad[index])
     return {

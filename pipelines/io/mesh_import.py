@@ -34,15 +34,21 @@ from models.scene import (
     KITTI_GROUND_CLASSES,
     Grid,
     Scene,
-    canonical_boxes,
-    yaw_of,
+    canonicalize_boxes,
+    compute_yaw,
 )
-from pipelines.geometry.shape_fitting import boxes_of_corners, boxes_of_edges, ellipsoids_of_points
+from pipelines.geometry.shape_fitting import fit_boxes_to_corners, fit_boxes_to_edges, fit_ellipsoids
 from pipelines.io.gltf_reader import Glb, read_glb
 from pipelines.io.mesh_export import GLTF_FROM_SCENE
-from pipelines.io.mesh_segmentation import COLOR_TOLERANCE, nearest_class, pieces_of, rasters, stored_linear
+from pipelines.io.mesh_segmentation import (
+    COLOR_TOLERANCE,
+    convert_to_stored_linear,
+    find_nearest_class,
+    rasterize_ground,
+    segment_mesh,
+)
 from pipelines.runtime import storage
-from pipelines.schema.axis_convention import Axes, scene_from_axes
+from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
@@ -50,7 +56,7 @@ UNMOVED = 1e-4  # change of a size, relative, and of a yaw, in rad, that is roun
 MAX_PIXELS = 2**24  # of a grid that a file names
 
 
-def scene_from_glb(
+def import_glb(
     source: bytes | str | os.PathLike, scene_id: str = "", axes: Axes = AUTHORS_AXES, grid: Grid | None = None
 ) -> Scene:
     """The Scene that a .glb shows, given as its bytes or its path.
@@ -60,23 +66,23 @@ def scene_from_glb(
     their file. Raises ValueError that names the file, what was found and what to do.
     """
     name = "GLB" if isinstance(source, bytes) else os.fspath(source)
-    orientation = scene_from_axes(axes)
+    orientation = compute_scene_from_axes(axes)
     glb_bytes = source if isinstance(source, bytes) else storage.read_bytes(name)
     try:
         glb = read_glb(glb_bytes)
         if "grid" in glb.extras and "ground_classes" in glb.extras:
-            return _own_scene(glb, scene_id)
-        return _foreign_scene(
+            return _import_own_scene(glb, scene_id)
+        return _import_foreign_scene(
             glb, scene_id or name.rsplit("/", 1)[-1].removesuffix(".glb"), orientation, grid or Grid()
         )
     except (ValueError, np.linalg.LinAlgError) as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _own_scene(glb: Glb, scene_id: str) -> Scene:
+def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     nodes = [part for part in glb.parts if "category" in part.extras]
     try:
-        about = _about(glb.extras)
+        about = _read_metadata(glb.extras)
         category = np.array([CATEGORY_INDEX[part.extras["category"]] for part in nodes], np.int8)
         size_said_m, yaw_said, heading, existence, instance_id, label = (
             np.array([part.extras[name] for part in nodes], kind)
@@ -96,20 +102,20 @@ def _own_scene(glb: Glb, scene_id: str) -> Scene:
     scene_from_gltf = np.linalg.inv(GLTF_FROM_SCENE)
     scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
     center_m = scene_from_unit[:, :3, 3]
-    rotation, size_m = boxes_of_edges(scene_from_unit[:, :3, :3], center_m)
+    rotation, size_m = fit_boxes_to_edges(scene_from_unit[:, :3, :3], center_m)
     # A square's length and width must not change places by rounding.
     size_said_m = size_said_m.reshape(-1, 3)
     size_m = np.where(np.isclose(size_m, size_said_m, rtol=UNMOVED, atol=0), size_said_m, size_m)
-    rotation, size_m = canonical_boxes(rotation, size_m)
-    turned = ~np.isclose(yaw_of(rotation), yaw_said, rtol=0, atol=UNMOVED)
+    rotation, size_m = canonicalize_boxes(rotation, size_m)
+    turned = ~np.isclose(compute_yaw(rotation), yaw_said, rtol=0, atol=UNMOVED)
 
     ground = [part for part in glb.parts if "classes" in part.extras]
-    vertices_m = _joined([part.vertices @ scene_from_gltf[:3, :3].T for part in ground], (0, 3))
+    vertices_m = _join_meshes([part.vertices @ scene_from_gltf[:3, :3].T for part in ground], (0, 3))
     ids = np.array([GROUND_CLASS_ID[name] for name in about["ground_classes"]])
-    class_id, off = nearest_class(_joined([part.color for part in ground], (0, 3)), True, ids)
+    class_id, off = find_nearest_class(_join_meshes([part.color for part in ground], (0, 3)), True, ids)
     if (off > COLOR_TOLERANCE).any():
         raise ValueError(f"{(off > COLOR_TOLERANCE).sum()} ground vertices have the colour of none of its classes")
-    height_m, occupied = rasters(vertices_m, class_id, about["ground_classes"], about["grid"])
+    height_m, occupied = rasterize_ground(vertices_m, class_id, about["ground_classes"], about["grid"])
     return Scene(
         **about | ({"scene_id": scene_id} if scene_id else {}),
         category=category,
@@ -125,7 +131,7 @@ def _own_scene(glb: Glb, scene_id: str) -> Scene:
     )
 
 
-def _about(extras: dict) -> dict:
+def _read_metadata(extras: dict) -> dict:
     """What a Scene says of itself as a whole, checked. Raises LookupError, TypeError or ValueError."""
     said, classes = extras["grid"], tuple(extras["ground_classes"])
     lengths = [float(said[name]) for name in ("front_m", "left_m", "resolution_m")]
@@ -149,18 +155,18 @@ def _about(extras: dict) -> dict:
     }
 
 
-def _foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: Grid) -> Scene:
+def _import_foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: Grid) -> Scene:
     if not glb.parts:
         raise ValueError("holds no mesh; export the scene's meshes with it")
-    linear = stored_linear(np.concatenate([part.color for part in glb.parts]))
-    found = [pieces_of(part.vertices @ scene_from_file.T, part.triangles, part.color, linear) for part in glb.parts]
+    linear = convert_to_stored_linear(np.concatenate([part.color for part in glb.parts]))
+    found = [segment_mesh(part.vertices @ scene_from_file.T, part.triangles, part.color, linear) for part in glb.parts]
     ground_m, ground_id, corners_m, box_id = (np.concatenate([part[k] for part in found]) for k in range(4))
     clouds = [cloud for part in found for cloud in part.clouds]
     classes = tuple(n for n in GROUND_CLASSES if n in KITTI_GROUND_CLASSES or (ground_id == GROUND_CLASS_ID[n]).any())
-    height_m, occupied = rasters(ground_m, ground_id, classes, grid)
-    shapes = zip(boxes_of_corners(corners_m), ellipsoids_of_points(clouds), strict=True)
+    height_m, occupied = rasterize_ground(ground_m, ground_id, classes, grid)
+    shapes = zip(fit_boxes_to_corners(corners_m), fit_ellipsoids(clouds), strict=True)
     center_m, rotation, size_m = (np.concatenate(pair) for pair in shapes)
-    rotation, size_m = canonical_boxes(rotation, size_m)
+    rotation, size_m = canonicalize_boxes(rotation, size_m)
     category = np.append(np.searchsorted(CATEGORY_IDS, box_id), np.full(len(clouds), ELLIPSOID))
     return Scene(
         scene_id=scene_id,
@@ -179,5 +185,5 @@ def _foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: G
     )
 
 
-def _joined(arrays: list[np.ndarray], empty: tuple[int, ...]) -> np.ndarray:
+def _join_meshes(arrays: list[np.ndarray], empty: tuple[int, ...]) -> np.ndarray:
     return np.concatenate(arrays) if arrays else np.zeros(empty)

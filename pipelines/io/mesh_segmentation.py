@@ -24,13 +24,13 @@ IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values())
 # ------------------------------------------------------------------------------------------------------- colours
 
 
-def stored_linear(color: np.ndarray) -> bool:
+def convert_to_stored_linear(color: np.ndarray) -> bool:
     """Whether colours (v, 3) in [0, 1] fit the classes better as linear light than as sRGB."""
-    off = [np.minimum(nearest_class(color, linear, CLASS_IDS)[1], FAR).sum() for linear in (True, False)]
+    off = [np.minimum(find_nearest_class(color, linear, CLASS_IDS)[1], FAR).sum() for linear in (True, False)]
     return bool(off[0] < off[1])
 
 
-def nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The class id of nearest colour for each of (v, 3) in [0, 1], and how far off its worst channel is, of 255."""
     levels = np.round(color * 65535).astype(np.int64).clip(0, 65535)
     code, place = np.unique(levels @ [2**32, 2**16, 1], return_inverse=True)
@@ -44,7 +44,7 @@ def nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -> tup
 # -------------------------------------------------------------------------------------------------------- pieces
 
 
-class Pieces(NamedTuple):
+class MeshPieces(NamedTuple):
     """What a mesh shows, in the scene frame."""
 
     ground_m: np.ndarray  # (v, 3) one vertex per pixel
@@ -54,15 +54,15 @@ class Pieces(NamedTuple):
     clouds: list[np.ndarray]  # (k, 3) vertices of each ellipsoid
 
 
-def pieces_of(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarray, linear: bool) -> Pieces:
+def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarray, linear: bool) -> MeshPieces:
     """A mesh taken apart into its connected pieces; a piece is ground if most of its coloured vertices are.
 
     Of vertices without triangles those in a ground class's colour count. Raises ValueError that says where a piece lies
     that is neither ground nor box nor ellipsoid, and what is wrong with it.
     """
-    class_id, off = nearest_class(color, linear, CLASS_IDS)
+    class_id, off = find_nearest_class(color, linear, CLASS_IDS)
     class_id = np.where(off <= COLOR_TOLERANCE, class_id, EMPTY)
-    piece = _connected(triangles, len(vertices_m))
+    piece = _split_connected(triangles, len(vertices_m))
     votes = np.zeros((piece.max(initial=-1) + 1, len(CLASS_COLORS)), np.int64)
     np.add.at(votes, (piece, class_id), 1)
     votes[:, EMPTY] = 0
@@ -81,18 +81,20 @@ def pieces_of(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarray, 
     ground_m, ground_id = vertices_m[on_ground], class_id[on_ground]
     faces = triangles[~on_ground[triangles[:, 0]]]
     used, faces = np.unique(faces, return_inverse=True)  # a sphere's poles may lie there unused
-    boxes, clouds = _primitives(vertices_m[used], class_id[used], faces.reshape(-1, 3))
-    return Pieces(ground_m, _unmixed(ground_m, np.where(IS_GROUND[ground_id], ground_id, EMPTY)), *boxes, clouds)
+    boxes, clouds = _find_primitives(vertices_m[used], class_id[used], faces.reshape(-1, 3))
+    return MeshPieces(
+        ground_m, _split_mixed(ground_m, np.where(IS_GROUND[ground_id], ground_id, EMPTY)), *boxes, clouds
+    )
 
 
-def _connected(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
+def _split_connected(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
     """(v,) number of the connected piece of each vertex."""
     start, end = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
     graph = coo_array((np.ones(len(start), bool), (start, end)), shape=(num_vertices, num_vertices))
     return connected_components(graph, directed=False)[1] if num_vertices else np.zeros(0, int)
 
 
-def _unmixed(ground_m: np.ndarray, class_id: np.ndarray) -> np.ndarray:
+def _split_mixed(ground_m: np.ndarray, class_id: np.ndarray) -> np.ndarray:
     """Class ids of ground vertices, those between two classes' colours filled in from the nearest that has one."""
     mixed = class_id == EMPTY
     if mixed.sum() > MAX_MIXED * len(mixed):
@@ -104,15 +106,15 @@ def _unmixed(ground_m: np.ndarray, class_id: np.ndarray) -> np.ndarray:
     return class_id
 
 
-def _primitives(
+def _find_primitives(
     points_m: np.ndarray, class_id: np.ndarray, faces: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[np.ndarray]]:
     """(corners_m (b, 8, 3), class ids (b,)) of the boxes, and the vertices of each ellipsoid."""
-    piece = _connected(faces, len(points_m))
+    piece = _split_connected(faces, len(points_m))
     if (np.bincount(piece) < 8).any():  # vertices are repeated along edges: sew
         keys, place = np.unique(np.column_stack([points_m, class_id]), axis=0, return_inverse=True)
         points_m, class_id, faces = keys[:, :3], keys[:, 3].astype(np.int64), place.ravel()[faces]
-        piece = _connected(faces, len(points_m))
+        piece = _split_connected(faces, len(points_m))
     order, size = np.argsort(piece, kind="stable"), np.bincount(piece)
     start = np.cumsum(size) - size
     points_m, class_id = points_m[order], class_id[order]
@@ -138,7 +140,7 @@ def _refuse(bad: np.ndarray, points_m: np.ndarray, start: np.ndarray, what: str)
 # ------------------------------------------------------------------------------------------------------- rasters
 
 
-def rasters(
+def rasterize_ground(
     vertices_m: np.ndarray, class_id: np.ndarray, classes: tuple[str, ...], grid: Grid
 ) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) float32 and occupied (G, H, W) from ground vertices, one per pixel, all at corners or centres.

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from models.scene import Scene
-from pipelines.geometry.centerlines import Road, RoadNetwork, road_network
+from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
 KNOT_M = 5.0  # between points of a reference line
 LANE_M = 3.5  # a road's half of about so many metres is one lane
@@ -61,19 +61,19 @@ class ReferenceLine:
         return self.curve(self.breaks[which]), direction / np.linalg.norm(direction)
 
 
-def reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
+def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
     """A line for each road, cut short where a junction begins."""
     clear_m = [
         CLEAR * max(float(np.median(road.width_m)) for road in network.leaving(node)) / 2
         for node in range(len(network.nodes_m))
     ]
     return [
-        _shortened(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end)))
+        _shorten_road(road, *(clear_m[node] if node >= 0 else 0.0 for node in (road.start, road.end)))
         for road in network.roads
     ]
 
 
-def _shortened(road: Road, from_start_m: float, from_end_m: float) -> ReferenceLine:
+def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> ReferenceLine:
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(road.xyz_m[:, :2], axis=0), axis=1)))
     spare_m = max(along[-1] - LEAST_ROAD_M, 0) / max(from_start_m + from_end_m, 1e-9)
     low, high = from_start_m * min(1, spare_m), along[-1] - from_end_m * min(1, spare_m)
@@ -84,55 +84,64 @@ def _shortened(road: Road, from_start_m: float, from_end_m: float) -> ReferenceL
     return ReferenceLine.through(xyz_m, width_m)
 
 
-def lanes_of(line: ReferenceLine) -> int:
+def list_lanes(line: ReferenceLine) -> int:
     """Driving lanes on either side."""
     return max(1, round(float(np.median(line.width_m)) / 2 / LANE_M))
 
 
-def scene_opendrive(scene: Scene) -> bytes:
+def export_opendrive(scene: Scene) -> bytes:
     """The scene's roads as an OpenDRIVE file. Raises ValueError for a scene without a road."""
-    network = road_network(scene)
+    network = extract_road_network(scene)
     if not network.roads:
         raise ValueError(f"scene {scene.scene_id} has no road to export")
-    lines = reference_lines(network)
+    lines = fit_reference_lines(network)
     root = ET.Element("OpenDRIVE")
-    _header(root, scene)
+    _make_header(root, scene)
     for number, (road, line) in enumerate(zip(network.roads, lines, strict=True)):
-        element = _road(root, number, line, junction=-1)
+        element = _make_road(root, number, line, junction=-1)
         link = ET.SubElement(element, "link")
         for name, node in (("predecessor", road.start), ("successor", road.end)):
             if node >= 0:
-                ET.SubElement(link, name, elementType="junction", elementId=_junction_id(node))
-        _body(element, line, left=lanes_of(line), right=lanes_of(line))
-    junctions = [_junction(root, network, lines, node) for node in range(len(network.nodes_m))]
+                ET.SubElement(link, name, elementType="junction", elementId=_make_junction_id(node))
+        _make_road_body(element, line, left=list_lanes(line), right=list_lanes(line))
+    junctions = [_make_junction(root, network, lines, node) for node in range(len(network.nodes_m))]
     root.extend(junctions)  # after all roads
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _header(root: ET.Element, scene: Scene) -> None:
+def _make_header(root: ET.Element, scene: Scene) -> None:
     grid = scene.grid
     borders = {"north": grid.left_m, "south": grid.right_m, "east": grid.front_m, "west": grid.back_m}
     about = {"revMajor": "1", "revMinor": "7", "name": scene.scene_id, "version": "1.00", "vendor": "PrITTI on Ray"}
-    header = ET.SubElement(root, "header", about | {name: _number(value) for name, value in borders.items()})
+    header = ET.SubElement(root, "header", about | {name: _format_number(value) for name, value in borders.items()})
     x, y, z = scene.world_xyz_m
-    ET.SubElement(header, "offset", x=_number(x), y=_number(y), z=_number(z), hdg=_number(scene.world_yaw_rad))
+    ET.SubElement(
+        header,
+        "offset",
+        x=_format_number(x),
+        y=_format_number(y),
+        z=_format_number(z),
+        hdg=_format_number(scene.world_yaw_rad),
+    )
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{float(value):.9g}"
 
 
-def _junction_id(node: int) -> str:
+def _make_junction_id(node: int) -> str:
     return str(10_000 + node)
 
 
-def _road(root: ET.Element, number: int, line: ReferenceLine, junction: int) -> ET.Element:
-    about = {"id": str(number), "length": _number(line.length_m), "junction": str(junction), "rule": "RHT"}
+def _make_road(root: ET.Element, number: int, line: ReferenceLine, junction: int) -> ET.Element:
+    about = {"id": str(number), "length": _format_number(line.length_m), "junction": str(junction), "rule": "RHT"}
     return ET.SubElement(root, "road", {"name": ""} | about)
 
 
-def _body(road: ET.Element, line: ReferenceLine, left: int, right: int, links: tuple[int, int] | None = None) -> None:
+def _make_road_body(
+    road: ET.Element, line: ReferenceLine, left: int, right: int, links: tuple[int, int] | None = None
+) -> None:
     """Plan, elevation and lanes; `links`: signs of the lane numbers before and after a connecting road's."""
     ET.SubElement(ET.SubElement(road, "type", s="0", type="town"), "speed", max="50", unit="km/h")
     plan, profile = ET.SubElement(road, "planView"), ET.Element("elevationProfile")
@@ -147,23 +156,24 @@ def _body(road: ET.Element, line: ReferenceLine, left: int, right: int, links: t
         u, v = cos * x + sin * y, cos * y - sin * x
         u[0] = v[0] = v[1] = 0.0
         at = {
-            "s": _number(s),
-            "x": _number(x[0]),
-            "y": _number(y[0]),
-            "hdg": _number(heading),
-            "length": _number(length_m),
+            "s": _format_number(s),
+            "x": _format_number(x[0]),
+            "y": _format_number(y[0]),
+            "hdg": _format_number(heading),
+            "length": _format_number(length_m),
         }
         geometry = ET.SubElement(plan, "geometry", at)
         terms = {
-            f"{name}{axis}": _number(term)
+            f"{name}{axis}": _format_number(term)
             for axis, part in (("U", u), ("V", v))
             for name, term in zip("abcd", part, strict=True)
         }
         ET.SubElement(geometry, "paramPoly3", terms, pRange="normalized")
         terms = {
-            name: _number(term / length_m**power) for power, (name, term) in enumerate(zip("abcd", z, strict=True))
+            name: _format_number(term / length_m**power)
+            for power, (name, term) in enumerate(zip("abcd", z, strict=True))
         }
-        ET.SubElement(profile, "elevation", {"s": _number(s)} | terms)
+        ET.SubElement(profile, "elevation", {"s": _format_number(s)} | terms)
     road.append(profile)
     section = ET.SubElement(ET.SubElement(road, "lanes"), "laneSection", s="0")
     for side, sign, count in (("left", 1, left), ("center", 0, 1), ("right", -1, right)):
@@ -175,20 +185,20 @@ def _body(road: ET.Element, line: ReferenceLine, left: int, right: int, links: t
                 ET.SubElement(link, "predecessor", id=str(links[0] * k))
                 ET.SubElement(link, "successor", id=str(links[1] * k))
             if sign:
-                _widths(lane, line, max(left, right))
+                _make_widths(lane, line, max(left, right))
 
 
-def _widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
+def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
     """The width of one of a side's lanes, linear from knot to knot."""
     width_m = line.width_m / 2 / lanes
     slope = np.diff(width_m) / line.lengths_m
     for s, a, b in zip(line.starts_m[:-1], width_m[:-1], slope, strict=True):
-        ET.SubElement(lane, "width", sOffset=_number(s), a=_number(a), b=_number(b), c="0", d="0")
+        ET.SubElement(lane, "width", sOffset=_format_number(s), a=_format_number(a), b=_format_number(b), c="0", d="0")
 
 
-def _junction(root: ET.Element, network: RoadNetwork, lines: list[ReferenceLine], node: int) -> ET.Element:
+def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[ReferenceLine], node: int) -> ET.Element:
     """A junction, and in `root` the roads that lead through it."""
-    junction = ET.Element("junction", id=_junction_id(node), name="", type="default")
+    junction = ET.Element("junction", id=_make_junction_id(node), name="", type="default")
     ends = [
         (road.number, end)
         for road in network.roads
@@ -198,19 +208,19 @@ def _junction(root: ET.Element, network: RoadNetwork, lines: list[ReferenceLine]
     for (come, come_end), (go, go_end) in permutations(ends, 2):
         (a_m, a_way), (b_m, b_way) = lines[come].end(come_end), lines[go].end(go_end)
         a_way, b_way = (a_way if come_end else -a_way), (-b_way if go_end else b_way)
-        lanes = min(lanes_of(lines[come]), lanes_of(lines[go]))
+        lanes = min(list_lanes(lines[come]), list_lanes(lines[go]))
         width_m = np.array([lines[come].width_m[come_end], lines[go].width_m[go_end]])
-        width_m = width_m * lanes / [lanes_of(lines[come]), lanes_of(lines[go])]
+        width_m = width_m * lanes / [list_lanes(lines[come]), list_lanes(lines[go])]
         line = ReferenceLine.through(np.stack([a_m, b_m]), width_m, np.stack([a_way, b_way]))
         number = sum(1 for _ in root.iter("road"))
-        road = _road(root, number, line, junction=int(_junction_id(node)))
+        road = _make_road(root, number, line, junction=int(_make_junction_id(node)))
         link = ET.SubElement(road, "link")
         points = ["end" if come_end else "start", "end" if go_end else "start"]
         for name, other, point in zip(("predecessor", "successor"), (come, go), points, strict=True):
             ET.SubElement(link, name, elementType="road", elementId=str(other), contactPoint=point)
         # Traffic keeps right: on a road that is left at its end it is on the negative lanes, at its start on the positive.
         signs = (-1 if come_end else 1), (1 if go_end else -1)
-        _body(road, line, left=0, right=lanes, links=signs)
+        _make_road_body(road, line, left=0, right=lanes, links=signs)
         about = {"incomingRoad": str(come), "connectingRoad": str(number), "contactPoint": "start"}
         connection = ET.SubElement(junction, "connection", {"id": str(len(junction))} | about)
         for k in range(1, lanes + 1):

@@ -17,9 +17,9 @@ import zipfile
 import numpy as np
 
 from models.scene import Scene
-from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelise
+from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.runtime import storage
-from pipelines.schema.axis_convention import Axes, scene_from_axes
+from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 
 VOXEL_AXES: Axes = ("x-", "y-", "z+")
@@ -36,7 +36,7 @@ def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
     """
     shown = " or ".join(" x ".join(map(str, shape)) for shape in SHAPES)
     try:
-        voxels = in_our_axes(_only_array(storage.read_bytes(uri)), axes)
+        voxels = convert_axes(_read_only_array(storage.read_bytes(uri)), axes)
     except (ValueError, zipfile.BadZipFile, EOFError, OSError, NotImplementedError) as error:
         named = str(error).removeprefix(f"{uri}: ")
         raise ValueError(f"{uri}: {named}; expected one scene of {shown} integers as {ARRAY!r} in an .npz") from error
@@ -52,7 +52,7 @@ def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
     return voxels
 
 
-def _only_array(content: bytes) -> np.ndarray:
+def _read_only_array(content: bytes) -> np.ndarray:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
     name = ARRAY if ARRAY in sizes else next(iter(sizes), "")
@@ -64,21 +64,21 @@ def _only_array(content: bytes) -> np.ndarray:
         return arrays[name]
 
 
-def in_our_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
+def convert_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
     """A view of voxels with rows backwards, columns to the right and levels upwards. Raises ValueError."""
-    ours_from_file = scene_from_axes(VOXEL_AXES).T @ scene_from_axes(axes)
+    ours_from_file = compute_scene_from_axes(VOXEL_AXES).T @ compute_scene_from_axes(axes)
     if voxels.ndim != 3:
         raise ValueError(f"holds an array of shape {voxels.shape}")
     turned = voxels.transpose(np.abs(ours_from_file).argmax(axis=1))
     return turned[tuple(slice(None, None, int(step)) for step in ours_from_file.sum(axis=1))]
 
 
-def scene_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
+def export_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
     """The scene's voxels as `read_voxels` takes them: a compressed .npz, the same bytes on every call.
 
     Raises ValueError if the grid's shape is none of SHAPES.
     """
-    voxels = voxelise(scene, grid or VoxelGrid())
+    voxels = voxelize(scene, grid or VoxelGrid())
     if voxels.shape not in SHAPES:
         raise ValueError(f"a voxel grid of {voxels.shape} cannot be read back, expected one of {SHAPES}")
     content = io.BytesIO()
@@ -88,11 +88,11 @@ def scene_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
 
 def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
     """Writes `scene_voxels_npz`."""
-    content = scene_voxels_npz(scene, grid)
+    content = export_voxels_npz(scene, grid)
     storage.write_whole(uri, lambda stream: stream.write(content))
 
 
-def voxel_picture(voxels: np.ndarray) -> np.ndarray:
+def draw_voxels(voxels: np.ndarray) -> np.ndarray:
     """(rows, cols, 3) uint8 sRGB from above: the colour of each column's topmost filled voxel, white where none is."""
     filled = voxels != EMPTY
     top = voxels.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)  # the highest level, empty, where nothing is

@@ -19,12 +19,12 @@ import numpy as np
 import pyarrow as pa
 
 from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
-from pipelines.runtime.storage import resolve, write_whole
+from pipelines.runtime.storage import resolve_uri, write_whole
 
 PICTURES = "arr_0"
 
 
-class Gaussian(NamedTuple):
+class StoredGaussian(NamedTuple):
     """What `frechet.frechet_distance` needs of a set of features."""
 
     mean: np.ndarray  # (d,) float64
@@ -32,17 +32,17 @@ class Gaussian(NamedTuple):
 
 
 class ReferenceMoments(NamedTuple):
-    pool3: Gaussian  # 2048-d
-    spatial: Gaussian | None  # 2023-d; None in files of other evaluators, which hold `mu` and `sigma` only
+    pool3: StoredGaussian  # 2048-d
+    spatial: StoredGaussian | None  # 2023-d; None in files of other evaluators, which hold `mu` and `sigma` only
 
 
 # -------------------------------------------------------------------------------------------------------- reading
 
 
 @contextmanager
-def _opened(path: str) -> Iterator[zipfile.ZipFile]:
+def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
     """The archive. ValueError naming the file for a missing, truncated or damaged one, whenever that shows."""
-    fs, inside = resolve(path)
+    fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
             yield archive
@@ -53,7 +53,7 @@ def _opened(path: str) -> Iterator[zipfile.ZipFile]:
 
 
 @contextmanager
-def _array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
+def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
     """Stream at the first number, shape and type of a C-ordered array; ValueError if it is anything else."""
     if f"{name}.npy" not in archive.namelist():
         raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
@@ -74,9 +74,9 @@ def _array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zip
         yield stream, shape, dtype
 
 
-def picture_shape(path: str) -> tuple[int, int, int, int]:
+def read_picture_shape(path: str) -> tuple[int, int, int, int]:
     """(N, height, width, 3) of the pictures in an ADM .npz, checked without reading them; ValueError as below."""
-    with _opened(path) as archive, _array(archive, PICTURES, path) as (_, shape, dtype):
+    with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (_, shape, dtype):
         if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3:
             raise ValueError(
                 f"{path}: {PICTURES} is {dtype} {shape}; pictures are uint8 (N, height, width, 3), values 0 to 255"
@@ -84,7 +84,7 @@ def picture_shape(path: str) -> tuple[int, int, int, int]:
     return shape
 
 
-def pictures_in_npz(path: str, batch: int) -> Iterator[np.ndarray]:
+def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
     """uint8 arrays (batch, height, width, 3), the last one shorter, in the order of the file; one in memory at a time.
 
     path is local or a URI; the archive may be compressed. Raises ValueError, naming the file, at once if it is
@@ -92,11 +92,11 @@ def pictures_in_npz(path: str, batch: int) -> Iterator[np.ndarray]:
     """
     if batch < 1:
         raise ValueError(f"a batch holds at least 1 picture, got {batch}")
-    return _pictures(path, picture_shape(path), batch)
+    return _iterate_batches(path, read_picture_shape(path), batch)
 
 
-def _pictures(path: str, shape: tuple[int, int, int, int], batch: int) -> Iterator[np.ndarray]:
-    with _opened(path) as archive, _array(archive, PICTURES, path) as (stream, _, _):
+def _iterate_batches(path: str, shape: tuple[int, int, int, int], batch: int) -> Iterator[np.ndarray]:
+    with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (stream, _, _):
         for start in range(0, shape[0], batch):
             pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
             if (read := stream.readinto(pictures)) != pictures.nbytes:
@@ -104,27 +104,31 @@ def _pictures(path: str, shape: tuple[int, int, int, int], batch: int) -> Iterat
             yield pictures
 
 
-def reference_moments(path: str) -> ReferenceMoments | None:
+def read_reference_moments(path: str) -> ReferenceMoments | None:
     """Precomputed moments of an ADM reference batch, float64; None if it holds pictures only.
 
     ValueError naming the file if they are incomplete, of other sizes or not finite.
     """
-    with _opened(path) as archive:
+    with _open_npz(path) as archive:
         held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if f"{name}.npy" in archive.namelist()}
         if not held:
             return None
         if held not in ({"mu", "sigma"}, {"mu", "sigma", "mu_s", "sigma_s"}):
             raise ValueError(f"{path}: holds {sorted(held)} only; mean and covariance (mu, sigma) go together")
-        pool3 = Gaussian(_numbers(archive, "mu", (FEATURES,), path), _numbers(archive, "sigma", (FEATURES,) * 2, path))
+        pool3 = StoredGaussian(
+            _read_numbers(archive, "mu", (FEATURES,), path), _read_numbers(archive, "sigma", (FEATURES,) * 2, path)
+        )
         if "mu_s" not in held:
             return ReferenceMoments(pool3, None)
         size = SPATIAL_FEATURES
-        spatial = Gaussian(_numbers(archive, "mu_s", (size,), path), _numbers(archive, "sigma_s", (size, size), path))
+        spatial = StoredGaussian(
+            _read_numbers(archive, "mu_s", (size,), path), _read_numbers(archive, "sigma_s", (size, size), path)
+        )
     return ReferenceMoments(pool3, spatial)
 
 
-def _numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
-    with _array(archive, name, path) as (stream, found, dtype):
+def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
+    with _read_array(archive, name, path) as (stream, found, dtype):
         if found != shape or dtype.kind != "f":
             raise ValueError(f"{path}: {name} is {dtype} {found}, features of this network need floats {shape}")
         numbers = np.frombuffer(stream.read(), dtype).reshape(shape).astype(np.float64)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from models.scene import CATEGORIES, GROUND_CLASSES, Scene
-from pipelines.metrics.intervals import Estimate, estimate, weights
+from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 EXTENT_EDGES_M = np.geomspace(0.1, 60, 49)
 PAIR_EDGES_M = np.geomspace(0.25, 100, 33)
@@ -46,7 +46,7 @@ class Histogram:
         return np.bincount(values, minlength=len(self))
 
 
-def _histograms() -> Iterator[Histogram]:
+def _list_histograms() -> Iterator[Histogram]:
     for category in CATEGORIES:
         for extent in ("length", "width", "height"):
             yield Histogram(f"{category}.{extent}_m", EXTENT_EDGES_M)
@@ -56,17 +56,17 @@ def _histograms() -> Iterator[Histogram]:
     yield Histogram("road_width_m", ROAD_WIDTH_EDGES_M)
 
 
-HISTOGRAMS = tuple(_histograms())
+HISTOGRAMS = tuple(_list_histograms())
 ENDS = np.cumsum([len(histogram) for histogram in HISTOGRAMS])
 
 
-def scene_histograms(scene: Scene) -> np.ndarray:
+def compute_scene_histograms(scene: Scene) -> np.ndarray:
     """(ENDS[-1],) uint32 counts of one scene over the bins of HISTOGRAMS, side by side.
 
     Per category: extents; the ground class under the centre; distance of the centre from the nearest road pixel, where
     the scene has road; distances between the centres of each pair, seen from above. And widths of the road.
     """
-    width_m, to_road_m = road_widths(scene)
+    width_m, to_road_m = measure_road_widths(scene)
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
     inside = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
     pixel = row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1)
@@ -77,19 +77,19 @@ def scene_histograms(scene: Scene) -> np.ndarray:
         members = scene.category == index
         parts += [*scene.size_m[members].T.astype(np.float64), below[members]]
         parts.append(to_road_m[pixel][members & inside] if to_road_m is not None else np.zeros(0))
-        parts.append(pair_distances(scene.center_m[members, :2]))
+        parts.append(compute_pair_distances(scene.center_m[members, :2]))
     parts.append(width_m)
     counted = [histogram.count(part) for histogram, part in zip(HISTOGRAMS, parts, strict=True)]
     return np.concatenate(counted).astype(np.uint32)
 
 
-def pair_distances(xy_m: np.ndarray) -> np.ndarray:
+def compute_pair_distances(xy_m: np.ndarray) -> np.ndarray:
     """(n (n - 1) / 2,) distances between points (n, 2)."""
     first, second = np.triu_indices(len(xy_m), 1)
     return np.hypot(*(xy_m[first] - xy_m[second]).T.astype(np.float64))
 
 
-def road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
+def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
     """Widths of the road (p,) in metres along its middle, and each pixel's distance from road (H, W), None without road.
 
     The middle is where the distance from the border is greatest nearby; the width is twice that distance, to a pixel.
@@ -112,53 +112,55 @@ def road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
 # --------------------------------------------------------------------------------------------------- two sources
 
 
-def histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
+def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
     """By name, the distance of each histogram in its unit, from scenes (n, bins) and (m, bins).
 
     A histogram that is empty on either side is left out.
     """
-    drawn = [weights(len(side), key) for key, side in enumerate((real, generated))]
+    drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
     for histogram, end in zip(HISTOGRAMS, ENDS, strict=True):
         columns = slice(end - len(histogram), end)
         sums = [w @ side[:, columns].astype(np.float64) for w, side in zip(drawn, (real, generated), strict=True)]
         if min(part[0].sum() for part in sums) == 0:
             continue
-        p, q = (normalised(part) for part in sums)
-        found[histogram.name] = estimate(
-            jensen_shannon(p, q) if histogram.edges is None else wasserstein(p, q, histogram.edges)
+        p, q = (normalize_histogram(part) for part in sums)
+        found[histogram.name] = make_estimate(
+            compute_jensen_shannon(p, q) if histogram.edges is None else compute_wasserstein(p, q, histogram.edges)
         )
     return found
 
 
-def count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
+def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
     """By category, the Wasserstein distance of its numbers per scene, in objects; counts (n, 11) and (m, 11)."""
-    drawn = [weights(len(side), key) for key, side in enumerate((real, generated))]
+    drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
     for index, category in enumerate(CATEGORIES):
         sides = real[:, index].astype(int), generated[:, index].astype(int)
         bins = 1 + max(side.max() for side in sides)
         p, q = (w @ np.eye(bins)[side] for w, side in zip(drawn, sides, strict=True))
-        found[category] = estimate(wasserstein(p, q, np.arange(bins + 1) - 0.5))
+        found[category] = make_estimate(compute_wasserstein(p, q, np.arange(bins + 1) - 0.5))
     return found
 
 
-def normalised(counts: np.ndarray) -> np.ndarray:
+def normalize_histogram(counts: np.ndarray) -> np.ndarray:
     """Rows (b, bins) of sum 1; NaN for a row of zeros."""
     total = counts.sum(axis=1, keepdims=True)
     return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
 
 
-def wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def compute_wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """(b,) W1 distance of distributions (b, bins), mass at the middles of the bins, in the unit of the edges."""
     step = np.diff((edges[1:] + edges[:-1]) / 2)
     return (np.abs(np.cumsum(p - q, axis=1)[:, :-1]) * step).sum(axis=1)
 
 
-def jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def compute_jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """(b,) divergence in bits, in [0, 1], of distributions (b, bins)."""
-    return np.clip(entropy_bits((p + q) / 2) - (entropy_bits(p) + entropy_bits(q)) / 2, 0.0, 1.0)
+    return np.clip(
+        compute_entropy_bits((p + q) / 2) - (compute_entropy_bits(p) + compute_entropy_bits(q)) / 2, 0.0, 1.0
+    )
 
 
-def entropy_bits(p: np.ndarray) -> np.ndarray:
+def compute_entropy_bits(p: np.ndarray) -> np.ndarray:
     return -(p * np.log2(np.where(p > 0, p, 1.0))).sum(axis=-1)

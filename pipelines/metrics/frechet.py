@@ -15,7 +15,7 @@ BLOCK_ROWS = 4096
 NEGLIGIBLE = 1e-6  # of the largest singular value: what is below carries rounding and no influence
 
 
-def checked_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray:
+def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray:
     """features (n, d) as floats, float32 kept; ValueError if not 2-d, of fewer than `at_least` rows, or not finite."""
     features = np.asarray(features)
     features = features if features.dtype == np.float32 else features.astype(np.float64)
@@ -54,14 +54,14 @@ class Moments:
         return Moments(count, mean, self.scatter + other.scatter + between)
 
 
-def moments(features: np.ndarray) -> Moments:
+def compute_moments(features: np.ndarray) -> Moments:
     """Moments of features (n, d), n >= 1; block by block, so that no copy in float64 is held."""
-    features = checked_features(features, "moment", at_least=1)
+    features = check_features(features, "moment", at_least=1)
     starts = range(0, len(features), BLOCK_ROWS)
-    return reduce(operator.add, (block_moments(features[start : start + BLOCK_ROWS]) for start in starts))
+    return reduce(operator.add, (compute_block_moments(features[start : start + BLOCK_ROWS]) for start in starts))
 
 
-def block_moments(features: np.ndarray) -> Moments:
+def compute_block_moments(features: np.ndarray) -> Moments:
     mean = features.mean(axis=0, dtype=np.float64)
     centred = features - mean
     return Moments(len(features), mean, centred.T @ centred)
@@ -79,7 +79,7 @@ class Transport:
     factor: np.ndarray  # (d, d) F U
 
 
-def transport(a: Moments, b: Moments) -> Transport:
+def compute_transport(a: Moments, b: Moments) -> Transport:
     """Raises ValueError for unequal dimensions and for fewer than 2 samples."""
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
@@ -90,14 +90,14 @@ def transport(a: Moments, b: Moments) -> Transport:
     return Transport(np.sqrt(np.maximum(squares, 0)), factor @ rotation)
 
 
-def frechet_distance(a: Moments, b: Moments, between: Transport | None = None) -> float:
+def compute_frechet_distance(a: Moments, b: Moments, between: Transport | None = None) -> float:
     """Squared Frechet distance of the two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (AB)^1/2)."""
-    between = between or transport(a, b)
+    between = between or compute_transport(a, b)
     traces = np.trace(a.covariance) + np.trace(b.covariance)
     return float(max(np.square(a.mean - b.mean).sum() + traces - 2 * between.roots.sum(), 0.0))
 
 
-def influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
+def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
     """W (d, r) of either side, with the distance's derivative by its covariance I - W W^T.
 
     With M = F^T B F = U s^2 U^T, W W^T is (B F U) s^-3 (B F U)^T by A, and (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2
@@ -108,7 +108,9 @@ def influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarr
     return (b.covariance @ factor) / roots**1.5, factor / np.sqrt(roots)
 
 
-def frechet_influence(features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray) -> np.ndarray:
+def compute_frechet_influence(
+    features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray
+) -> np.ndarray:
     """(n,) what each sample of a side adds to the distance, to first order, with mean zero; `through` is its W.
 
     Their mean over a resample says how far the distance moves. A resampled distance itself would be biased upwards, as

@@ -39,7 +39,7 @@ CHAINS_5 = {
 }
 
 
-def _chains_6(channels: int) -> dict[str, Chain]:
+def _make_chains_6(channels: int) -> dict[str, Chain]:
     c = channels
     return {
         "branch1x1": ((192, 1, 1),),
@@ -146,10 +146,10 @@ class Inception(nn.Module):
         self.Mixed_5c = Mixed(256, CHAINS_5, 64)
         self.Mixed_5d = Mixed(288, CHAINS_5, 64)
         self.Mixed_6a = Mixed(288, CHAINS_6A, None)
-        self.Mixed_6b = Mixed(768, _chains_6(128), 192)
-        self.Mixed_6c = Mixed(768, _chains_6(160), 192)
-        self.Mixed_6d = Mixed(768, _chains_6(160), 192)
-        self.Mixed_6e = Mixed(768, _chains_6(192), 192)
+        self.Mixed_6b = Mixed(768, _make_chains_6(128), 192)
+        self.Mixed_6c = Mixed(768, _make_chains_6(160), 192)
+        self.Mixed_6d = Mixed(768, _make_chains_6(160), 192)
+        self.Mixed_6e = Mixed(768, _make_chains_6(192), 192)
         self.Mixed_7a = Mixed(768, CHAINS_7A, None)
         self.Mixed_7b = Mixed(1280, CHAINS_7, 192)
         self.Mixed_7c = Mixed(2048, CHAINS_7, 192, max_pool=True)
@@ -199,7 +199,7 @@ def load_inception(path: str | Path) -> Inception:
     network.
     """
     path = Path(path)
-    sha256 = weights_sha256(path)
+    sha256 = hash_weights(path)
     try:
         if path.suffix == ".safetensors":
             state = safetensors.torch.load_file(path)
@@ -213,12 +213,12 @@ def load_inception(path: str | Path) -> Inception:
     except (RuntimeError, TypeError) as error:
         raise ValueError(f"{path}: not the weights of the FID Inception network ({error})") from error
     if sha256 != KNOWN_SHA256:
-        warnings.warn(weights_line(path), stacklevel=2)
+        warnings.warn(describe_weights(path), stacklevel=2)
     network.weights_sha256 = sha256
     return network
 
 
-def weights_sha256(path: str | Path) -> str:
+def hash_weights(path: str | Path) -> str:
     """sha256 of a weight file, hexadecimal. ValueError if it is missing or its name claims another one."""
     path = Path(path)
     if not path.is_file():
@@ -231,26 +231,26 @@ def weights_sha256(path: str | Path) -> str:
     return sha256
 
 
-def weights_line(path: str | Path) -> str:
+def describe_weights(path: str | Path) -> str:
     """Which file numbers come from, for a report: its path, its sha256, and whether it is the published one."""
-    sha256 = weights_sha256(path)
+    sha256 = hash_weights(path)
     known = sha256 == KNOWN_SHA256
     verdict = "the published ones" if known else f"not {KNOWN_FILE}: no score of theirs compares with published ones"
     return f"Inception weights {path}, sha256 {sha256}: {verdict}"
 
 
 @torch.inference_mode()
-def inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> InceptionFeatures:
+def compute_inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> InceptionFeatures:
     """pool3 (n, 2048), spatial (n, 2023) and logits (n, 1008), float32, of uint8 pictures (n, height, width, 3)."""
     device = network.fc.weight.device
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 would keep 10 of 23 bits on a GPU
-        parts = [network(batch.to(device)) for batch in _batches(images, batch_size)]
+        parts = [network(batch.to(device)) for batch in _iterate_batches(images, batch_size)]
     if not parts:
         return InceptionFeatures(*(np.empty((0, size), np.float32) for size in (FEATURES, SPATIAL_FEATURES, CLASSES)))
     return InceptionFeatures(*(torch.cat(part).float().cpu().numpy() for part in zip(*parts, strict=True)))
 
 
-def random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
+def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
     """A small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
 
     For tests and for comparing sources where no Inception weights are at hand. Distances of its features are called
@@ -268,14 +268,14 @@ def random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)
 
 
 @torch.inference_mode()
-def random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
+def compute_random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
     """(n, 480) float32 features of uint8 pictures (n, height, width, 3) under `random_network(seed)`.
 
     The mean over the picture after each convolution (32 + 64 + 128 + 256): coarse and fine structure alike.
     """
-    network = random_network(seed)
+    network = make_random_network(seed)
     parts = []
-    for batch in _batches(images, batch_size):
+    for batch in _iterate_batches(images, batch_size):
         x, means = batch.permute(0, 3, 1, 2).float() / 128 - 1, []
         for layer in network:
             x = layer(x)
@@ -285,7 +285,7 @@ def random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> 
     return torch.cat(parts).numpy() if parts else np.empty((0, 480), np.float32)
 
 
-def _batches(images: np.ndarray, batch_size: int) -> Iterator[Tensor]:
+def _iterate_batches(images: np.ndarray, batch_size: int) -> Iterator[Tensor]:
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[-1] != 3:
         raise ValueError(f"pictures must be uint8 (n, height, width, 3), got {images.dtype} {images.shape}")
     for start in range(0, len(images), batch_size):

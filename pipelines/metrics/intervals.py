@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
     high: float
 
 
-def draws(count: int, key: int = 0) -> np.ndarray:
+def draw_resamples(count: int, key: int = 0) -> np.ndarray:
     """(1 + DRAWS, count) how often each scene is taken: every one once, then the draws. float64, but whole numbers.
 
     `key` tells the draws of one side from those of another.
@@ -36,35 +36,35 @@ def draws(count: int, key: int = 0) -> np.ndarray:
     return np.vstack([np.ones((1, count)), drawn])
 
 
-def weights(count: int, key: int = 0) -> np.ndarray:
+def compute_weights(count: int, key: int = 0) -> np.ndarray:
     """`draws` in rows of sum 1."""
-    return draws(count, key) / count
+    return draw_resamples(count, key) / count
 
 
-def estimate(scores: np.ndarray) -> Estimate:
+def make_estimate(scores: np.ndarray) -> Estimate:
     """From the scores (1 + DRAWS,) under `weights`. Draws that have none, NaN, do not count."""
     value, drawn = float(scores[0]), scores[1:]
     low, high = np.quantile(drawn[np.isfinite(drawn)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Estimate(value, float(low), float(high))
 
 
-def mean_estimate(values: np.ndarray, key: int = 0) -> Estimate:
+def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
     """Mean of values (n,), a value per scene."""
-    return estimate(draws(len(values), key) @ np.asarray(values, np.float64) / len(values))
+    return make_estimate(draw_resamples(len(values), key) @ np.asarray(values, np.float64) / len(values))
 
 
-def ratio_estimates(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
+def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
     """Sum over sum for each column of (n, m) and (n, m), a row per scene; None where nothing is to be judged.
 
     Covers shares of objects (bad ones over all) and means over the scenes that have a value (values over ones).
     """
-    drawn = draws(len(numerators), key)
+    drawn = draw_resamples(len(numerators), key)
     above, below = (drawn @ np.asarray(part, np.float64) for part in (numerators, denominators))
     scores = np.divide(above, below, out=np.full_like(above, np.nan), where=below > 0)
-    return [estimate(scores[:, m]) if below[0, m] > 0 else None for m in range(scores.shape[1])]
+    return [make_estimate(scores[:, m]) if below[0, m] > 0 else None for m in range(scores.shape[1])]
 
 
-def moved(value: float, influences: Sequence[np.ndarray]) -> Estimate:
+def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> Estimate:
     """A score that moves, to first order, by the mean of what each side's samples (n,) add to it."""
-    shifts = sum(weights(len(part), key) @ part for key, part in enumerate(influences))
-    return estimate(value + shifts)
+    shifts = sum(compute_weights(len(part), key) @ part for key, part in enumerate(influences))
+    return make_estimate(value + shifts)

@@ -7,37 +7,37 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.metrics.intervals import Estimate, estimate, weights
-from pipelines.metrics.neighbours import comparable
+from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
+from pipelines.metrics.neighbours import require_comparable
 
 GROUP_SAMPLES = 1000  # the usual size of subsets
 
 
-def kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate:
+def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate:
     """Mean over groups of about 1000 samples of a side, all samples in one group each; k(x, y) = (x . y / d + 1)^3.
 
     The common estimate takes 50 or 100 random subsets of 1000; its expectation is the same, whatever the groups. Draws
     are made within groups; a sample drawn twice is no pair, or its own kernel would come in.
     """
-    real, generated = comparable(real, generated, at_least=2)
+    real, generated = require_comparable(real, generated, at_least=2)
     groups = max(1, min(len(real), len(generated)) // GROUP_SAMPLES)
     scores = []
     for group in range(groups):
         # Every so many: neighbouring samples of a drive fall into different groups.
         x, y = (side[group::groups].astype(np.float64) for side in (real, generated))
-        drawn = [weights(len(z), key=2 * group + k) for k, z in enumerate((x, y))]
-        within = [pairs(w, kernel(z, z)) for w, z in zip(drawn, (x, y), strict=True)]
-        across = ((drawn[0] @ kernel(x, y)) * drawn[1]).sum(axis=1)
+        drawn = [compute_weights(len(z), key=2 * group + k) for k, z in enumerate((x, y))]
+        within = [sum_pairs(w, compute_kernel(z, z)) for w, z in zip(drawn, (x, y), strict=True)]
+        across = ((drawn[0] @ compute_kernel(x, y)) * drawn[1]).sum(axis=1)
         scores.append(within[0] + within[1] - 2 * across)
-    return estimate(np.mean(scores, axis=0))
+    return make_estimate(np.mean(scores, axis=0))
 
 
-def kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def compute_kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, m)"""
     return (x @ y.T / x.shape[1] + 1) ** 3
 
 
-def pairs(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
+def sum_pairs(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
     """(b,) mean of a kernel matrix (n, n) over pairs of different samples, under weights (b, n)."""
     own = np.square(weights)
     total = ((weights @ gram) * weights).sum(axis=1) - own @ np.diag(gram)

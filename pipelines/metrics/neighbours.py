@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.metrics.frechet import checked_features
+from pipelines.metrics.frechet import check_features
 
 BLOCK_ROWS = 1024  # rows of a distance matrix held at once: 4 kB x number of columns
 SPARE_NEIGHBOURS = 8  # candidates beyond the k-th whose upper bounds bound its distance
@@ -27,7 +27,7 @@ FLOAT32_ROUNDING = 2.0**-24
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class NeighbourhoodScores:
     """Scores at one neighbourhood size. A ball reaches from a sample to its k-th nearest other sample of its side.
 
     Precision and recall: Kynkaanniemi et al. 2019, and the paper's supplement; density and coverage: Naeem et al. 2020.
@@ -58,7 +58,7 @@ class Neighbourhood:
 
 
 @dataclass(frozen=True, eq=False)
-class Basis:
+class PrincipalBasis:
     """Principal axes (p, d) of a sample of both sides, orthonormal rows, and their mean (d,), float64.
 
     None for the features' own axes, all of them.
@@ -69,7 +69,7 @@ class Basis:
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class FeatureSet:
     """One side's features (n, d) with their short vectors.
 
     left (n, p + 3) and right (n, p + 3), float32: left[i] . right[j] is the squared distance of the short vectors.
@@ -88,50 +88,54 @@ class Side:
         return len(self.features)
 
 
-def prepare(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[Side, Side]:
+def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[FeatureSet, FeatureSet]:
     """Both sides in the filter's form.
 
     Raises ValueError for features that are not finite, of unequal width, or of max(k) samples or fewer.
     """
-    real, generated = comparable(real, generated, at_least=checked_k(k) + 1)
-    basis = principal_axes(real, generated)
-    sides = short_vectors(real, basis), short_vectors(generated, basis)
+    real, generated = require_comparable(real, generated, at_least=check_k(k) + 1)
+    basis = compute_principal_axes(real, generated)
+    sides = project_to_axes(real, basis), project_to_axes(generated, basis)
     whole = sum(np.square(side.length).sum() for side in sides)
     rest = sum(np.square(side.rest).sum() for side in sides)
     if rest <= MOST_LEFT_OVER * whole:
         return sides
-    basis = Basis(basis.mean, None)
-    return short_vectors(real, basis), short_vectors(generated, basis)
+    basis = PrincipalBasis(basis.mean, None)
+    return project_to_axes(real, basis), project_to_axes(generated, basis)
 
 
-def neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int] = (3,)) -> list[Neighbourhood]:
+def compute_neighbourhoods(
+    real: np.ndarray, generated: np.ndarray, k: Sequence[int] = (3,)
+) -> list[NeighbourhoodScores]:
     """A Neighbourhood for each k, from features (n, d) and (m, d) (paper, supplement, Evaluation).
 
     Memory: BLOCK_ROWS x max(n, m) float32, besides the features. The paper's protocol takes n = m; other sizes work.
     Raises ValueError as `prepare` does.
     """
-    sides = prepare(real, generated, k)
-    radii = [ball_radii(side, range(len(side)), k) for side in sides]
-    return judged(k, [within(*sides, *radii, range(len(real)))])
+    sides = prepare_features(real, generated, k)
+    radii = [compute_ball_radii(side, range(len(side)), k) for side in sides]
+    return judge_neighbours(k, [find_within(*sides, *radii, range(len(real)))])
 
 
-def judged(k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[Neighbourhood]:
+def judge_neighbours(
+    k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> list[NeighbourhoodScores]:
     """A Neighbourhood for each k from what `within` gave for all parts of the real samples, in order."""
     in_real, in_generated, covered = zip(*parts, strict=True)
     found = sum(in_real), np.concatenate(in_generated, axis=1), np.concatenate(covered, axis=1)
-    return [Neighbourhood(size, *(part[index] for part in found)) for index, size in enumerate(k)]
+    return [NeighbourhoodScores(size, *(part[index] for part in found)) for index, size in enumerate(k)]
 
 
-def checked_k(k: Sequence[int]) -> int:
+def check_k(k: Sequence[int]) -> int:
     """The largest of the neighbourhood sizes; ValueError if there is none or one is below 1."""
     if not k or min(k) < 1:
         raise ValueError(f"k must name neighbourhood sizes of at least 1, got {list(k)}")
     return max(k)
 
 
-def comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[np.ndarray, np.ndarray]:
+def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[np.ndarray, np.ndarray]:
     """Both sides, checked. Raises ValueError as `checked_features` does, and for unequal dimensions."""
-    real, generated = checked_features(real, "real", at_least), checked_features(generated, "generated", at_least)
+    real, generated = check_features(real, "real", at_least), check_features(generated, "generated", at_least)
     if real.shape[1] != generated.shape[1]:
         raise ValueError(f"real features have {real.shape[1]} dimensions, generated {generated.shape[1]}")
     return real, generated
@@ -140,7 +144,7 @@ def comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[
 # ------------------------------------------------------------------------------------------------------- filter
 
 
-def principal_axes(real: np.ndarray, generated: np.ndarray) -> Basis:
+def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> PrincipalBasis:
     """As many principal axes as hold KEPT_VARIANCE of some samples of both sides, evenly taken."""
     count = min(BASIS_SAMPLES // 2, len(real), len(generated))
     some = np.concatenate([side[np.arange(count) * len(side) // count] for side in (real, generated)])
@@ -151,10 +155,10 @@ def principal_axes(real: np.ndarray, generated: np.ndarray) -> Basis:
     held = np.cumsum(strength[::-1].clip(0))
     count = 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))
     axes, _ = np.linalg.qr(centred.T @ vectors[:, -count:])
-    return Basis(mean, axes.T)
+    return PrincipalBasis(mean, axes.T)
 
 
-def short_vectors(features: np.ndarray, basis: Basis) -> Side:
+def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
     """The filter's form of features (n, d).
 
     For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2, and |r - r'| lies between the difference and the
@@ -175,24 +179,24 @@ def short_vectors(features: np.ndarray, basis: Basis) -> Side:
     left[:, -2], left[:, -1], right[:, -2], right[:, -1] = norm, 1, 1, norm
     # |rounding of a product of t terms| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2), and t + 4 grants the terms' own.
     slack = 2 * (width + 6) * FLOAT32_ROUNDING * norm
-    return Side(features, left, right, np.sqrt(norm), rest, slack)
+    return FeatureSet(features, left, right, np.sqrt(norm), rest, slack)
 
 
 # ------------------------------------------------------------------------------------------------------- verify
 
 
-def ball_radii(side: Side, rows: range, k: Sequence[int]) -> np.ndarray:
+def compute_ball_radii(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
     """(len(k), len(rows)) squared distance of each sample of `rows` to its k-th nearest other sample."""
     radii = np.empty((len(k), len(rows)))
-    for block in blocks(rows):
-        radii[:, block.start - rows.start : block.stop - rows.start] = nearest(
-            side, side, block, checked_k(k), themselves=True
+    for block in iterate_blocks(rows):
+        radii[:, block.start - rows.start : block.stop - rows.start] = find_nearest(
+            side, side, block, check_k(k), themselves=True
         )[0][:, [size - 1 for size in k]].T
     return radii
 
 
-def nearest(
-    side: Side, others: Side, rows: range, count: int, themselves: bool = False
+def find_nearest(
+    side: FeatureSet, others: FeatureSet, rows: range, count: int, themselves: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances (rows, count) of samples of `side` to the nearest of `others`, ascending, and their indices.
 
@@ -206,16 +210,16 @@ def nearest(
     here, slack = slice(rows.start, rows.stop), side.slack[rows.start : rows.stop] + others.slack.max()
     high = low.numpy() + 4 * side.rest[here, None] * others.rest[column.numpy()]
     reach = np.sort(high, axis=1)[:, count - 1] + 2 * slack
-    row, column = torch.nonzero(bound <= upper_float32(reach)[:, None]).numpy().T
-    squared = squared_distances(side.features, row + rows.start, others.features, column)
+    row, column = torch.nonzero(bound <= round_up_float32(reach)[:, None]).numpy().T
+    squared = compute_squared_distances(side.features, row + rows.start, others.features, column)
     order = np.lexsort((column, squared, row))
     first = np.searchsorted(row, np.arange(len(rows)))
     chosen = order[first[:, None] + np.arange(count)]
     return squared[chosen], column[chosen]
 
 
-def within(
-    real: Side, generated: Side, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
+def find_within(
+    real: FeatureSet, generated: FeatureSet, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the balls of both sides hold, for the real samples of `rows`; radii squared, (len(k), n) and (len(k), m).
 
@@ -224,9 +228,9 @@ def within(
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))
-    to_column = upper_float32(generated_radii.max(axis=0) + generated.slack + real.slack.max())
-    to_row = upper_float32(real_radii.max(axis=0) + real.slack + generated.slack.max())
-    for block in blocks(rows):
+    to_column = round_up_float32(generated_radii.max(axis=0) + generated.slack + real.slack.max())
+    to_row = round_up_float32(real_radii.max(axis=0) + real.slack + generated.slack.max())
+    for block in iterate_blocks(rows):
         bound = torch.from_numpy(real.left[block.start : block.stop] @ generated.right.T)
         close = bound <= torch.maximum(to_row[block.start : block.stop, None], to_column)
         row, column = torch.nonzero(close).numpy().T
@@ -237,7 +241,7 @@ def within(
         unsure = np.zeros(len(row), bool)
         for radii in (real_radii[:, row], generated_radii[:, column]):
             unsure |= ((low <= radii) & (radii <= high)).any(axis=0)
-        squared[unsure] = squared_distances(real.features, row[unsure], generated.features, column[unsure])
+        squared[unsure] = compute_squared_distances(real.features, row[unsure], generated.features, column[unsure])
         for index in range(len(real_radii)):
             held = squared <= real_radii[index, row]
             in_real[index] += np.bincount(column[held], minlength=len(generated))
@@ -246,7 +250,7 @@ def within(
     return in_real, in_generated, covered
 
 
-def squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
+def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
     """(p,) squared distances of a[i] and b[j] in float64, by differences: the same bits whichever side comes first."""
     squared = np.empty(len(i))
     for start in range(0, len(i), PAIRS_PER_BLOCK):
@@ -256,12 +260,12 @@ def squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray
     return squared
 
 
-def upper_float32(values: np.ndarray) -> Tensor:
+def round_up_float32(values: np.ndarray) -> Tensor:
     """As float32, not smaller."""
     rounded = values.astype(np.float32)
     return torch.from_numpy(np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded))
 
 
-def blocks(rows: range) -> list[range]:
+def iterate_blocks(rows: range) -> list[range]:
     """Parts of BLOCK_ROWS rows."""
     return [range(start, min(start + BLOCK_ROWS, rows.stop)) for start in range(rows.start, rows.stop, BLOCK_ROWS)]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from models.batch import LayoutBatch
-from models.geometry.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
+from models.geometry.iou3d import compute_ellipsoid_iou3d_matrix, compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.voxels import NUM_CLASSES
 from pipelines.schema.palette import CLASS_ID, EMPTY
@@ -41,7 +41,7 @@ class GroundSums:
         return GroundSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
 
 
-def ground_sums(
+def sum_ground(
     true_occupied: np.ndarray, true_height_m: np.ndarray, occupied: np.ndarray, height_m: np.ndarray
 ) -> GroundSums:
     """Sums of one scene (or a stack of scenes) from rasters (..., G, H, W): masks bool, heights in metres.
@@ -75,7 +75,7 @@ class GroundScores:
     class_height_mse: dict[str, float]
 
 
-def ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray) -> GroundScores:
+def compute_ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray) -> GroundScores:
     """Scores of the summed scenes; height_bounds_m is (2,) or (G, 2), lowest and highest height of the data.
 
     Raises ValueError if no pixel is occupied at all or if bounds are empty intervals.
@@ -140,7 +140,7 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
         raise ValueError(f"scene {prediction.scene_id}: existence holds NaN or infinite numbers")
     same_category = prediction.category[:, None] == truth.category
     scored = np.isin(prediction.category, SCORED)
-    iou = iou3d_matrix(boxes_of(prediction), boxes_of(truth), wanted=same_category & scored[:, None])
+    iou = compute_iou3d_matrix(extract_boxes(prediction), extract_boxes(truth), wanted=same_category & scored[:, None])
     category, score, rank, hit = [], [], [], []
     truths = np.zeros(len(CATEGORIES), np.int64)
     for c in SCORED:
@@ -192,7 +192,7 @@ class DetectionScores:
         return {f"{threshold:.2f}": float(mean) for threshold, mean in zip(THRESHOLDS, means, strict=True)}
 
 
-def detection_scores(
+def compute_detection_scores(
     matches: Matches, max_detections: int | None = None, min_score: float = -np.inf
 ) -> DetectionScores:
     """AP3D and AP3D@50 as in Omni3D (paper, Sec. 4.1), over all scenes at once.
@@ -207,7 +207,7 @@ def detection_scores(
     for c in np.flatnonzero(matches.truths):
         of_category = np.flatnonzero(keep & (matches.category == c))
         order = of_category[np.argsort(-matches.score[of_category], kind="stable")]
-        table[CATEGORIES[c]] = average_precision(matches.hit[order], int(matches.truths[c]))
+        table[CATEGORIES[c]] = compute_average_precision(matches.hit[order], int(matches.truths[c]))
     if not table:
         raise ValueError("AP3D is undefined: no scored category has a true primitive")
     means = {name: float(values.mean()) for name, values in table.items()}
@@ -221,7 +221,7 @@ def detection_scores(
     )
 
 
-def average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
+def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
     """(t,) mean over 101 recall points of the interpolated precision; hit (d, t), best score first, num_truths > 0.
 
     The precision at a recall is the highest one reached at that recall or beyond, 0 if it is never reached.
@@ -256,7 +256,7 @@ class PairSums:
         return PairSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
 
 
-def pair_sums(truth: Scene, prediction: Scene) -> PairSums:
+def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
     """Sums of one scene. Primitives are matched one to one within their category such that the sum of their IoU3D is
     greatest; two that do not overlap are no pair.
 
@@ -265,8 +265,10 @@ def pair_sums(truth: Scene, prediction: Scene) -> PairSums:
     """
     sums = PairSums(truth.counts(), prediction.counts(), *np.zeros((2, len(CATEGORIES))))
     for c in np.flatnonzero((sums.truths > 0) & (sums.predictions > 0)):
-        matrix = ellipsoid_iou3d_matrix if c == ELLIPSOID else iou3d_matrix
-        iou = matrix(boxes_of(prediction.select(prediction.category == c)), boxes_of(truth.select(truth.category == c)))
+        matrix = compute_ellipsoid_iou3d_matrix if c == ELLIPSOID else compute_iou3d_matrix
+        iou = matrix(
+            extract_boxes(prediction.select(prediction.category == c)), extract_boxes(truth.select(truth.category == c))
+        )
         matched = iou[linear_sum_assignment(iou, maximize=True)]
         sums.pairs[c], sums.iou[c] = (matched > 0).sum(), matched.sum()
     return sums
@@ -289,7 +291,7 @@ class PairScores:
     category_right: dict[str, float]
 
 
-def pair_scores(sums: PairSums) -> PairScores:
+def compute_pair_scores(sums: PairSums) -> PairScores:
     """Scores of the summed scenes. Raises ValueError if no scored category has a truth."""
     truths, predictions, pairs, iou = (getattr(sums, name) for name in PairSums.__dataclass_fields__)
     total = [part[list(SCORED)].sum() for part in (truths, predictions, pairs, iou)]
@@ -314,7 +316,7 @@ def pair_scores(sums: PairSums) -> PairScores:
 # --------------------------------------------------------------------------------------------------------- voxels
 
 
-def voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
+def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
     """(classes, classes) int64 voxels by true class (rows) and predicted class, from class ids of equal shape.
 
     Confusion matrices add up over scenes. Raises ValueError if the shapes differ.
@@ -337,7 +339,7 @@ class VoxelScores:
     class_iou: dict[str, float]
 
 
-def voxel_scores(confusion: np.ndarray) -> VoxelScores:
+def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
     """Scores of a dataset's summed confusion matrix. Raises ValueError if no voxel is filled on either side."""
     hit, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
     class_iou = {name: float(hit[k] / either[k]) for name, k in CLASS_ID.items() if either[k]}
@@ -365,7 +367,7 @@ MEMORY = (
 )
 
 
-def memory_bytes(layout: LayoutBatch, latent: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+def measure_memory_bytes(layout: LayoutBatch, latent: np.ndarray, voxels: np.ndarray) -> np.ndarray:
     """(6,) int64 bytes of the forms MEMORY that one scene takes (paper, Tab. 1); layout is a batch of one."""
     return np.array(
         [

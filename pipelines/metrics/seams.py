@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.geometry.iou3d import boxes_of, iou3d_matrix
+from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import Scene
-from pipelines.metrics.intervals import Estimate, estimate, weights
+from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 MEASURES = (
     "class_changes",  # pairs of pixels across the line, either of them ground, that differ in class
@@ -27,7 +27,7 @@ END_M = 0.25  # an object that ends so close to the line ends at it
 DOUBLE_IOU3D = 0.05
 
 
-def seam_record(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()) -> np.ndarray:
+def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()) -> np.ndarray:
     """(4, 2, 2) of MEASURES for the lines before pixel rows `rows` and pixel columns `cols`.
 
     Raises ValueError for a line on or beyond the scene's edge.
@@ -35,8 +35,8 @@ def seam_record(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()
     grid = scene.grid
     height_m, ground_class = scene.surface()
     total = np.zeros((len(MEASURES), 2, 2))
-    corners_m = footprint_ranges(scene)
-    doubles = overlapping_pairs(scene)
+    corners_m = compute_footprint_ranges(scene)
+    doubles = find_overlapping_pairs(scene)
     for axis, seams, count in ((0, rows, grid.rows), (1, cols, grid.cols)):
         if bad := [line for line in seams if not 0 < line < count]:
             raise ValueError(f"scene {scene.scene_id}: seam before pixel {bad[0]}, expected 1 to {count - 1}")
@@ -45,17 +45,17 @@ def seam_record(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()
         low_m, high_m = edge_m - corners_m[:, axis, 1], edge_m - corners_m[:, axis, 0]
         center_m = edge_m - scene.center_m[:, axis]
         pixels = ground_class.swapaxes(0, axis), height_m.swapaxes(0, axis)
-        across = np.stack([line_record(*pixels, line) for line in range(1, count)])
+        across = np.stack([measure_line(*pixels, line) for line in range(1, count)])
         at_m = grid.resolution_m * np.arange(1, count)
-        objects = object_records(at_m, low_m, high_m, center_m, doubles)
+        objects = measure_objects(at_m, low_m, high_m, center_m, doubles)
         every = np.concatenate([across, objects], axis=1)  # (lines, measures, 2)
-        for line, near in neighbours(seams, count, grid.resolution_m).items():
+        for line, near in list_parallel_lines(seams, count, grid.resolution_m).items():
             total[:, 0] += every[line - 1]
             total[:, 1] += every[near - 1].mean(axis=0) if len(near) else 0
     return total
 
 
-def neighbours(seams: Sequence[int], count: int, resolution_m: float) -> dict[int, np.ndarray]:
+def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -> dict[int, np.ndarray]:
     """The lines that each seam is compared with."""
     lines = np.arange(1, count)
     nearest_m = np.abs(lines[:, None] - np.array(seams, int).reshape(1, -1)).min(axis=1, initial=count) * resolution_m
@@ -63,7 +63,7 @@ def neighbours(seams: Sequence[int], count: int, resolution_m: float) -> dict[in
     return {seam: free[np.abs(free - seam) * resolution_m <= FAR_M] for seam in seams}
 
 
-def line_record(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> np.ndarray:
+def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> np.ndarray:
     """(2, 2) class changes and height steps across the line before row `line`."""
     before, after = ground_class[line - 1], ground_class[line]
     either, both = (before >= 0) | (after >= 0), (before >= 0) & (after >= 0)
@@ -71,7 +71,7 @@ def line_record(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> np
     return np.array([[(before != after).sum(), either.sum()], [step.sum(), both.sum()]], float)
 
 
-def object_records(
+def measure_objects(
     at_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, center_m: np.ndarray, doubles: np.ndarray
 ) -> np.ndarray:
     """(lines, 2, 2) cut and doubled objects at lines (l,), from the objects' ranges and centres along the normal."""
@@ -91,30 +91,30 @@ def object_records(
     ).astype(float)
 
 
-def footprint_ranges(scene: Scene) -> np.ndarray:
+def compute_footprint_ranges(scene: Scene) -> np.ndarray:
     """(n, 2, 2) least and greatest x, and y, of each primitive's box."""
     reach = 0.5 * (np.abs(scene.rotation) * scene.size_m[:, None, :]).sum(axis=2)[:, :2]
     return np.stack([scene.center_m[:, :2] - reach, scene.center_m[:, :2] + reach], axis=2)
 
 
-def overlapping_pairs(scene: Scene) -> np.ndarray:
+def find_overlapping_pairs(scene: Scene) -> np.ndarray:
     """(p, 2) objects of one category whose IoU3D is above DOUBLE_IOU3D."""
-    boxes = boxes_of(scene)
-    iou = np.triu(iou3d_matrix(boxes, boxes), 1)
+    boxes = extract_boxes(scene)
+    iou = np.triu(compute_iou3d_matrix(boxes, boxes), 1)
     iou[scene.category[:, None] != scene.category] = 0
     return np.argwhere(iou > DOUBLE_IOU3D)
 
 
-def seam_ratios(records: np.ndarray, key: int = 0) -> dict[str, Estimate | None]:
+def estimate_seam_ratios(records: np.ndarray, key: int = 0) -> dict[str, Estimate | None]:
     """Rate across seams over the rate across neighbouring lines, from records (scenes, 4, 2, 2).
 
     None where no neighbouring line has anything that could show.
     """
-    drawn = np.tensordot(weights(len(records), key), records, axes=1)  # (1 + draws, 4, 2, 2)
+    drawn = np.tensordot(compute_weights(len(records), key), records, axes=1)  # (1 + draws, 4, 2, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         rates = drawn[..., 0] / drawn[..., 1]
         ratios = rates[..., 0] / rates[..., 1]
     return {
-        name: estimate(ratios[:, index]) if np.isfinite(ratios[0, index]) else None
+        name: make_estimate(ratios[:, index]) if np.isfinite(ratios[0, index]) else None
         for index, name in enumerate(MEASURES)
     }

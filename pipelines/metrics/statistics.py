@@ -11,14 +11,14 @@ from models.scene import CATEGORIES, Scene
 EXTENTS = ("length_m", "width_m", "height_m")
 
 
-def statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
+def list_statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
     """Columns of `layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share."""
     counts = [f"num_{category}" for category in CATEGORIES]
     extents = [f"{category}_{extent}" for category in CATEGORIES for extent in EXTENTS]
     return (*counts, *extents, *(f"{name}_share" for name in ground_classes))
 
 
-def layout_statistics(scene: Scene) -> np.ndarray:
+def compute_layout_statistics(scene: Scene) -> np.ndarray:
     """(11 + 33 + G,) float64, columns as in `statistic_names(scene.ground_classes)`.
 
     Counts; mean extents in metres, NaN for an absent category; share of the scene's pixels per ground class (classes
@@ -32,7 +32,7 @@ def layout_statistics(scene: Scene) -> np.ndarray:
     return np.concatenate([counts, extents.ravel(), shares])
 
 
-def standardised(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Layout statistics (n, s) and (m, s) as features: shifted and scaled by the reference's mean and deviation.
 
     So distances have no unit, and each column about the same weight (a constant column is only shifted: its unit is 1).

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy import ndimage
 
-from models.geometry.iou3d import boxes_of, iou3d_matrix
+from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORIES, CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
-from pipelines.schema.density_labels import DensityThresholds, density
+from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
     "overlapping",  # solid primitives with IoU3D > 0.05 with another solid one
@@ -42,12 +42,12 @@ ROAD_CLASSES = ("road", "crossing")
 DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 
-def slab_offset_m(surface: str) -> float:
+def find_slab_offset_m(surface: str) -> float:
     """How far a dataset's ground heights lie above what objects stand on, by its LayoutSpec's `surface`."""
     return SLAB_OFFSET_M if surface == "top" else 0.0
 
 
-def faults(
+def find_faults(
     scene: Scene, slab_offset_m: float, tolerance_m: float = TOLERANCE_M
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """For each of MEASURES but the last: which primitives (n,) bool are at fault, and among which it is looked for.
@@ -65,9 +65,9 @@ def faults(
 
     standing = np.isin(category, STANDING)
     vehicles, buildings = np.isin(category, VEHICLES), category == BUILDING
-    drivable, road = (_mask(scene, classes)[pixel] for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
+    drivable, road = (_make_mask(scene, classes)[pixel] for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
     looked_for = {
-        "overlapping": (_overlapping(scene), np.isin(category, SOLID)),
+        "overlapping": (_find_overlapping(scene), np.isin(category, SOLID)),
         "floating": (above_m > tolerance_m, standing & known),
         "sunken": (above_m < -tolerance_m, standing & known),
         "over_unknown_ground": (~known, standing & inside),
@@ -77,13 +77,13 @@ def faults(
     return {name: (bad & among, among) for name, (bad, among) in looked_for.items()}
 
 
-def scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
+def compute_scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
     """(7, 2) numerators and denominators of MEASURES for one scene; slab_offset_m as for `faults`."""
-    shares = [(int(bad.sum()), int(among.sum())) for bad, among in faults(scene, slab_offset_m).values()]
-    return np.array([*shares, _largest_component(_mask(scene, ROAD_CLASSES))], np.float64)
+    shares = [(int(bad.sum()), int(among.sum())) for bad, among in find_faults(scene, slab_offset_m).values()]
+    return np.array([*shares, _find_largest_component(_make_mask(scene, ROAD_CLASSES))], np.float64)
 
 
-def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
+def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
     """(3, 2) of LABEL_MEASURES: is the scene's own density label the one it bears (the one asked for)?
 
     A label that was not asked for counts nowhere. Raises ValueError for a scene that bears no label at all.
@@ -96,37 +96,37 @@ def label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: Density
         (VEHICLES, vehicle, scene.vehicle_density),
     ):
         members = np.isin(scene.category, categories)
-        own = density(members.sum(), scene.volume_m3[members].sum(), thresholds)
+        own = classify_density(members.sum(), scene.volume_m3[members].sum(), thresholds)
         right.append(None if label is None else bool(own == label))
     right.append(None if None in right else all(right))
     return np.array([[bool(value), value is not None] for value in right], np.float64)
 
 
-def validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
+def compute_validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
     """Share per measure over all scenes, from records (scenes, measures, 2); None where nothing could be judged."""
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T
     return {n: float(a / b) if b > 0 else None for n, a, b in zip(names, numerator, denominator, strict=True)}
 
 
-def _overlapping(scene: Scene) -> np.ndarray:
+def _find_overlapping(scene: Scene) -> np.ndarray:
     """(n,) bool: a solid primitive that overlaps another solid one by more than OVERLAP_IOU3D."""
     solid = np.flatnonzero(np.isin(scene.category, SOLID))
-    boxes = boxes_of(scene).take(solid)
-    iou = iou3d_matrix(boxes, boxes)
+    boxes = extract_boxes(scene).take(solid)
+    iou = compute_iou3d_matrix(boxes, boxes)
     np.fill_diagonal(iou, 0)
     overlapping = np.zeros(len(scene), bool)
     overlapping[solid] = (iou > OVERLAP_IOU3D).any(axis=1)
     return overlapping
 
 
-def _mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
+def _make_mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
     """(H, W) bool: any of the classes occupies the pixel (classes may overlap)."""
     index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
     return scene.occupied[index].any(axis=0)
 
 
-def _largest_component(mask: np.ndarray) -> tuple[float, int]:
+def _find_largest_component(mask: np.ndarray) -> tuple[float, int]:
     """Share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
     components, _ = ndimage.label(mask)
     sizes = np.bincount(components.ravel())[1:]

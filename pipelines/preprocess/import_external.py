@@ -16,14 +16,14 @@ import numpy as np
 import pyarrow as pa
 import ray.data
 
-from pipelines.io.mesh_import import scene_from_glb
-from pipelines.io.voxel_import import read_voxels, voxel_picture
+from pipelines.io.mesh_import import import_glb
+from pipelines.io.voxel_import import draw_voxels, read_voxels
 from pipelines.metrics.adm_npz import write_npz
-from pipelines.preprocess.shard_writer import joined_tables
+from pipelines.preprocess.shard_writer import join_tables
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import per_row
+from pipelines.runtime.ray_tasks import map_rows
 from pipelines.schema.axis_convention import Axes
-from pipelines.schema.tables import Shard, rejects_table, scene_tables
+from pipelines.schema.tables import Shard, make_rejects_table, make_scene_tables
 
 MAX_FILES_PER_SHARD = 64
 WANTED_SHARDS = 8
@@ -52,17 +52,17 @@ class ImportRequest:
         """Index, scene id and URI of each of a shard's files."""
         start = shard.number * self.files_per_shard
         for index, file in enumerate(self.files[start : start + self.files_per_shard], start):
-            yield index, scene_id(file), storage.join(self.base, file)
+            yield index, make_scene_id(file), storage.join_uri(self.base, file)
 
     def pictures_path(self, shard: Shard) -> str:
-        return storage.join(self.output, f".pictures-{self.name}", f"part-{shard.number:05d}.npz")
+        return storage.join_uri(self.output, f".pictures-{self.name}", f"part-{shard.number:05d}.npz")
 
     @property
     def target(self) -> str:
-        return storage.join(self.output, f"{self.name}.npz")
+        return storage.join_uri(self.output, f"{self.name}.npz")
 
 
-def scene_id(file: str) -> str:
+def make_scene_id(file: str) -> str:
     """Name of a scene by its file: "night/007.glb" is night-007."""
     return file.rsplit(".", 1)[0].replace("/", "-")
 
@@ -77,12 +77,12 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
         fixed = fixed.rsplit("/", 1)[0]
     files = [f[len(fixed.rstrip("/")) + 1 :] for f in storage.list_files(fixed, suffix)]
     if fixed != pattern:
-        files = [file for file in files if fnmatch(storage.join(fixed, file), pattern)]
+        files = [file for file in files if fnmatch(storage.join_uri(fixed, file), pattern)]
     if not files:
         raise ValueError(
             f"{pattern}: no {suffix} files there; give a directory or a quoted pattern such as 'DIR/*{suffix}'"
         )
-    names = [scene_id(file) for file in files]
+    names = [make_scene_id(file) for file in files]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{pattern}: two files would both be scene {twice!r}; rename one")
@@ -102,7 +102,7 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
         except ValueError as error:
             rejects.append({"scene_id": name, "sequence": request.name, "frame": index, "reason": str(error)})
     if rejects:
-        storage.write_parquet(rejects_table(rejects), shard.path("rejects"))
+        storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
     return names, contents
 
 
@@ -114,14 +114,14 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
     shard = request.shards()[row["shard"]]
 
     def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
-        scene = scene_from_glb(uri, name, request.axes)
+        scene = import_glb(uri, name, request.axes)
         about = {"source": shard.source, "split": shard.split, "sequence": request.name, "frame": index}
-        return scene_tables([replace(scene, **about)])
+        return make_scene_tables([replace(scene, **about)])
 
     if shard.is_written() and not storage.exists(shard.path("rejects")):
         return {"shard": row["shard"], "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
     names, parts = read_files(request, shard, tables)
-    for table, content in joined_tables(parts).items() if parts else ():
+    for table, content in join_tables(parts).items() if parts else ():
         storage.write_parquet(content, shard.path(table))
     if len(names) == len(list(request.files_of(shard))):
         storage.delete_file(shard.path("rejects"))
@@ -134,7 +134,7 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
         return {"shard": row["shard"], "scenes": np.load(io.BytesIO(storage.read_bytes(path)))["names"].tolist()}
-    names, pictures = read_files(request, shard, lambda _, __, uri: voxel_picture(read_voxels(uri, request.axes)))
+    names, pictures = read_files(request, shard, lambda _, __, uri: draw_voxels(read_voxels(uri, request.axes)))
     content = io.BytesIO()
     np.savez_compressed(content, names=np.array(names, str), pictures=np.array(pictures, np.uint8))
     storage.write_whole(path, lambda stream: stream.write(content.getvalue()))
@@ -143,7 +143,7 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
     return {"shard": row["shard"], "scenes": names}
 
 
-def shard_pictures(path: str) -> np.ndarray:
+def make_pictures_shard(path: str) -> np.ndarray:
     """(n, 256, 256, 3) uint8, as `write_pictures` left them."""
     return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
 
@@ -157,7 +157,7 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
     Goes on where it stopped; shards with rejects are read again, for files get repaired. Raises ValueError if the output
     holds an import of other files under this name, or if no file could be read.
     """
-    record = storage.join(request.output, f"imported-{request.name}.json")
+    record = storage.join_uri(request.output, f"imported-{request.name}.json")
     options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}
     shards = request.shards()
     if storage.exists(record):
@@ -174,7 +174,7 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
     write = {"glb": write_tables, "npz": write_pictures}[request.kind]
     rows = ray.data.from_items([{"shard": k} for k in range(len(shards))], override_num_blocks=len(shards))
     found = {}
-    for row in per_row(rows, lambda row: write(row, request)).iter_rows():
+    for row in map_rows(rows, lambda row: write(row, request)).iter_rows():
         found[row["shard"]] = list(row["scenes"])
         if on_shard:
             on_shard(len(list(request.files_of(shards[row["shard"]]))))
@@ -184,10 +184,10 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
         reason = shards[0].read("rejects")["reason"][0]
         raise ValueError(f"none of the {rejects} files could be read; the first: {reason}")
     if request.kind == "npz":
-        parts = (shard_pictures(request.pictures_path(shard)) for shard in shards)
+        parts = (make_pictures_shard(request.pictures_path(shard)) for shard in shards)
         write_npz(request.target, (part for part in parts if len(part)), len(scenes))
     made = options | {"scenes": scenes, "rejects": rejects}
     storage.write_json(made, record)
     if not rejects:
-        storage.delete_directory(storage.join(request.output, f".pictures-{request.name}"))
+        storage.delete_directory(storage.join_uri(request.output, f".pictures-{request.name}"))
     return made

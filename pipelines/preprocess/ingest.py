@@ -18,12 +18,12 @@ import ray
 import ray.data
 
 from models.scene import Grid
-from pipelines.preprocess.shard_writer import manifest_path, read_drive, write_shard
-from pipelines.preprocess.sharding import Task
+from pipelines.preprocess.shard_writer import make_manifest_path, read_drive, write_shard
+from pipelines.preprocess.sharding import ShardTask
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import MAX_RETRIES, per_row
-from pipelines.schema.dataset import DESCRIPTION, Statistics, label_scenes, training_statistics
+from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
+from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
 from pipelines.schema.tables import SCHEMA_VERSION, Shard
 
 STAGING = ".staging"
@@ -32,7 +32,7 @@ STAGING = ".staging"
 # ------------------------------------------------------------------------------------------------------- pass 1
 
 
-def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
+def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
     """Ray task. A drive into the object store, once for all its shards; or why it cannot be read."""
     try:
         return read_drive(source, key)
@@ -40,12 +40,12 @@ def _drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
         return str(error)
 
 
-def write_shards(tasks: list[Task], staging: str, grid: Grid) -> Iterator[dict]:
+def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[dict]:
     """Manifests as they are done, in any order; one Ray task per shard, one more per drive that has several."""
-    finished = set(storage.list_files(storage.join(staging, "manifest"), ".json"))
-    todo = [task for task in tasks if manifest_path(staging, task) not in finished]
+    finished = set(storage.list_files(storage.join_uri(staging, "manifest"), ".json"))
+    todo = [task for task in tasks if make_manifest_path(staging, task) not in finished]
     shards_of = Counter((task.source, part.key) for task in todo for part in task.parts)
-    load = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_drive_or_reason)
+    load = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_read_drive_or_reason)
     shared = {drive: load.remote(*drive) for drive, shards in shards_of.items() if shards > 1}
 
     def read(source: str, key: tuple) -> tuple[Drive, dict]:
@@ -61,14 +61,14 @@ def write_shards(tasks: list[Task], staging: str, grid: Grid) -> Iterator[dict]:
         return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
-    for row in per_row(dataset, write).iter_rows():
+    for row in map_rows(dataset, write).iter_rows():
         yield json.loads(row["manifest"])
 
 
 # ------------------------------------------------------------------------------------------------------- pass 2
 
 
-def publish(root: str, staging: str, manifests: list[dict], statistics: Statistics) -> None:
+def publish_shards(root: str, staging: str, manifests: list[dict], statistics: Statistics) -> None:
     """Label the scenes and move every staged file into place. Safe to repeat after a crash at any point."""
 
     def move(row: dict) -> dict:
@@ -77,7 +77,7 @@ def publish(root: str, staging: str, manifests: list[dict], statistics: Statisti
         moved = ["primitives", "rasters"] * bool(row["scenes"]) + ["rejects"] * bool(row["rejects"])
         for table in moved:
             if storage.exists(staged.path(table)):
-                storage.move(staged.path(table), final.path(table))
+                storage.move_file(staged.path(table), final.path(table))
         if row["scenes"]:
             storage.write_parquet(label_scenes(staged.read("scenes"), statistics), final.path("scenes"))
         return row
@@ -86,7 +86,7 @@ def publish(root: str, staging: str, manifests: list[dict], statistics: Statisti
         {k: m[k] for k in ("source", "split", "number", "scenes")} | {"rejects": len(m["rejects"])} for m in manifests
     ]
     blocks = min(len(rows), max(2, 4 * int(ray.cluster_resources().get("CPU", 1))))
-    per_row(ray.data.from_items(rows, override_num_blocks=blocks), move).materialize()
+    map_rows(ray.data.from_items(rows, override_num_blocks=blocks), move).materialize()
 
 
 # ---------------------------------------------------------------------------------------------------------- run
@@ -103,8 +103,8 @@ class IngestResult:
     already_complete: bool = False
 
 
-def ingest(
-    tasks: list[Task],
+def ingest_drives(
+    tasks: list[ShardTask],
     root: str,
     options: dict,
     slots: tuple[int, ...] | None = None,
@@ -120,7 +120,7 @@ def ingest(
     """
     started = time.perf_counter()
     grid = grid or Grid()
-    description, staging = storage.join(root, DESCRIPTION), storage.join(root, STAGING)
+    description, staging = storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING)
     _refuse_other_options(root, options)
     if storage.exists(description):
         storage.delete_directory(staging)  # of a run that was killed while it tidied up
@@ -130,7 +130,7 @@ def ingest(
     if not tasks:
         raise ValueError("there is nothing to preprocess: no drive was found")
     storage.clean_temporaries(root)
-    storage.write_json(options, storage.join(staging, "options.json"))
+    storage.write_json(options, storage.join_uri(staging, "options.json"))
 
     manifests = []
     for manifest in write_shards(tasks, staging, grid):
@@ -145,8 +145,8 @@ def ingest(
             f"{unreadable[0]}{more}. All other drives are staged: repair the file and run the same command again, "
             "or add --skip-unreadable to leave it out"
         )
-    statistics = ray.get(ray.remote(training_statistics).remote(manifests, staging, grid, slots))
-    publish(root, staging, manifests, statistics)
+    statistics = ray.get(ray.remote(compute_training_statistics).remote(manifests, staging, grid, slots))
+    publish_shards(root, staging, manifests, statistics)
 
     totals, reasons = Counter(), Counter()
     for manifest in manifests:
@@ -173,7 +173,7 @@ def ingest(
 
 def _refuse_other_options(root: str, options: dict) -> None:
     """Raises ValueError if `root` was made, or begun, with other options."""
-    for path in (storage.join(root, DESCRIPTION), storage.join(root, STAGING, "options.json")):
+    for path in (storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING, "options.json")):
         if storage.exists(path):
             made = storage.read_json(path)
             made = made["options"] if path.endswith(DESCRIPTION) else made

@@ -15,14 +15,14 @@ from itertools import islice
 import numpy as np
 import pyarrow as pa
 
-from models.geometry.cholesky import cholesky_parameters
+from models.geometry.cholesky import compute_cholesky_parameters
 from models.scene import Grid, Scene
-from pipelines.preprocess.sharding import Part, Task
+from pipelines.preprocess.sharding import ShardPart, ShardTask
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town import generator
 from pipelines.runtime import storage
-from pipelines.schema.tables import MAX_HEIGHT_M, rejects_table, scene_tables
+from pipelines.schema.tables import MAX_HEIGHT_M, make_rejects_table, make_scene_tables
 
 BATCH_SCENES = 32
 
@@ -33,8 +33,8 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
     """A drive and what its reader dropped. Raises ValueError, naming the file, if it cannot be read."""
     if source == "town":
         seed, num_scenes = key
-        drive = generator.town_drive(seed)
-        return drive.at(generator.take(len(drive), num_scenes)), {}
+        drive = generator.generate_town(seed)
+        return drive.at(generator.select_poses(len(drive), num_scenes)), {}
     if source == "kitti360":
         drive, report = kitti360.read_drive(*key)
         return drive, asdict(report)
@@ -45,7 +45,7 @@ class Rejected(ValueError):
     """A scene that is left out, and why."""
 
 
-def cut(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
+def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
     """The scene ahead of a pose. Raises Rejected."""
     try:
         scene = drive.scene(pose, split, grid)
@@ -60,7 +60,7 @@ def cut(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
     return scene
 
 
-def _planned(drive: Drive, part: Part) -> Drive:
+def _plan_scenes(drive: Drive, part: ShardPart) -> Drive:
     """The drive, if it still has the poses that were planned. Raises ValueError."""
     if drive.frame.take(part.poses, mode="clip").tolist() != list(part.frames):
         raise ValueError(f"{part.sequence}: its poses changed after this run began; run the same command again")
@@ -70,7 +70,7 @@ def _planned(drive: Drive, part: Part) -> Drive:
 class ShardCut:
     """Cuts the scenes of a task, one after another; what went wrong is listed beside."""
 
-    def __init__(self, task: Task, grid: Grid, read: ReadDrive = read_drive) -> None:
+    def __init__(self, task: ShardTask, grid: Grid, read: ReadDrive = read_drive) -> None:
         self.task, self.grid, self.read = task, grid, read
         self.rejects: list[dict] = []
         self.unreadable: list[str] = []  # reasons, one per drive
@@ -81,7 +81,7 @@ class ShardCut:
             try:
                 drive, self.reports[part.sequence] = self.read(self.task.source, part.key)
                 if part.poses is not None:
-                    drive = _planned(drive, part).at(np.array(part.poses), self.grid)
+                    drive = _plan_scenes(drive, part).at(np.array(part.poses), self.grid)
             except ValueError as error:
                 self.unreadable.append(str(error))
                 for frame in part.frames or [None]:
@@ -89,11 +89,11 @@ class ShardCut:
                 continue
             for pose, frame in enumerate(drive.frame.tolist()):
                 try:
-                    yield cut(drive, pose, self.task.split, self.grid)
+                    yield cut_scenes(drive, pose, self.task.split, self.grid)
                 except Rejected as error:
                     self._reject(part, frame, str(error))
 
-    def _reject(self, part: Part, frame: int | None, reason: str) -> None:
+    def _reject(self, part: ShardPart, frame: int | None, reason: str) -> None:
         name = f"{self.task.source}-{part.sequence}" + ("" if frame is None else f"-{frame:010d}")
         self.rejects.append({"scene_id": name, "sequence": part.sequence, "frame": frame, "reason": reason})
 
@@ -101,17 +101,17 @@ class ShardCut:
 Extremes = dict[str, list[list[float]]]  # name -> [lowest, highest], a number per entry
 
 
-def extremes(scenes: list[Scene]) -> Extremes:
+def compute_extremes(scenes: list[Scene]) -> Extremes:
     """The lowest and highest of what a model normalises; a name is absent where there is nothing to measure."""
     values = {
-        "cholesky": np.concatenate([cholesky_parameters(s.rotation, s.size_m) for s in scenes]),
+        "cholesky": np.concatenate([compute_cholesky_parameters(s.rotation, s.size_m) for s in scenes]),
         "height": np.concatenate([s.height_m[s.occupied] for s in scenes])[:, None],
         "z": np.concatenate([s.center_m[:, 2:] for s in scenes]),
     }
     return {name: [v.min(axis=0).tolist(), v.max(axis=0).tolist()] for name, v in values.items() if len(v)}
 
 
-def widest(parts: Iterable[Extremes]) -> Extremes:
+def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
     """The extremes of everything together."""
     parts = list(parts)
     return {
@@ -123,7 +123,7 @@ def widest(parts: Iterable[Extremes]) -> Extremes:
     }
 
 
-def joined_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
+def join_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
     """The tables of one shard from those of its batches of scenes."""
     tables = {name: pa.concat_tables([part[name] for part in parts]) for name in parts[0]}
     scenes = tables["scenes"]
@@ -133,16 +133,16 @@ def joined_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
     return tables
 
 
-def manifest_path(staging: str, task: Task) -> str:
-    return storage.join(staging, "manifest", f"{task.source}-{task.split}-{task.number:05d}.json")
+def make_manifest_path(staging: str, task: ShardTask) -> str:
+    return storage.join_uri(staging, "manifest", f"{task.source}-{task.split}-{task.number:05d}.json")
 
 
-def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
+def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
     """Row in: a task. Row out: its manifest. One shard per task; a finished one is not redone.
 
     It is redone if it was cut from other parts: a drive was added, or its poses repaired, since the run began.
     """
-    path, shard = manifest_path(staging, task), task.shard(staging)
+    path, shard = make_manifest_path(staging, task), task.shard(staging)
     parts = hashlib.blake2b(repr(task.parts).encode(), digest_size=16).hexdigest()
     if storage.exists(path):
         finished = storage.read_json(path)
@@ -152,17 +152,17 @@ def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_dri
     cuts = ShardCut(task, grid, read)
     scenes, tables, measured, classes = iter(cuts), [], [], ()
     while batch := list(islice(scenes, BATCH_SCENES)):
-        tables.append(scene_tables(batch))
-        measured.append(extremes(batch))
+        tables.append(make_scene_tables(batch))
+        measured.append(compute_extremes(batch))
         classes = batch[0].ground_classes
     num_scenes = 0
     if tables:
-        joined = joined_tables(tables)
+        joined = join_tables(tables)
         num_scenes = len(joined["scenes"])
         for name in ("primitives", "rasters", "scenes"):  # a shard is there when its scenes are
             storage.write_parquet(joined[name], shard.path(name))
     if cuts.rejects:
-        storage.write_parquet(rejects_table(cuts.rejects), shard.path("rejects"))
+        storage.write_parquet(make_rejects_table(cuts.rejects), shard.path("rejects"))
     manifest = {
         "source": task.source,
         "split": task.split,
@@ -172,7 +172,7 @@ def write_shard(task: Task, staging: str, grid: Grid, read: ReadDrive = read_dri
         "rejects": dict(Counter(row["reason"] for row in cuts.rejects)),
         "unreadable": cuts.unreadable,
         "reports": cuts.reports,
-        "extremes": widest(measured),
+        "extremes": merge_extremes(measured),
         "ground_classes": list(classes),
         "seconds": time.perf_counter() - started,
     }

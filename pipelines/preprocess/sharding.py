@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.town import generator
-from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, no_split, split_poses
+from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_no_split, split_poses
 from pipelines.schema.tables import Shard
 
 SHARD_SCENES = 256
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Part:
+class ShardPart:
     """Some poses of one drive. `key` is what its source needs to read it (`pipelines.preprocess.shard_writer.read_drive`)."""
 
     key: tuple
@@ -30,61 +30,67 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Task:
+class ShardTask:
     """One shard to write: its source, split and number, and the parts it is cut from."""
 
     source: str
     split: str
     number: int
-    parts: tuple[Part, ...]
+    parts: tuple[ShardPart, ...]
 
     def shard(self, root: str) -> Shard:
         return Shard(root, self.source, self.split, self.number)
 
 
-def plan_town(num_train: int, num_test: int, seed: int) -> list[Task]:
+def plan_town(num_train: int, num_test: int, seed: int) -> list[ShardTask]:
     """A task per town."""
     plan = [
-        (split, Part((town_seed, count), f"{town_seed:05d}"))
-        for town_seed, split, count in generator.town_plan(num_train, num_test, seed)
+        (split, ShardPart((town_seed, count), f"{town_seed:05d}"))
+        for town_seed, split, count in generator.plan_town_parts(num_train, num_test, seed)
     ]
-    return _numbered("town", [(split, (part,)) for split, part in plan])
+    return _number_tasks("town", [(split, (part,)) for split, part in plan])
 
 
-def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) -> list[Task]:
+def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:
     """Tasks of at most SHARD_SCENES poses of one sequence and one side of the paper's split.
 
     Raises ValueError for missing or broken poses, unless `skip_unreadable`: then the sequence becomes a reject.
     """
     poses, unreadable = _read_poses(
-        kitti360.sequences(root), lambda name: kitti360.read_poses(root, name), skip_unreadable
+        kitti360.list_sequences(root), lambda name: kitti360.read_poses(root, name), skip_unreadable
     )
-    labels = (split_poses if split else no_split)({name: matrix[:, :, 3] for name, (_, matrix) in poses.items()})
+    labels = (split_poses if split else make_no_split)({name: matrix[:, :, 3] for name, (_, matrix) in poses.items()})
     keys = {name: (root, name) for name in [*poses, *unreadable]}
     return _plan_drives("kitti360", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
 
 
-def plan_own(root: str, split: bool = True, skip_unreadable: bool = False) -> list[Task]:
+def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:
     """Tasks of at most SHARD_SCENES poses of one own drive and one side of splits.json, or of the paper's split."""
-    poses, unreadable = _read_poses(custom.drives(root), lambda name: custom.read_poses(root, name), skip_unreadable)
+    poses, unreadable = _read_poses(
+        custom.list_drives(root), lambda name: custom.read_poses(root, name), skip_unreadable
+    )
     given = custom.read_splits(root)
     if given is not None:
         labels = {name: np.full(len(frame), given[name], object) for name, (frame, _) in poses.items()}
     else:
-        labels = (split_poses if split else no_split)({name: matrix[:, :, 3] for name, (_, matrix) in poses.items()})
-    classes = custom.ground_classes(root)
+        labels = (split_poses if split else make_no_split)(
+            {name: matrix[:, :, 3] for name, (_, matrix) in poses.items()}
+        )
+    classes = custom.read_ground_classes(root)
     keys = {name: (root, name, classes) for name in [*poses, *unreadable]}
     return _plan_drives("own", keys, {name: frame for name, (frame, _) in poses.items()}, labels)
 
 
-def plan_argoverse2(root: str) -> list[Task]:
+def plan_argoverse2(root: str) -> list[ShardTask]:
     """Tasks of a few logs each; AV2's own train is train, its val is test."""
     plan = []
     for theirs, side in ARGOVERSE2_SPLIT.items():
-        logs = [log for split, log in argoverse2.logs(root) if split == theirs]
+        logs = [log for split, log in argoverse2.list_logs(root) if split == theirs]
         for start in range(0, len(logs), LOGS_PER_SHARD):
-            plan.append((side, tuple(Part((root, theirs, log), log) for log in logs[start : start + LOGS_PER_SHARD])))
-    return _numbered("av2", plan)
+            plan.append(
+                (side, tuple(ShardPart((root, theirs, log), log) for log in logs[start : start + LOGS_PER_SHARD]))
+            )
+    return _number_tasks("av2", plan)
 
 
 Poses = tuple[np.ndarray, np.ndarray]  # frame (p,), world_from_imu (p, 3, 4)
@@ -108,26 +114,26 @@ def _read_poses(
 
 def _plan_drives(
     source: str, keys: dict[str, tuple], frames: dict[str, np.ndarray], labels: dict[str, np.ndarray]
-) -> list[Task]:
+) -> list[ShardTask]:
     """Tasks drive after drive, so that neighbours in the plan share what they read.
 
     A drive without frames could not be read: reading it fails again and gives its one reject.
     """
-    plan = [(UNUSED, (Part(key, name),)) for name, key in keys.items() if name not in frames]
+    plan = [(UNUSED, (ShardPart(key, name),)) for name, key in keys.items() if name not in frames]
     for name, frame in frames.items():
         for side in (TRAIN, TEST, UNUSED):
             members = np.flatnonzero(labels[name] == side)
             for start in range(0, len(members), SHARD_SCENES):
                 poses = members[start : start + SHARD_SCENES]
-                part = Part(keys[name], name, tuple(poses.tolist()), tuple(frame[poses].tolist()))
+                part = ShardPart(keys[name], name, tuple(poses.tolist()), tuple(frame[poses].tolist()))
                 plan.append((side, (part,)))
-    return _numbered(source, plan)
+    return _number_tasks(source, plan)
 
 
-def _numbered(source: str, plan: list[tuple[str, tuple[Part, ...]]]) -> list[Task]:
+def _number_tasks(source: str, plan: list[tuple[str, tuple[ShardPart, ...]]]) -> list[ShardTask]:
     """Tasks from (split, parts): shards are counted within their split."""
     tasks, numbers = [], dict.fromkeys((TRAIN, TEST, UNUSED), 0)
     for split, parts in plan:
-        tasks.append(Task(source, split, numbers[split], parts))
+        tasks.append(ShardTask(source, split, numbers[split], parts))
         numbers[split] += 1
     return tasks

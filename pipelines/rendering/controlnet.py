@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pipelines.rendering.render import contact_sheet, png
-from pipelines.rendering.street_views import ON_SHEET, moving_picture
+from pipelines.rendering.render import arrange_contact_sheet, encode_png
+from pipelines.rendering.street_views import ON_SHEET, encode_animation
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import fan_out
+from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
-from pipelines.schema.run_guard import changed_option
+from pipelines.schema.run_guard import find_changed_option
 
 SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view has nothing
 MULTIPLE_PX = 8  # of the sides of pictures that the network takes
@@ -35,7 +35,7 @@ class PhotoRequest:
     seed: int  # the same noise for every frame
 
 
-def control_image(class_id: np.ndarray) -> np.ndarray:
+def make_control_image(class_id: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8 in the KITTI-360 palette, sky where nothing is; class_id (H, W)."""
     return np.where((class_id == EMPTY)[..., None], np.array(SKY, np.uint8), CLASS_COLORS[class_id])
 
@@ -68,7 +68,7 @@ class Painter:
         """(H, W, 3) uint8 from class ids (H, W). The same for the same request and image."""
         rows, cols = class_id.shape
         size = [-(-n // MULTIPLE_PX) * MULTIPLE_PX for n in (rows, cols)]
-        control = Image.fromarray(control_image(class_id)).resize(size[::-1], Image.Resampling.NEAREST)
+        control = Image.fromarray(make_control_image(class_id)).resize(size[::-1], Image.Resampling.NEAREST)
         request = self.request
         painted = self.pipeline(
             request.prompt,
@@ -92,29 +92,31 @@ class StreetPainter:
 
     def __call__(self, row: dict) -> dict:
         directory, frames = self.directories[row["id"]], []
-        for name in frame_names(directory):
-            path = storage.join(directory, "photo", name)
+        for name in list_frame_names(directory):
+            path = storage.join_uri(directory, "photo", name)
             if not storage.exists(path):
                 class_id = np.asarray(
-                    Image.open(io.BytesIO(storage.read_bytes(storage.join(directory, "class_id", name))))
+                    Image.open(io.BytesIO(storage.read_bytes(storage.join_uri(directory, "class_id", name))))
                 )
-                content = png(self.painter.paint(class_id))
+                content = encode_png(self.painter.paint(class_id))
                 storage.write_whole(path, lambda stream, content=content: stream.write(content))
             frames.append(np.asarray(Image.open(io.BytesIO(storage.read_bytes(path)))))
         every = frames[:: -(-len(frames) // ON_SHEET)]
         for name, content in {
-            "photos.png": png(contact_sheet(every, 3)),
-            "photos.webp": moving_picture(frames),
+            "photos.png": encode_png(arrange_contact_sheet(every, 3)),
+            "photos.webp": encode_animation(frames),
         }.items():
-            storage.write_whole(storage.join(directory, name), lambda stream, content=content: stream.write(content))
+            storage.write_whole(
+                storage.join_uri(directory, name), lambda stream, content=content: stream.write(content)
+            )
         return {"frames": len(frames)}
 
 
-def frame_names(directory: str) -> list[str]:
-    return [path.rsplit("/", 1)[1] for path in storage.list_files(storage.join(directory, "class_id"), ".png")]
+def list_frame_names(directory: str) -> list[str]:
+    return [path.rsplit("/", 1)[1] for path in storage.list_files(storage.join_uri(directory, "class_id"), ".png")]
 
 
-def drives(streets: str) -> list[str]:
+def list_drives(streets: str) -> list[str]:
     """The directories of all drives with frames under streets/<run>. Raises ValueError if there is none."""
     found = sorted({path.rsplit("/", 2)[0] for path in storage.list_files(streets, ".png") if "/class_id/" in path})
     if not found:
@@ -130,12 +132,12 @@ def paint_streets(
     Raises ValueError if a drive was painted with other options.
     """
     for directory in directories:
-        record = storage.join(directory, "photos.json")
-        if said := changed_option(record, asdict(request)):
+        record = storage.join_uri(directory, "photos.json")
+        if said := find_changed_option(record, asdict(request)):
             raise ValueError(f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it anew")
         storage.write_json(asdict(request), record)
     total = 0
-    for row in fan_out(range(len(directories)), StreetPainter, (request, directories), actors):
+    for row in map_actors(range(len(directories)), StreetPainter, (request, directories), actors):
         total += row["frames"]
         if on_drive:
             on_drive()

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.geometry.rasterize import draw, hits, integers_between, ranges
-from pipelines.io.mesh_export import GROUND, Triangles, cuboid_triangles, ground_triangles
+from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, find_hits, list_integers_between
+from pipelines.io.mesh_export import GROUND, Triangles, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY
 
 NEAR_M = 0.1  # nothing nearer is seen
@@ -86,7 +86,7 @@ class StreetRenderer:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        parts = ground_triangles(scene), cuboid_triangles(scene)
+        parts = triangulate_ground(scene), triangulate_cuboids(scene)
         self.soup = Triangles(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     @cached_property
@@ -100,17 +100,17 @@ class StreetRenderer:
         """What the camera sees."""
         shape = camera.lens.height, camera.lens.width
         nearness, triangle = np.zeros(shape), np.full(shape, -1, np.int64)
-        index, corners = _in_front(camera.local(self.soup.corners_m), camera.lens)
-        pixel, owner, value = hits(_on_image(corners, camera.lens), _pixels(camera.lens), index)
-        draw(pixel, owner, value, nearness.reshape(-1), triangle.reshape(-1))
+        index, corners = _clip_in_front(camera.local(self.soup.corners_m), camera.lens)
+        pixel, owner, value = find_hits(_project_to_image(corners, camera.lens), _list_pixels(camera.lens), index)
+        fill_triangles(pixel, owner, value, nearness.reshape(-1), triangle.reshape(-1))
 
         flat = triangle >= 0
         class_id = np.where(flat, self.soup.class_id[triangle], EMPTY).astype(np.uint8)
         primitive = np.where(flat, self.soup.primitive[triangle], GROUND).astype(np.int32)
         normal = np.where(flat[..., None], self.normals[triangle], np.float32(0))
-        pixel, ball, value = _ellipsoid_hits(self.scene, camera)
+        pixel, ball, value = _intersect_ellipsoids(self.scene, camera)
         over = np.full(shape, GROUND, np.int64)
-        draw(pixel, ball, value, nearness.reshape(-1), over.reshape(-1))
+        fill_triangles(pixel, ball, value, nearness.reshape(-1), over.reshape(-1))
         row, col = np.nonzero(over != GROUND)
         class_id[row, col], primitive[row, col] = CATEGORY_IDS[ELLIPSOID], over[row, col]
         with np.errstate(divide="ignore"):
@@ -121,7 +121,7 @@ class StreetRenderer:
     def _ball_normals(
         self, camera: StreetCamera, row: np.ndarray, col: np.ndarray, depth_m: np.ndarray, primitive: np.ndarray
     ) -> np.ndarray:
-        rays = _rays(camera.lens, row, col) * depth_m[:, None]
+        rays = _make_rays(camera.lens, row, col) * depth_m[:, None]
         point_m = rays @ camera.camera_from_scene + camera.position_m
         axes = self.scene.rotation / self.scene.size_m[:, None, :] ** 2
         gradient = (axes @ self.scene.rotation.transpose(0, 2, 1))[primitive]
@@ -129,24 +129,24 @@ class StreetRenderer:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _pixels(lens: Lens) -> Grid:
+def _list_pixels(lens: Lens) -> Grid:
     """The image as a grid of rasters.py: x = -v - 1/2, y = -u - 1/2."""
     return Grid(0.0, 0.0, 1.0, lens.height, lens.width)
 
 
-def _rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _make_rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
     """(k, 3) directions in the camera frame of the rays through pixels, with z = 1."""
     return np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(len(u))], axis=1)
 
 
-def _on_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
+def _project_to_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
     """Triangles (t, 3, 3) in the camera frame, z > 0, on the grid of `_pixels`; their height is 1 / z."""
     x, y, z = np.moveaxis(corners, -1, 0)
     u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
     return np.stack([-v - 0.5, -u - 0.5, 1 / z], axis=-1)
 
 
-def _in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (t, 3, 3) in the camera frame that may be seen, cut at NEAR_M: their index (k,) and corners (k, 3, 3)."""
     x, y, z = np.moveaxis(corners, -1, 0)
     left, right = (0 - 0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx
@@ -172,7 +172,7 @@ def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np
         odd = np.argmax(near if count == 1 else ~near, axis=1)  # the corner alone on its side goes first
         turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
         first, second, third = np.moveaxis(turned, 1, 0)
-        on_second, on_third = (_crossing(first, other) for other in (second, third))
+        on_second, on_third = (_find_crossing(first, other) for other in (second, third))
         if count == 1:
             found += [np.stack([on_second, second, third], 1), np.stack([on_second, third, on_third], 1)]
             found_index += [index[some], index[some]]
@@ -182,13 +182,13 @@ def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np
     return np.concatenate(found_index), np.concatenate(found)
 
 
-def _crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(k, 3) where the lines from a to b (k, 3) pass z = NEAR_M."""
     share = (NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2])
     return a + share[:, None] * (b - a)
 
 
-def _ellipsoid_hits(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every pixel centre over every ellipsoid ahead: flat pixel index, primitive and 1 / depth (m,).
 
     A ray t d (d with z = 1) meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0, A = |M d|^2, B = d.M^T M p,
@@ -215,15 +215,15 @@ def _ellipsoid_hits(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.
     qb = k[:, 0, 1] * k[:, 0, 2] - k[:, 0, 0] * k[:, 1, 2]
     qc = k[:, 0, 2] ** 2 - k[:, 0, 0] * k[:, 2, 2]
     root = np.sqrt(np.maximum(qb**2 - qa * qc, 0))
-    first, count = integers_between((-qb + root) / qa, (-qb - root) / qa, lens.height)
-    row, ball = ranges(first, count), np.repeat(np.arange(len(primitive)), count)
+    first, count = list_integers_between((-qb + root) / qa, (-qb - root) / qa, lens.height)
+    row, ball = concatenate_ranges(first, count), np.repeat(np.arange(len(primitive)), count)
     half = k[ball, 0, 1] * row + k[ball, 0, 2]
     rest = k[ball, 1, 1] * row**2 + 2 * k[ball, 1, 2] * row + k[ball, 2, 2]
     root = np.sqrt(np.maximum(half**2 - k[ball, 0, 0] * rest, 0))
     ends = np.sort([(-half + root) / k[ball, 0, 0], (-half - root) / k[ball, 0, 0]], axis=0)
-    first, count = integers_between(*ends, lens.width)
-    col, row, ball = ranges(first, count), np.repeat(row, count), np.repeat(ball, count)
-    d = _rays(lens, row, col)
+    first, count = list_integers_between(*ends, lens.width)
+    col, row, ball = concatenate_ranges(first, count), np.repeat(row, count), np.repeat(ball, count)
+    d = _make_rays(lens, row, col)
     of_d = np.einsum("ki,ki->k", b[ball], d)
     square_d = np.einsum("ki,kij,kj->k", d, square[ball], d)
     # The nearer root, as C / (B + sqrt): without a difference of large numbers.
@@ -231,7 +231,7 @@ def _ellipsoid_hits(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.
     return row * lens.width + col, primitive[ball], inverse
 
 
-def shaded(view: StreetView) -> np.ndarray:
+def shade_view(view: StreetView) -> np.ndarray:
     """(H, W, 3) uint8: class colours in soft light, paler with distance, under a pale sky."""
     sun = np.array([0.35, -0.45, 0.82], np.float32)
     light = 0.62 + 0.38 * (view.normal @ sun).clip(0)

@@ -10,44 +10,49 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.geometry.orthographic import ellipsoids_over, facing, looking_at, looking_down
-from pipelines.geometry.rasterize import draw, hits
-from pipelines.io.mesh_export import cuboid_triangles
-from pipelines.rendering.shading import lit_picture
-from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, ground_ids
+from pipelines.geometry.orthographic import (
+    find_ellipsoids_over,
+    find_facing_sides,
+    make_oblique_camera,
+    make_top_camera,
+)
+from pipelines.geometry.rasterize import fill_triangles, find_hits
+from pipelines.io.mesh_export import triangulate_cuboids
+from pipelines.rendering.shading import render_lit
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
 MARK_COLOR = (230, 0, 0)  # sRGB, of lines drawn over a picture
 
 
-def bev_picture(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
+def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
     """The scene from above, unlit, white where there is nothing: (H, W, 3) uint8 sRGB.
 
     Orthographic, up = +x (forward), left = +y; the grid exactly fills the picture and its longer side has
     size_px pixels. With supersample > 1 each pixel is the mean of that many squared. This is the picture of
     the metrics: the same to the last bit on every call.
     """
-    view = _view_from_above(scene.grid, size_px * supersample)
+    view = _make_oblique_view(scene.grid, size_px * supersample)
     ground_m, ground = scene.surface()
     if view != scene.grid:
         row, col = scene.grid.pixel(view.x_m(), view.y_m())
         ground_m, ground = (raster.take(row, axis=0).take(col, axis=1) for raster in (ground_m, ground))
     top, class_id = np.full(ground_m.shape, -np.inf), np.full(ground_m.shape, EMPTY, np.uint8)
-    boxes = cuboid_triangles(scene)
-    seen = facing(boxes.corners_m)
-    box_hits = hits(boxes.corners_m.take(seen, axis=0), view, boxes.class_id.take(seen))
-    draw(*box_hits, top.reshape(-1), class_id.reshape(-1))
+    boxes = triangulate_cuboids(scene)
+    seen = find_facing_sides(boxes.corners_m)
+    box_hits = find_hits(boxes.corners_m.take(seen, axis=0), view, boxes.class_id.take(seen))
+    fill_triangles(*box_hits, top.reshape(-1), class_id.reshape(-1))
     bare = (ground >= 0) & (top <= ground_m)
     np.copyto(top, ground_m, where=bare)
-    np.copyto(class_id, ground_ids(scene).take(ground), where=bare)
-    class_id.reshape(-1)[ellipsoids_over(scene, looking_down(view), top)] = CATEGORY_IDS[ELLIPSOID]
-    picture = _painted(class_id)
-    return picture if supersample == 1 else np.round(block_mean(picture, supersample)).astype(np.uint8)
+    np.copyto(class_id, list_ground_ids(scene).take(ground), where=bare)
+    class_id.reshape(-1)[find_ellipsoids_over(scene, make_top_camera(view), top)] = CATEGORY_IDS[ELLIPSOID]
+    picture = _paint_pixels(class_id)
+    return picture if supersample == 1 else np.round(average_blocks(picture, supersample)).astype(np.uint8)
 
 
-def outlined_picture(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
+def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
     """The smooth picture from above with the border of a region (rows, cols), True = inside: (H, W, 3) uint8."""
-    picture = bev_picture(scene, size_px, supersample=2).copy()
-    view = _view_from_above(scene.grid, size_px)
+    picture = render_bev(scene, size_px, supersample=2).copy()
+    view = _make_oblique_view(scene.grid, size_px)
     inside = region[scene.grid.pixel(view.x_m(), 0.0)[0]][:, scene.grid.pixel(0.0, view.y_m())[1]]
     border = np.zeros_like(inside)
     border[1:] |= inside[1:] != inside[:-1]
@@ -57,27 +62,27 @@ def outlined_picture(scene: Scene, region: np.ndarray, size_px: int = 512) -> np
 
 
 @cache
-def _color_pairs() -> np.ndarray:
+def _list_color_pairs() -> np.ndarray:
     """(18 x 256, 6): the colours of two neighbouring pixels, by the class id of the first plus 256 that of the second."""
     first, second = np.zeros((2, len(CLASS_COLORS), 256, 3), np.uint8)
     first[:, : len(CLASS_COLORS)], second[:] = CLASS_COLORS, CLASS_COLORS[:, None]
     return np.concatenate([first, second], axis=2).reshape(-1, 6)
 
 
-def _painted(class_id: np.ndarray) -> np.ndarray:
+def _paint_pixels(class_id: np.ndarray) -> np.ndarray:
     """(H, W, 3): CLASS_COLORS[class_id (H, W) uint8]; two pixels at a time, since six bytes are copied as fast as three."""
     pair = np.resize(class_id, class_id.size + class_id.size % 2).view("<u2")
-    return _color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
+    return _list_color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
 
 
-def _view_from_above(grid: Grid, size_px: int) -> Grid:
+def _make_oblique_view(grid: Grid, size_px: int) -> Grid:
     """The same rectangle with size_px pixels along its longer side."""
     resolution_m = max(grid.rows, grid.cols) * grid.resolution_m / size_px
     rows, cols = (max(1, round(n * grid.resolution_m / resolution_m)) for n in (grid.rows, grid.cols))
     return Grid(grid.front_m, grid.left_m, resolution_m, rows, cols)
 
 
-def picture_3d(
+def render_3d(
     scene: Scene,
     width: int = 800,
     height: int = 600,
@@ -91,19 +96,19 @@ def picture_3d(
     it depends on the scene's grid only, so that scenes of one size compare. Where the ground is unknown the
     light plate under the scene shows.
     """
-    camera = looking_at(scene.grid, width * supersample, height * supersample, azimuth_deg, elevation_deg)
-    linear = block_mean(lit_picture(scene, camera), supersample)
+    camera = make_oblique_camera(scene.grid, width * supersample, height * supersample, azimuth_deg, elevation_deg)
+    linear = average_blocks(render_lit(scene, camera), supersample)
     return np.round(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
 
 
-def png(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
     """(H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG")  # `optimize` makes it a tenth smaller in five times the time
     return file.getvalue()
 
 
-def block_mean(picture: np.ndarray, factor: int) -> np.ndarray:
+def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
     """(H, W, C) with each factor x factor block replaced by its mean, float32."""
     rows, cols = picture.shape[0] // factor, picture.shape[1] // factor
     total = np.zeros((rows, cols, picture.shape[2]), np.float32)
@@ -113,7 +118,7 @@ def block_mean(picture: np.ndarray, factor: int) -> np.ndarray:
     return total / factor**2
 
 
-def contact_sheet(
+def arrange_contact_sheet(
     pictures: Sequence[np.ndarray], columns: int, captions: Sequence[str] | None = None, gap_px: int = 12
 ) -> np.ndarray:
     """Pictures (h, w, 3) uint8 in rows of `columns` on white, each centred over its caption: (H, W, 3) uint8.

@@ -12,9 +12,15 @@ import numpy as np
 from scipy import ndimage
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.geometry.orthographic import Camera, cast_ellipsoids, facing, looking_at, looking_down
-from pipelines.geometry.rasterize import cast_down
-from pipelines.io.mesh_export import cuboid_triangles, ground_triangles, unit_cuboid
+from pipelines.geometry.orthographic import (
+    Camera,
+    cast_ellipsoids,
+    find_facing_sides,
+    make_oblique_camera,
+    make_top_camera,
+)
+from pipelines.geometry.rasterize import cast_rays_down
+from pipelines.io.mesh_export import make_unit_cuboid, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
 
 PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # color ids after the classes
@@ -48,38 +54,38 @@ class Surfaces(NamedTuple):
     normal: np.ndarray  # (H, W, 3) float32, outward, scene frame
 
 
-def lit_picture(scene: Scene, camera: Camera) -> np.ndarray:
+def render_lit(scene: Scene, camera: Camera) -> np.ndarray:
     """(H, W, 3) float32 linear RGB: the scene on its plate on a table, in sun and sky."""
-    sheet_m = _sheet(scene)
+    sheet_m = _make_sheet(scene)
     table_z_m = float(sheet_m.min()) - 1.0
-    solid = _joined(_plate(scene.grid, sheet_m, table_z_m), _cuboids(scene))
-    seen = _surfaces(scene, camera, _joined(_ground(scene), solid), table_z_m)
+    solid = _join_faces(_make_plate(scene.grid, sheet_m, table_z_m), _make_cuboid_faces(scene))
+    seen = _cast_surfaces(scene, camera, _join_faces(_make_ground_faces(scene), solid), table_z_m)
 
     x, y = camera.view.x_m().astype(np.float32)[:, None], camera.view.y_m().astype(np.float32)[None, :]
     point = [up * x + left * y + near * seen.depth_m for up, left, near in camera.camera_from_scene.T.tolist()]
-    sun = looking_at(scene.grid, SHADOW_PX, SHADOW_PX, SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG)
+    sun = make_oblique_camera(scene.grid, SHADOW_PX, SHADOW_PX, SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG)
     cosine = (seen.normal @ sun.camera_from_scene[2].astype(np.float32)).clip(0)
-    direct = cosine / sun.camera_from_scene[2, 2].astype(np.float32) * _sunlit(scene, solid, sun, point, cosine)
-    sky = (0.65 + 0.35 * seen.normal[..., 2]) * _open_sky(scene, solid, table_z_m, point)
-    kept = 1 - _lines(seen)
+    direct = cosine / sun.camera_from_scene[2, 2].astype(np.float32) * _find_sunlit(scene, solid, sun, point, cosine)
+    sky = (0.65 + 0.35 * seen.normal[..., 2]) * _measure_open_sky(scene, solid, table_z_m, point)
+    kept = 1 - _draw_lines(seen)
     light = (direct * kept)[..., None] * SUN + (sky * kept)[..., None] * SKY
     return LINEAR_COLORS.take(seen.color_id, axis=0) * light
 
 
-def _joined(*parts: Faces) -> Faces:
+def _join_faces(*parts: Faces) -> Faces:
     return Faces(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> Surfaces:
+def _cast_surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> Surfaces:
     """The nearest surface at each pixel: a face, an ellipsoid, or the table beneath everything."""
     turned = camera.turned(faces.corners_m)
-    seen = facing(turned)
-    (depth,), (hit,) = cast_down(turned[seen], camera.view)
-    depth = np.where(hit < 0, _table_depth(camera, table_z_m), depth)
+    seen = find_facing_sides(turned)
+    (depth,), (hit,) = cast_rays_down(turned[seen], camera.view)
+    depth = np.where(hit < 0, _compute_table_depth(camera, table_z_m), depth)
     # -1 is the table: the last entry of each list.
     color_id = np.append(faces.color_id[seen], np.uint8(TABLE)).take(hit, mode="wrap")
     part = np.append(faces.part[seen], SCENERY).astype(np.int32).take(hit, mode="wrap")
-    normal = np.vstack([_normals(faces.corners_m[seen]), [[0, 0, 1]]]).astype(np.float32)
+    normal = np.vstack([_compute_normals(faces.corners_m[seen]), [[0, 0, 1]]]).astype(np.float32)
     normal = normal.take(hit, axis=0, mode="wrap")
 
     round_depth, primitive = cast_ellipsoids(scene, camera)
@@ -88,23 +94,23 @@ def _surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> S
     depth[row, col] = round_depth[row, col]
     color_id[row, col] = CATEGORY_IDS[ELLIPSOID]
     part[row, col] = 4 * (primitive + 1)
-    normal[row, col] = _ellipsoid_normals(scene, camera, depth, row, col, primitive)
+    normal[row, col] = _compute_ellipsoid_normals(scene, camera, depth, row, col, primitive)
     return Surfaces(depth.astype(np.float32), color_id, part, normal)
 
 
-def _ground(scene: Scene) -> Faces:
-    corners, class_id, _ = ground_triangles(scene)
+def _make_ground_faces(scene: Scene) -> Faces:
+    corners, class_id, _ = triangulate_ground(scene)
     return Faces(corners, class_id, np.full(len(corners), SCENERY))
 
 
-def _cuboids(scene: Scene) -> Faces:
-    corners, class_id, primitive = cuboid_triangles(scene)
-    vertices, triangles = unit_cuboid()
-    axis = np.abs(_normals(vertices[triangles])).argmax(axis=1)
+def _make_cuboid_faces(scene: Scene) -> Faces:
+    corners, class_id, primitive = triangulate_cuboids(scene)
+    vertices, triangles = make_unit_cuboid()
+    axis = np.abs(_compute_normals(vertices[triangles])).argmax(axis=1)
     return Faces(corners, class_id, 4 * (primitive + 1) + np.tile(axis, len(corners) // 12))
 
 
-def _sheet(scene: Scene) -> np.ndarray:
+def _make_sheet(scene: Scene) -> np.ndarray:
     """(rows, cols) heights of the plate, a node about every metre: just below the ground, and beyond it level."""
     height, winner = scene.surface()
     if (winner < 0).all():
@@ -116,36 +122,36 @@ def _sheet(scene: Scene) -> np.ndarray:
     return below[np.ix_(*nodes)]
 
 
-def _plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
+def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
     """The sheet over the whole grid, with walls down to the table."""
     rows, cols = sheet_m.shape
     x, y = np.linspace(grid.front_m, grid.back_m, rows), np.linspace(grid.left_m, grid.right_m, cols)
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), sheet_m], axis=-1)
     rim = np.concatenate([top[0], top[1:, -1], top[-1, -2::-1], top[-2::-1, 0]])  # clockwise from above
     foot = rim * [1, 1, 0] + [0, 0, table_z_m]
-    corners = np.concatenate([_quads(top), _quads(np.stack([foot, rim]))])
+    corners = np.concatenate([_make_quads(top), _make_quads(np.stack([foot, rim]))])
     return Faces(corners, np.full(len(corners), PLATE, np.uint8), np.full(len(corners), SCENERY))
 
 
-def _table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
+def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
     """(H, 1) depth of the table at each row of the picture: its scene z is up x + near depth."""
     up, _, near = camera.camera_from_scene[:, 2]
     return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 
 
-def _quads(points: np.ndarray) -> np.ndarray:
+def _make_quads(points: np.ndarray) -> np.ndarray:
     """(2 (r - 1) (c - 1), 3, 3) triangles of a net of points (r, c, 3); facing up where x and y fall."""
     here, right, below, across = points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]
     return np.stack([here, below, right, right, below, across], axis=2).reshape(-1, 3, 3)
 
 
-def _normals(corners_m: np.ndarray) -> np.ndarray:
+def _compute_normals(corners_m: np.ndarray) -> np.ndarray:
     """(t, 3) unit outward normals of triangles (t, 3, 3)."""
     normal = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
 
 
-def _ellipsoid_normals(
+def _compute_ellipsoid_normals(
     scene: Scene, camera: Camera, depth_m: np.ndarray, row: np.ndarray, col: np.ndarray, primitive: np.ndarray
 ) -> np.ndarray:
     """(k, 3) unit normals, scene frame, at the pixels (row, col) that show these primitives."""
@@ -157,19 +163,19 @@ def _ellipsoid_normals(
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
+def _find_top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
     """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf where there is none."""
     turned = camera.turned(solid.corners_m)
-    (flat,), _ = cast_down(turned[facing(turned)], camera.view)
+    (flat,), _ = cast_rays_down(turned[find_facing_sides(turned)], camera.view)
     return np.maximum(flat, cast_ellipsoids(scene, camera)[0]).astype(np.float32)
 
 
-def _sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray) -> np.ndarray:
+def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray) -> np.ndarray:
     """(H, W) share of the sun, 0..1, that reaches each point: a shadow map, softened over its neighbours."""
-    blocker = _with_rim(_top(scene, solid, sun), -np.inf)
+    blocker = _add_rim(_find_top(scene, solid, sun), -np.inf)
     x, y, z = (a * point[0] + b * point[1] + c * point[2] for a, b, c in sun.camera_from_scene.tolist())
     z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # more where the sun grazes
-    pixel = _flat_pixel(sun.view, x, y)
+    pixel = _project_flat(sun.view, x, y)
     free = np.zeros(z.shape, np.float32)
     neighbours = (0, 1, -1, SHADOW_PX, -SHADOW_PX)
     for offset in neighbours:
@@ -177,34 +183,34 @@ def _sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], co
     return free / len(neighbours)
 
 
-def _open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
+def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
     """(H, W) 1 in the open, less the deeper a point lies below the mean top of its neighbourhood."""
     grid = scene.grid
     length_m, width_m = (n * grid.resolution_m + 2 * MARGIN_M for n in (grid.rows, grid.cols))
     resolution_m = max(length_m, width_m) / SKY_PX
     rows, cols = round(length_m / resolution_m), round(width_m / resolution_m)
     view = Grid(grid.front_m + MARGIN_M, grid.left_m + MARGIN_M, resolution_m, rows, cols)
-    top = _top(scene, solid, looking_down(view)).clip(table_z_m)
+    top = _find_top(scene, solid, make_top_camera(view)).clip(table_z_m)
     around = ndimage.gaussian_filter(top, NEARBY_M / resolution_m)
-    depth = (_with_rim(around, table_z_m).take(_flat_pixel(view, point[0], point[1])) - point[2]).clip(0)
+    depth = (_add_rim(around, table_z_m).take(_project_flat(view, point[0], point[1])) - point[2]).clip(0)
     return 0.3 + 0.7 * np.exp(-depth / 2.5)
 
 
-def _with_rim(picture: np.ndarray, value: float) -> np.ndarray:
+def _add_rim(picture: np.ndarray, value: float) -> np.ndarray:
     """(H W,) the picture flattened, with `value` in its two outermost pixels: what lies outside."""
     framed = np.full_like(picture, value)
     framed[2:-2, 2:-2] = picture[2:-2, 2:-2]
     return framed.reshape(-1)
 
 
-def _flat_pixel(view: Grid, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _project_flat(view: Grid, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Index into the flattened picture of the pixel under each point, the nearest for points outside."""
     row = ((view.front_m - x) * (1 / view.resolution_m)).clip(0, view.rows - 1).astype(np.int32)
     col = ((view.left_m - y) * (1 / view.resolution_m)).clip(0, view.cols - 1).astype(np.int32)
     return row * view.cols + col
 
 
-def _lines(seen: Surfaces) -> np.ndarray:
+def _draw_lines(seen: Surfaces) -> np.ndarray:
     """(H, W) share of light lost to a line: on the nearer side of each border between parts."""
     lost = np.zeros(seen.part.shape, np.float32)
     for axis in (0, 1):

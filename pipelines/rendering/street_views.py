@@ -10,14 +10,14 @@ import numpy as np
 from PIL import Image
 
 from models.scene import Scene
-from pipelines.geometry.centerlines import drive, road_network
-from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, StreetView, shaded
-from pipelines.rendering.render import contact_sheet, png
+from pipelines.geometry.centerlines import extract_road_network, plan_drive
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, StreetView, shade_view
+from pipelines.rendering.render import arrange_contact_sheet, encode_png
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import numbered, per_row
+from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
 from pipelines.schema.palette import CLASS_ID
-from pipelines.schema.run_guard import changed_option
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.run_guard import find_changed_option
+from pipelines.schema.scene_subset import SceneSubset
 
 DEPTH_PER_M = 256  # of the 16 bits of a depth image, as in KITTI; 0 where nothing is or beyond 255 m
 FRAMES_PER_SECOND = 10
@@ -38,10 +38,10 @@ class StreetRequest:
     most: int | None  # frames of a scene
 
     def directory(self, scene: Scene) -> str:
-        return storage.join(self.output, "streets", self.run, scene.scene_id)
+        return storage.join_uri(self.output, "streets", self.run, scene.scene_id)
 
 
-def cameras_along(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
+def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
     """Cameras on a way (k, 3) over the ground, each looking along it; the last metres only show the way."""
     along_m = np.append(0, np.cumsum(np.linalg.norm(np.diff(way_m[:, :2], axis=0), axis=1)))
     count = int((along_m[-1] - 1e-6) // request.spacing_m) + 1
@@ -57,20 +57,20 @@ def cameras_along(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamer
     ]
 
 
-def camera_json(camera: StreetCamera) -> dict:
+def serialize_camera(camera: StreetCamera) -> dict:
     """Pose of a camera in the scene, and its intrinsics."""
     scene_from_camera = np.eye(4)
     scene_from_camera[:3, :3], scene_from_camera[:3, 3] = camera.camera_from_scene.T, camera.position_m
     return {"scene_from_camera": scene_from_camera.tolist(), **asdict(camera.lens)}
 
 
-def depth_image(view: StreetView) -> np.ndarray:
+def encode_depth(view: StreetView) -> np.ndarray:
     """(H, W) uint16 of DEPTH_PER_M a metre."""
     depth = np.round(view.depth_m * DEPTH_PER_M)
     return np.where(depth < 2**16, depth, 0).astype(np.uint16)
 
 
-def moving_picture(frames: list[np.ndarray]) -> bytes:
+def encode_animation(frames: list[np.ndarray]) -> bytes:
     """Frames (H, W, 3) uint8 as an animated WebP, which every browser plays."""
     content, (first, *rest) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
     pause_ms = 1000 // FRAMES_PER_SECOND
@@ -81,37 +81,42 @@ def moving_picture(frames: list[np.ndarray]) -> bytes:
 def write_street(scene: Scene, request: StreetRequest) -> int:
     """Render the drive through a scene; how many frames. cameras.json is written last."""
     directory, renderer = request.directory(scene), StreetRenderer(scene)
-    way_m = drive(road_network(scene), right=request.right)
-    cameras = cameras_along(way_m, request) if len(way_m) > 1 else []
+    way_m = plan_drive(extract_road_network(scene), right=request.right)
+    cameras = place_cameras(way_m, request) if len(way_m) > 1 else []
     frames = []
     for number, camera in enumerate(cameras):
         view = renderer.view(camera)
-        frames.append(shaded(view))
+        frames.append(shade_view(view))
         images = {"semantic": view.semantic, "class_id": view.class_id, "instance": view.instance()}
-        images |= {"depth": depth_image(view), "shaded": frames[-1]}
+        images |= {"depth": encode_depth(view), "shaded": frames[-1]}
         for kind, image in images.items():
-            path = storage.join(directory, kind, f"{number:06d}.png")
-            storage.write_whole(path, lambda stream, image=image: stream.write(png(image)))
+            path = storage.join_uri(directory, kind, f"{number:06d}.png")
+            storage.write_whole(path, lambda stream, image=image: stream.write(encode_png(image)))
     if frames:
         every = frames[:: -(-len(frames) // ON_SHEET)]
-        files = {"sheet.png": png(contact_sheet(every, columns=3)), "drive.webp": moving_picture(frames)}
+        files = {
+            "sheet.png": encode_png(arrange_contact_sheet(every, columns=3)),
+            "drive.webp": encode_animation(frames),
+        }
         for name, content in files.items():
-            storage.write_whole(storage.join(directory, name), lambda stream, content=content: stream.write(content))
+            storage.write_whole(
+                storage.join_uri(directory, name), lambda stream, content=content: stream.write(content)
+            )
     about = {"scene_id": scene.scene_id, "source": scene.source, "depth_per_m": DEPTH_PER_M, "class_ids": CLASS_ID}
-    about["frames"] = [camera_json(camera) for camera in cameras]
-    storage.write_json(about, storage.join(directory, "cameras.json"))
+    about["frames"] = [serialize_camera(camera) for camera in cameras]
+    storage.write_json(about, storage.join_uri(directory, "cameras.json"))
     return len(frames)
 
 
 def render_streets(
-    request: StreetRequest, selection: Selection, on_scene: Callable[[], None] | None = None
+    request: StreetRequest, selection: SceneSubset, on_scene: Callable[[], None] | None = None
 ) -> dict[str, int]:
     """Street views of the selected scenes; frames by scene id, 0 for a scene without a road. Goes on where it stopped.
 
     Raises ValueError if the output holds a run with other cameras, or if no scene has a road.
     """
-    record = storage.join(request.output, "streets", f"{request.run}.json")
-    if said := changed_option(record, asdict(request)):
+    record = storage.join_uri(request.output, "streets", f"{request.run}.json")
+    if said := find_changed_option(record, asdict(request)):
         raise ValueError(f"{request.output} holds a run {request.run!r} with {said}; choose another --run or --output")
     storage.write_json(asdict(request), record)
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
@@ -119,12 +124,12 @@ def render_streets(
     def write(row: dict) -> dict:
         shard, position = chosen[row["id"]]
         (scene,) = shard.scenes([position])
-        done = storage.join(request.directory(scene), "cameras.json")
+        done = storage.join_uri(request.directory(scene), "cameras.json")
         count = len(storage.read_json(done)["frames"]) if storage.exists(done) else write_street(scene, request)
         return {"scene_id": scene.scene_id, "frames": count}
 
     frames = {}
-    for row in per_row(numbered(range(len(chosen))), write).iter_rows():
+    for row in map_rows(make_numbered_rows(range(len(chosen))), write).iter_rows():
         frames[row["scene_id"]] = row["frames"]
         if on_scene:
             on_scene()

@@ -30,32 +30,35 @@ class Chart:
     log_y: bool = False
 
 
-def chart_svg(chart: Chart) -> str:
+def draw_chart_svg(chart: Chart) -> str:
     """The chart as an <svg> element. Raises ValueError if a series has not as many x as y."""
-    series = {name: _drawable(x, y, chart.log_y) for name, (x, y) in chart.series.items()}
+    series = {name: _find_drawable(x, y, chart.log_y) for name, (x, y) in chart.series.items()}
     points = [np.stack(pair) for pair in series.values() if len(pair[0])]
     head = f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">'
     if not points:
         return f'{head}<text class="empty" x="{WIDTH / 2}" y="{HEIGHT / 2}">no data</text></svg>'
     low, high = np.hstack(points).min(axis=1), np.hstack(points).max(axis=1)
-    x_ticks, y_ticks = ticks(low[0], high[0]), (log_ticks if chart.log_y else ticks)(low[1], high[1])
+    x_ticks, y_ticks = (
+        choose_ticks(low[0], high[0]),
+        (choose_log_ticks if chart.log_y else choose_ticks)(low[1], high[1]),
+    )
     x_axis = _Axis(low[0], high[0], LEFT, WIDTH - RIGHT)
     y_axis = _Axis(y_ticks[0], y_ticks[-1], HEIGHT - BOTTOM, TOP, chart.log_y)
-    parts = [head, *_grid(x_axis, y_axis, x_ticks, y_ticks), *_labels(chart)]
+    parts = [head, *_draw_grid(x_axis, y_axis, x_ticks, y_ticks), *_draw_labels(chart)]
     for index, (x, y) in enumerate(series.values()):
-        parts += _lines(x_axis(x), y_axis(y), index % NUM_COLORS)
-    return "".join([*parts, _legend(list(series)), "</svg>"])
+        parts += _draw_lines(x_axis(x), y_axis(y), index % NUM_COLORS)
+    return "".join([*parts, _draw_legend(list(series)), "</svg>"])
 
 
-def standalone_svg(chart: Chart) -> str:
+def make_standalone_svg(chart: Chart) -> str:
     """The chart as a file of its own: with its name space and the page's style."""
     face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
-    head, rest = chart_svg(chart).split(">", 1)
+    head, rest = draw_chart_svg(chart).split(">", 1)
     space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
     return f"{space}><style><![CDATA[{STYLE}{face}]]></style>{rest}"
 
 
-def ticks(low: float, high: float, about: int = 5) -> list[float]:
+def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
     """Round numbers (1, 2 or 5 times a power of ten) from at most `low` to at least `high`."""
     if high <= low:
         high = low + max(abs(low), 1.0)
@@ -66,7 +69,7 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
     return [round(k * step, 12) for k in range(first, last + 1)]
 
 
-def log_ticks(low: float, high: float) -> list[float]:
+def choose_log_ticks(low: float, high: float) -> list[float]:
     """Powers of ten around [low, high], with 2s and 5s where they span less than two decades."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
@@ -94,7 +97,7 @@ class _Axis:
         return self.start_px + share * (self.end_px - self.start_px)
 
 
-def _drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+def _find_drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.ndarray, np.ndarray]:
     x, y = np.asarray(x, float), np.asarray(y, float)
     if x.shape != y.shape:
         raise ValueError(f"a series has {x.size} x values and {y.size} y values")
@@ -104,22 +107,22 @@ def _drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.n
     return x[keep], y[keep]
 
 
-def _grid(x_axis: _Axis, y_axis: _Axis, x_ticks: list[float], y_ticks: list[float]) -> list[str]:
+def _draw_grid(x_axis: _Axis, y_axis: _Axis, x_ticks: list[float], y_ticks: list[float]) -> list[str]:
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     parts = []
     for value in y_ticks:
         y = float(y_axis(value))
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text class="tick y" x="{LEFT - 8}" y="{y + 4:.1f}">{number(value)}</text>')
+        parts.append(f'<text class="tick y" x="{LEFT - 8}" y="{y + 4:.1f}">{format_number(value)}</text>')
     for value in x_ticks:
         if x_axis.low <= value <= x_axis.high:
             x = float(x_axis(value))
             parts.append(f'<line class="axis" x1="{x:.1f}" x2="{x:.1f}" y1="{bottom}" y2="{bottom + 5}"/>')
-            parts.append(f'<text class="tick x" x="{x:.1f}" y="{bottom + 19}">{number(value)}</text>')
+            parts.append(f'<text class="tick x" x="{x:.1f}" y="{bottom + 19}">{format_number(value)}</text>')
     return [*parts, f'<line class="axis" x1="{LEFT}" x2="{right}" y1="{bottom}" y2="{bottom}"/>']
 
 
-def _labels(chart: Chart) -> list[str]:
+def _draw_labels(chart: Chart) -> list[str]:
     x, y = (LEFT + WIDTH - RIGHT) / 2, (TOP + HEIGHT - BOTTOM) / 2
     turned = f'transform="rotate(-90 14 {y})"'
     return [
@@ -128,24 +131,24 @@ def _labels(chart: Chart) -> list[str]:
     ]
 
 
-def _lines(x: np.ndarray, y: np.ndarray, color: int) -> list[str]:
+def _draw_lines(x: np.ndarray, y: np.ndarray, color: int) -> list[str]:
     if len(x) == 1:
         return [f'<circle class="series-{color}" cx="{x[0]:.1f}" cy="{y[0]:.1f}" r="3"/>']
     if len(x) < 200:
-        return [_polyline(x, y, f"series-{color}")]
+        return [_draw_polyline(x, y, f"series-{color}")]
     window = len(x) // 40
     mean = np.convolve(np.pad(y, window // 2, "edge"), np.full(window, 1 / window), "same")
     mean = mean[window // 2 :][: len(x)]
-    return [_polyline(x, y, f"series-{color} faint"), _polyline(x, mean, f"series-{color}")]
+    return [_draw_polyline(x, y, f"series-{color} faint"), _draw_polyline(x, mean, f"series-{color}")]
 
 
-def _polyline(x: np.ndarray, y: np.ndarray, style: str) -> str:
+def _draw_polyline(x: np.ndarray, y: np.ndarray, style: str) -> str:
     at = np.unique(np.linspace(0, len(x) - 1, min(len(x), MAX_POINTS)).round().astype(int))
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[at], y[at], strict=True))
     return f'<polyline class="{style}" points="{points}"/>'
 
 
-def _legend(names: list[str]) -> str:
+def _draw_legend(names: list[str]) -> str:
     parts = []
     for index, name in enumerate(names if len(names) > 1 else []):
         y = TOP + 14 + 18 * index
@@ -155,7 +158,7 @@ def _legend(names: list[str]) -> str:
     return "".join(parts)
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """A number as people write it: at most four digits that matter, thousands apart, powers of ten far
     out."""
     if not math.isfinite(value):

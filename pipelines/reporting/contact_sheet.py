@@ -16,11 +16,11 @@ import pyarrow.compute as pc
 from PIL import Image, ImageDraw, ImageFont
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
-from pipelines.io.mesh_export import scene_from_unit
-from pipelines.rendering.render import bev_picture, block_mean, contact_sheet, picture_3d
-from pipelines.reporting.chart import number, ticks
-from pipelines.reporting.dataset_charts import spelled
-from pipelines.schema.palette import COLOR_HEX, rgb
+from pipelines.io.mesh_export import compute_placements
+from pipelines.rendering.render import arrange_contact_sheet, average_blocks, render_3d, render_bev
+from pipelines.reporting.chart import choose_ticks, format_number
+from pipelines.reporting.dataset_charts import spell_name
+from pipelines.schema.palette import COLOR_HEX, parse_rgb
 from pipelines.schema.tables import SCENES, Shard, find_shards
 
 SORTS = {
@@ -148,8 +148,8 @@ class View:
     def picture(self, scene: Scene) -> np.ndarray:
         """(H, W, 3) uint8."""
         if self.kind == "bev":
-            return bev_picture(scene, self.size_px, supersample=2)
-        return picture_3d(scene, self.size_px, 3 * self.size_px // 4)
+            return render_bev(scene, self.size_px, supersample=2)
+        return render_3d(scene, self.size_px, 3 * self.size_px // 4)
 
 
 def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
@@ -163,7 +163,7 @@ def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
     return out
 
 
-def paint(
+def paint_scene(
     catalogue: Catalogue, indices: np.ndarray, views: tuple[View, ...], on_picture: Callable[[], None] | None = None
 ) -> list[list[np.ndarray]]:
     """Pictures of the scenes at `indices`: per scene one per view. Drawn by Ray, a task per few scenes of a shard."""
@@ -187,14 +187,14 @@ def paint(
 # ------------------------------------------------------------------------------------------------- parts of plates
 
 
-def font(size: int) -> ImageFont.FreeTypeFont:
+def load_font(size: int) -> ImageFont.FreeTypeFont:
     """Pillow's own face: no font file is looked for, every machine draws the same."""
     return ImageFont.load_default(size=size)
 
 
-def fitted(text: str, size: int, width_px: float) -> str:
+def fit_text(text: str, size: int, width_px: float) -> str:
     """The text, or as much of its two ends as is no wider than width_px."""
-    face, shown = font(size), text
+    face, shown = load_font(size), text
     for kept in range(len(text) - 1, 3, -1):
         if face.getlength(shown) <= width_px:
             break
@@ -202,19 +202,19 @@ def fitted(text: str, size: int, width_px: float) -> str:
     return shown
 
 
-def write(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: int = 18, fill: str = SOFT) -> float:
+def write_text(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: int = 18, fill: str = SOFT) -> float:
     """Text from x rightwards, centred on y; returns where it ends. Draws ² and ³ itself: the face lacks them."""
     for k, part in enumerate(re.split("([²³])", text)):
         raised = k % 2 == 1
-        face, part = font(round(0.65 * size) if raised else size), part.translate({ord("²"): "2", ord("³"): "3"})
+        face, part = load_font(round(0.65 * size) if raised else size), part.translate({ord("²"): "2", ord("³"): "3"})
         draw.text((x, y - (0.32 * size if raised else 0)), part, fill, face, anchor="lm")
         x += face.getlength(part)
     return x
 
 
-def swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int = 16) -> None:
+def draw_swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int = 16) -> None:
     """The colour of a ground class or category, centred on y."""
-    draw.rectangle((x, y - size / 2, x + size, y + size / 2), fill=rgb(COLOR_HEX[name]), outline=LINE)
+    draw.rectangle((x, y - size / 2, x + size, y + size / 2), fill=parse_rgb(COLOR_HEX[name]), outline=LINE)
 
 
 # ------------------------------------------------------------------------------------------- one scene, every view
@@ -222,13 +222,13 @@ def swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int =
 # viridis, at equal steps
 RAMP = np.array(
     [
-        rgb(c)
+        parse_rgb(c)
         for c in ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725")
     ]
 )
 
 
-def heights_picture(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, float]]:
+def draw_heights(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, float]]:
     """The fused ground's height in the colours of RAMP, white where there is none; and the heights of its ends.
 
     The ends are the 1st and 99th percentile: single slabs far off would leave no contrast. (0, 1) without ground.
@@ -237,21 +237,21 @@ def heights_picture(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float
     known = winner >= 0
     low, high = np.percentile(surface[known], [1, 99]) if known.any() else (0.0, 1.0)
     high = max(high, low + 0.01)
-    colored = np.where(known[..., None], ramp((surface - low) / (high - low)), 255)
+    colored = np.where(known[..., None], make_color_ramp((surface - low) / (high - low)), 255)
     scale = size_px / max(known.shape)
     row, col = (((np.arange(2 * round(n * scale)) + 0.5) / (2 * scale)).astype(int).clip(0, n - 1) for n in known.shape)
-    return np.round(block_mean(colored[np.ix_(row, col)], 2)).astype(np.uint8), (float(low), float(high))
+    return np.round(average_blocks(colored[np.ix_(row, col)], 2)).astype(np.uint8), (float(low), float(high))
 
 
-def ramp(share: np.ndarray) -> np.ndarray:
+def make_color_ramp(share: np.ndarray) -> np.ndarray:
     """(..., 3) float sRGB of values (...) from 0 to 1, clipped."""
     share = np.clip(share, 0, 1) * (len(RAMP) - 1)
     return np.stack([np.interp(share, np.arange(len(RAMP)), channel) for channel in RAMP.T], axis=-1)
 
 
-def footprints_m(scene: Scene) -> list[np.ndarray]:
+def compute_footprints_m(scene: Scene) -> list[np.ndarray]:
     """The outline (k, 2) of each primitive's shadow from above, in metres."""
-    transform = scene_from_unit(scene)
+    transform = compute_placements(scene)
     outlines = []
     turn = np.linspace(0, 2 * np.pi, 33)[:-1]
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1) / 2
@@ -266,7 +266,7 @@ def footprints_m(scene: Scene) -> list[np.ndarray]:
     return outlines
 
 
-def footprints_picture(scene: Scene, size_px: int, supersample: int = 3) -> np.ndarray:
+def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndarray:
     """The primitives alone from above: see-through footprints, higher ones over lower ones, (H, W, 3) uint8.
 
     A line from the centre shows the heading where it is known.
@@ -279,19 +279,19 @@ def footprints_picture(scene: Scene, size_px: int, supersample: int = 3) -> np.n
     def pixels(point_m: np.ndarray) -> list[tuple[float, float]]:
         return [(scale * (grid.left_m - y), scale * (grid.front_m - x)) for x, y in point_m]
 
-    outlines, center = footprints_m(scene), scene.center_m[:, :2]
+    outlines, center = compute_footprints_m(scene), scene.center_m[:, :2]
     ahead = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1) * scene.size_m[:, :1] / 2
     for k in (scene.center_m[:, 2] + scene.size_m[:, 2] / 2).argsort(kind="stable"):
-        color = rgb(COLOR_HEX[CATEGORIES[scene.category[k]]])
+        color = parse_rgb(COLOR_HEX[CATEGORIES[scene.category[k]]])
         path = pixels(outlines[k])
         draw.polygon(path, fill=(*color, 70))
         draw.line([*path, path[0]], fill=(*color, 255), width=round(0.5 * supersample + 1))
         if np.isfinite(scene.heading_rad[k]):
             draw.line(pixels([center[k], center[k] + ahead[k]]), fill=(*color, 255), width=round(0.5 * supersample + 1))
-    return np.round(block_mean(np.asarray(image), supersample)).astype(np.uint8)
+    return np.round(average_blocks(np.asarray(image), supersample)).astype(np.uint8)
 
 
-class Box(NamedTuple):
+class LayoutBox(NamedTuple):
     """Where a picture lies on a plate, in pixels."""
 
     left: int
@@ -314,52 +314,52 @@ PRIMITIVES_X = HEIGHTS_X + SMALL + SCALE + GAP
 LEGEND_X = PRIMITIVES_X + SMALL + GAP
 
 
-def scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, Box]]:
+def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
     """One scene in every view with its names, labels and counts: (H, W, 3) uint8, and where each picture lies.
 
     Pictures: bev, 3d, ground, heights, primitives. The first is `bev_picture` as it is.
     """
     bare = replace(scene, height_m=np.zeros_like(scene.height_m), occupied=np.zeros_like(scene.occupied))
-    heights, span_m = heights_picture(scene, SMALL)
-    extent = " x ".join(number(n * scene.grid.resolution_m) for n in (scene.grid.rows, scene.grid.cols))
+    heights, span_m = draw_heights(scene, SMALL)
+    extent = " x ".join(format_number(n * scene.grid.resolution_m) for n in (scene.grid.rows, scene.grid.cols))
     panels = {
         "bev": (
-            bev_picture(scene, LARGE, supersample=2),
+            render_bev(scene, LARGE, supersample=2),
             MARGIN,
             TOP_ROW,
             LARGE,
             f"From above, {extent} m, forward is up",
         ),
-        "3d": (picture_3d(scene, WIDE, LARGE), MARGIN + LARGE + GAP, TOP_ROW, LARGE, "From behind"),
-        "ground": (bev_picture(scene.select([]), SMALL, supersample=2), GROUND_X, BOTTOM_ROW, SMALL, "Ground classes"),
+        "3d": (render_3d(scene, WIDE, LARGE), MARGIN + LARGE + GAP, TOP_ROW, LARGE, "From behind"),
+        "ground": (render_bev(scene.select([]), SMALL, supersample=2), GROUND_X, BOTTOM_ROW, SMALL, "Ground classes"),
         "heights": (heights, HEIGHTS_X, BOTTOM_ROW, SMALL, "Ground height, m"),
-        "primitives": (footprints_picture(bare, SMALL), PRIMITIVES_X, BOTTOM_ROW, SMALL, "Primitives, seen through"),
+        "primitives": (draw_footprints(bare, SMALL), PRIMITIVES_X, BOTTOM_ROW, SMALL, "Primitives, seen through"),
     }
     plate = Image.new("RGB", (PLATE_WIDTH, PLATE_HEIGHT), "white")
     draw = ImageDraw.Draw(plate)
-    _header(draw, scene)
+    _draw_header(draw, scene)
     boxes = {}
     for name, (picture, left, top, size, title) in panels.items():
         rows, cols = picture.shape[:2]
         across = WIDE if name == "3d" else size
-        box = Box(left + (across - cols) // 2, top + (size - rows) // 2, cols, rows)
-        write(draw, left, top - 22, title, 20, INK)
+        box = LayoutBox(left + (across - cols) // 2, top + (size - rows) // 2, cols, rows)
+        write_text(draw, left, top - 22, title, 20, INK)
         draw.rectangle((box.left - 1, box.top - 1, box.left + cols, box.top + rows), outline=LINE)
         plate.paste(Image.fromarray(picture), (box.left, box.top))
         boxes[name] = box
-    _metres(draw, scene, boxes["bev"])
+    _format_metres(draw, scene, boxes["bev"])
     if scene.occupied.any():
-        _scale(plate, draw, boxes["heights"], span_m)
-    _legend(draw, scene, LEGEND_X, BOTTOM_ROW)
+        _draw_scale(plate, draw, boxes["heights"], span_m)
+    _draw_legend(draw, scene, LEGEND_X, BOTTOM_ROW)
     return np.asarray(plate), boxes
 
 
-def _header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
+def _draw_header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
     x, y, z = scene.world_xyz_m
-    write(draw, MARGIN, 54, fitted(scene.scene_id, 40, PLATE_WIDTH - 2 * MARGIN), 40, INK)
+    write_text(draw, MARGIN, 54, fit_text(scene.scene_id, 40, PLATE_WIDTH - 2 * MARGIN), 40, INK)
     where = f"{scene.source}  ·  {scene.split}  ·  sequence {scene.sequence}  ·  frame {scene.frame}"
     pose = f"x {x:,.1f}, y {y:,.1f}, z {z:,.1f} m, yaw {np.degrees(scene.world_yaw_rad):.0f}°"
-    write(draw, MARGIN, 98, f"{where}  ·  {pose}", 20)
+    write_text(draw, MARGIN, 98, f"{where}  ·  {pose}", 20)
     volume = {
         name: scene.volume_m3[
             np.isin(scene.category, [k for k, c in enumerate(CATEGORIES) if c.startswith(name)])
@@ -367,53 +367,53 @@ def _header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
         for name in ("vegetation", "vehicle")
     }
     parts = [
-        f"{name} {getattr(scene, f'{name}_density') or 'without label'}, {number(float(round(volume[name])))} m³"
+        f"{name} {getattr(scene, f'{name}_density') or 'without label'}, {format_number(float(round(volume[name])))} m³"
         for name in volume
     ]
-    write(draw, MARGIN, 128, "  ·  ".join([*parts, f"{len(scene)} primitives"]), 20)
+    write_text(draw, MARGIN, 128, "  ·  ".join([*parts, f"{len(scene)} primitives"]), 20)
 
 
-def _metres(draw: ImageDraw.ImageDraw, scene: Scene, box: Box) -> None:
+def _format_metres(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> None:
     """Ticks of x at the left and of y below a picture from above."""
     grid = scene.grid
-    for x in ticks(grid.back_m, grid.front_m, 4):
+    for x in choose_ticks(grid.back_m, grid.front_m, 4):
         if grid.back_m <= x <= grid.front_m:
             at = box.top + (grid.front_m - x) / (grid.front_m - grid.back_m) * box.height
             draw.line((box.left - 6, at, box.left - 1, at), fill=SOFT)
-            draw.text((box.left - 10, at), number(x), SOFT, font(14), anchor="rm")
-    for y in ticks(grid.right_m, grid.left_m, 4):
+            draw.text((box.left - 10, at), format_number(x), SOFT, load_font(14), anchor="rm")
+    for y in choose_ticks(grid.right_m, grid.left_m, 4):
         if grid.right_m <= y <= grid.left_m:
             at = box.left + (grid.left_m - y) / (grid.left_m - grid.right_m) * box.width
             draw.line((at, box.top + box.height, at, box.top + box.height + 5), fill=SOFT)
-            draw.text((at, box.top + box.height + 16), number(y), SOFT, font(14), anchor="mm")
+            draw.text((at, box.top + box.height + 16), format_number(y), SOFT, load_font(14), anchor="mm")
 
 
-def _scale(plate: Image.Image, draw: ImageDraw.ImageDraw, box: Box, span_m: tuple[float, float]) -> None:
+def _draw_scale(plate: Image.Image, draw: ImageDraw.ImageDraw, box: LayoutBox, span_m: tuple[float, float]) -> None:
     """The colours of heights with their metres, right of a picture."""
     low, high = span_m
     left = box.left + box.width + 14
-    strip = ramp(np.linspace(1, 0, box.height))[:, None].repeat(16, axis=1)
+    strip = make_color_ramp(np.linspace(1, 0, box.height))[:, None].repeat(16, axis=1)
     plate.paste(Image.fromarray(np.round(strip).astype(np.uint8)), (left, box.top))
-    for value in ticks(low, high):
+    for value in choose_ticks(low, high):
         if low <= value <= high:
             at = box.top + (high - value) / (high - low) * (box.height - 1)
             draw.line((left + 16, at, left + 20, at), fill=SOFT)
-            draw.text((left + 25, at), number(value), SOFT, font(14), anchor="lm")
+            draw.text((left + 25, at), format_number(value), SOFT, load_font(14), anchor="lm")
 
 
-def _legend(draw: ImageDraw.ImageDraw, scene: Scene, left: int, top: int) -> None:
+def _draw_legend(draw: ImageDraw.ImageDraw, scene: Scene, left: int, top: int) -> None:
     """Categories with their counts, ground classes with their share of the grid."""
     size, step, right = 17, 25, PLATE_WIDTH - MARGIN
     share = scene.occupied.mean(axis=(1, 2))
-    counts = [(name, number(int(n))) for name, n in zip(CATEGORIES, scene.counts(), strict=True)]
+    counts = [(name, format_number(int(n))) for name, n in zip(CATEGORIES, scene.counts(), strict=True)]
     areas = [(name, f"{100 * part:.1f} %") for name, part in zip(scene.ground_classes, share, strict=True)]
-    write(draw, left, top - 22, "Primitives and ground", 20, INK)
+    write_text(draw, left, top - 22, "Primitives and ground", 20, INK)
     y = top + 9
     for rows in (counts, areas):
         for name, value in rows:
-            swatch(draw, left, y, name)
-            write(draw, left + 26, y, spelled(name), size, INK if value not in ("0", "0.0 %") else SOFT)
-            draw.text((right, y), value, INK if value not in ("0", "0.0 %") else SOFT, font(size), anchor="rm")
+            draw_swatch(draw, left, y, name)
+            write_text(draw, left + 26, y, spell_name(name), size, INK if value not in ("0", "0.0 %") else SOFT)
+            draw.text((right, y), value, INK if value not in ("0", "0.0 %") else SOFT, load_font(size), anchor="rm")
             y += step
         y += 10
 
@@ -421,7 +421,7 @@ def _legend(draw: ImageDraw.ImageDraw, scene: Scene, left: int, top: int) -> Non
 # ---------------------------------------------------------------------------------------------- sheets of scenes
 
 
-def scene_sheet(
+def draw_scene_sheet(
     pictures: Sequence[np.ndarray], captions: Sequence[tuple[str, str]], title: str, columns: int | None = None
 ) -> np.ndarray:
     """Pictures of one size, two lines under each, a title above and the colours below: (H, W, 3) uint8."""
@@ -433,33 +433,33 @@ def scene_sheet(
         tile.paste(Image.fromarray(picture))
         draw = ImageDraw.Draw(tile)
         draw.rectangle((0, 0, picture.shape[1] - 1, picture.shape[0] - 1), outline=LINE)
-        write(draw, 0, height + size, fitted(name, size, width), size, INK)
-        write(draw, 0, height + 2.35 * size, remark, size)
+        write_text(draw, 0, height + size, fit_text(name, size, width), size, INK)
+        write_text(draw, 0, height + 2.35 * size, remark, size)
         tiles.append(np.asarray(tile))
-    body = contact_sheet(tiles, columns or best_columns(len(tiles), width / height), gap_px=gap)
-    return np.concatenate([_title(title, body.shape[1], gap), body, _colors(body.shape[1], gap)])
+    body = arrange_contact_sheet(tiles, columns or choose_columns(len(tiles), width / height), gap_px=gap)
+    return np.concatenate([_draw_title(title, body.shape[1], gap), body, _draw_colors(body.shape[1], gap)])
 
 
-def best_columns(count: int, aspect: float) -> int:
+def choose_columns(count: int, aspect: float) -> int:
     """Columns for a sheet about 5 : 4, the last row as full as can be; aspect is a picture's width / height."""
     middle = round(np.sqrt(count * 1.25 / aspect))
     near = range(max(1, round(0.75 * middle)), round(1.25 * middle) + 2)
     return min(near, key=lambda c: (-count % c, abs(c - middle)))
 
 
-def _title(text: str, width: int, margin: int) -> np.ndarray:
+def _draw_title(text: str, width: int, margin: int) -> np.ndarray:
     size = min(36, max(18, width // 50))
     strip = Image.new("RGB", (width, round(2.2 * size)), "white")
-    write(ImageDraw.Draw(strip), margin, 1.4 * size, fitted(text, size, width - 2 * margin), size, INK)
+    write_text(ImageDraw.Draw(strip), margin, 1.4 * size, fit_text(text, size, width - 2 * margin), size, INK)
     return np.asarray(strip)
 
 
-def _colors(width: int, margin: int) -> np.ndarray:
+def _draw_colors(width: int, margin: int) -> np.ndarray:
     """A strip with the colour of every class, in as many lines as it takes."""
     size = min(22, max(13, width // 90))
     places, x, line = [], margin, 0
     for name in COLOR_HEX:
-        span = 1.5 * size + font(size).getlength(spelled(name))
+        span = 1.5 * size + load_font(size).getlength(spell_name(name))
         if x > margin and x + span > width - margin:
             x, line = margin, line + 1
         places.append((x, line))
@@ -468,12 +468,12 @@ def _colors(width: int, margin: int) -> np.ndarray:
     draw = ImageDraw.Draw(strip)
     for name, (x, line) in zip(COLOR_HEX, places, strict=True):
         y = (line + 0.8) * 1.8 * size
-        swatch(draw, x, y, name, size)
-        write(draw, x + 1.5 * size, y, spelled(name), size)
+        draw_swatch(draw, x, y, name, size)
+        write_text(draw, x + 1.5 * size, y, spell_name(name), size)
     return np.asarray(strip)
 
 
-def captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[tuple[str, str]]:
+def make_captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[tuple[str, str]]:
     """Per scene its id, and its label, number of primitives and what it is sorted by."""
     names, totals = catalogue.column("scene_id"), catalogue.column("num_primitives")
     column = None if sort in ("drive", "random", "primitives", "num_primitives") else catalogue.sort_column(sort)
@@ -482,25 +482,27 @@ def captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[tuple
     for k in indices:
         remark = f"{totals[k]} primitives"
         if values is not None:
-            remark += f"  ·  {_quantity(column, values[k])}"
+            remark += f"  ·  {_format_quantity(column, values[k])}"
         out.append((names[k], remark))
     return out
 
 
-def _quantity(column: str, value: float) -> str:
+def _format_quantity(column: str, value: float) -> str:
     """A column's value with its name and unit."""
     for ending, unit in (("_m3", " m³"), ("_m2", " m²"), ("_rad", " rad"), ("_m", " m")):
         if column.endswith(ending):
             name = column.removesuffix(ending).removesuffix("_volume").removesuffix("_area")
             digits = 0 if ending in ("_m2", "_m3") else 2
-            return f"{spelled(name)} {number(round(float(value), digits))}{unit}"
-    return f"{spelled(column.removeprefix('num_'))} {number(float(value))}"
+            return f"{spell_name(name)} {format_number(round(float(value), digits))}{unit}"
+    return f"{spell_name(column.removeprefix('num_'))} {format_number(float(value))}"
 
 
-def sheet_title(catalogue: Catalogue, count: int, sort: str, pick: str) -> str:
+def make_sheet_title(catalogue: Catalogue, count: int, sort: str, pick: str) -> str:
     """What a sheet shows, in one line."""
     parts = (", ".join(sorted({getattr(shard, name) for shard in catalogue.shards})) for name in ("source", "split"))
-    order = {"random": "at random", "drive": "along the drives"}.get(sort, f"by {spelled(sort.removeprefix('num_'))}")
+    order = {"random": "at random", "drive": "along the drives"}.get(
+        sort, f"by {spell_name(sort.removeprefix('num_'))}"
+    )
     if sort != "random":
         order += {"spread": "", "lowest": ", the first", "highest": ", the last first"}[pick]
-    return "  ·  ".join([*parts, f"{number(count)} of {number(len(catalogue))} scenes", order])
+    return "  ·  ".join([*parts, f"{format_number(count)} of {format_number(len(catalogue))} scenes", order])

@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import CATEGORIES, DENSITIES, GROUND_CLASSES
-from pipelines.reporting.chart import number
+from pipelines.reporting.chart import format_number
 from pipelines.reporting.contact_sheet import Catalogue
 from pipelines.reporting.dataset_charts import (
-    count_histogram,
-    label_matrix,
-    share_bars,
-    size_ranges,
-    spelled,
-    track_map,
+    draw_count_histogram,
+    draw_label_matrix,
+    draw_share_bars,
+    draw_size_ranges,
+    draw_track_map,
+    spell_name,
 )
-from pipelines.reporting.report import Figure, KeyFigures, Picture, Pictures, Section, Table, Text, report_html
+from pipelines.reporting.report import Figure, KeyFigures, Picture, Pictures, Section, Table, Text, render_report_html
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards
 
@@ -39,7 +39,7 @@ SPLITS = ("train", "test", "unused", "generated")
 
 
 @dataclass(frozen=True, eq=False)
-class Facts:
+class DatasetFacts:
     """What the page is made of."""
 
     catalogue: Catalogue
@@ -68,7 +68,7 @@ class Facts:
 
 def read_facts(
     root: str, source: str | None = None, split: str | None = None, on_shard: Callable[[int, int], None] | None = None
-) -> Facts:
+) -> DatasetFacts:
     """Reads every table of a dataset directory once; `on_shard` hears how many shards are done, of how many.
 
     Raises ValueError if it holds no scenes of this source and split.
@@ -89,9 +89,9 @@ def read_facts(
             labels[row["category"], row["label"]] += row["count_all"]
         if on_shard:
             on_shard(done, len(catalogue.shards))
-    description = storage.join(root, "dataset.json")
-    records = {name: storage.join(root, f"{name}.json") for name in sorted({s.source for s in catalogue.shards})}
-    return Facts(
+    description = storage.join_uri(root, "dataset.json")
+    records = {name: storage.join_uri(root, f"{name}.json") for name in sorted({s.source for s in catalogue.shards})}
+    return DatasetFacts(
         catalogue=catalogue,
         grid_area_m2=np.concatenate(areas),
         sizes_m={name: np.concatenate(parts) for name, parts in sizes.items() if parts},
@@ -104,7 +104,7 @@ def read_facts(
 
 def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]:
     """Rows of the rejects table; none if there is no such table."""
-    if not storage.list_files(storage.join(root, "rejects"), ".parquet"):
+    if not storage.list_files(storage.join_uri(root, "rejects"), ".parquet"):
         return []
     shards = [s for s in find_shards(root, "rejects") if s.source == (source or s.source)]
     return [row for s in shards if s.split == (split or s.split) for row in s.read("rejects").to_pylist()]
@@ -113,7 +113,7 @@ def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]
 # --------------------------------------------------------------------------------------------------------- page
 
 
-class Drawing(NamedTuple):
+class CaptionedSvg(NamedTuple):
     """An <svg> element, and words under it."""
 
     svg: str
@@ -121,64 +121,68 @@ class Drawing(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Drawings:
+class DrawingsSection:
     """A section of drawings: as wide as the page, two side by side, or as many small ones as fit."""
 
     title: str
-    drawings: Sequence[Drawing]
+    drawings: Sequence[CaptionedSvg]
     layout: str  # wide, pairs or small
     note: str = ""
 
 
-def page_html(title: str, sections: Sequence[Section | Drawings], subtitle: str = "") -> str:
+def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
     """`report_html` with drawings among the sections."""
     plain = [
-        Text(section.title, [section.note, _marker(index)]) if isinstance(section, Drawings) else section
+        Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
         for index, section in enumerate(sections)
     ]
-    html = report_html(title, plain, subtitle)
+    html = render_report_html(title, plain, subtitle)
     for index, section in enumerate(sections):
-        if isinstance(section, Drawings):
-            html = html.replace(f"<p>{_marker(index)}</p>", _drawings(section))
+        if isinstance(section, DrawingsSection):
+            html = html.replace(f"<p>{_make_marker(index)}</p>", _render_drawings(section))
     return html
 
 
-def _marker(index: int) -> str:
+def _make_marker(index: int) -> str:
     return f"[drawings of section {index}]"
 
 
-def _drawings(section: Drawings) -> str:
+def _render_drawings(section: DrawingsSection) -> str:
     kind = {"wide": "scroll", "pairs": "charts", "small": "pictures"}[section.layout]
     captions = [f"<figcaption>{escape(d.caption)}</figcaption>" if d.caption else "" for d in section.drawings]
     figures = [f"<figure>{d.svg}{caption}</figure>" for d, caption in zip(section.drawings, captions, strict=True)]
     return f'<div class="{kind}">{"".join(figures)}</div>'
 
 
-def dataset_html(facts: Facts, scenes: Sequence[tuple[Picture, Picture]] = ()) -> str:
+def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Picture]] = ()) -> str:
     """The whole page; `scenes` are pairs of pictures to show, oblique and from above."""
     root = facts.catalogue.root.rstrip("/")
     sections = [
-        totals(facts),
-        *([scene_pictures(scenes)] if scenes else []),
-        *split_sections(facts),
-        histograms(facts),
-        *size_sections(facts),
-        ground_shares(facts),
-        *label_sections(facts),
-        *reject_sections(facts),
-        *reader_sections(facts),
-        *origin_sections(facts),
+        make_totals(facts),
+        *([draw_scene_pictures(scenes)] if scenes else []),
+        *make_split_sections(facts),
+        draw_histograms(facts),
+        *make_size_sections(facts),
+        draw_ground_shares(facts),
+        *make_label_sections(facts),
+        *make_reject_sections(facts),
+        *make_reader_sections(facts),
+        *make_provenance_sections(facts),
     ]
-    return page_html(root.rsplit("/", 1)[-1], sections, root)
+    return render_page_html(root.rsplit("/", 1)[-1], sections, root)
 
 
-def totals(facts: Facts) -> KeyFigures:
+def make_totals(facts: DatasetFacts) -> KeyFigures:
     catalogue, counts = facts.catalogue, facts.counts
     per_scene = counts.sum(axis=1)
     low, high = np.percentile(per_scene, [5, 95])
     sequences = len(set(catalogue.column("sequence")))
     figures = [
-        Figure(len(catalogue), "scenes", ", ".join(f"{number(n)} {split}" for split, n in by_split(facts).items())),
+        Figure(
+            len(catalogue),
+            "scenes",
+            ", ".join(f"{format_number(n)} {split}" for split, n in group_by_split(facts).items()),
+        ),
         Figure(int(per_scene.sum()), "primitives", f"in {len(facts.categories)} of {len(CATEGORIES)} categories"),
         Figure(float(round(per_scene.mean(), 1)), "primitives per scene", f"{low:.0f} to {high:.0f} in nine of ten"),
         Figure(sequences, "sequence" if sequences == 1 else "sequences"),
@@ -190,13 +194,13 @@ def totals(facts: Facts) -> KeyFigures:
     return KeyFigures("In short", figures)
 
 
-def by_split(facts: Facts) -> dict[str, int]:
+def group_by_split(facts: DatasetFacts) -> dict[str, int]:
     """Scenes per split, in the order of SPLITS."""
     found = Counter(facts.catalogue.column("split"))
     return {name: found[name] for name in sorted(found, key=lambda s: (SPLITS.index(s) if s in SPLITS else 9, s))}
 
 
-def scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
+def draw_scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
     """Rows of oblique pictures, each over a row of the same scenes from above."""
     columns, pictures = min(len(scenes), 4), []
     for start in range(0, len(scenes), columns):
@@ -206,7 +210,7 @@ def scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
     return Pictures("A few scenes", pictures, columns=columns, note=note)
 
 
-def split_sections(facts: Facts) -> list[Section | Drawings]:
+def make_split_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
     """How many scenes lie where; the map only where poses are known."""
     catalogue = facts.catalogue
     source, split, sequence = (catalogue.column(name) for name in ("source", "split", "sequence"))
@@ -225,7 +229,7 @@ def split_sections(facts: Facts) -> list[Section | Drawings]:
             )
         )
     columns = ("source", "split", "scenes", "share", "sequences", "primitives per scene")
-    sections: list[Section | Drawings] = [Table("Splits", columns, rows)]
+    sections: list[Section | DrawingsSection] = [Table("Splits", columns, rows)]
     position_m = np.stack([catalogue.column("x_m"), catalogue.column("y_m")], axis=1)
     if (np.ptp(position_m, axis=0) == 0).all():
         return sections
@@ -241,10 +245,10 @@ def split_sections(facts: Facts) -> list[Section | Drawings]:
         "A dot per scene at the pose it was cut at, world x to the right and y up. Every sequence is drawn at the same "
         "scale; where sequences lie to one another is not shown."
     )
-    return [*sections, Drawings("Split map", [Drawing(track_map(tracks))], "wide", note)]
+    return [*sections, DrawingsSection("Split map", [CaptionedSvg(draw_track_map(tracks))], "wide", note)]
 
 
-def histograms(facts: Facts) -> Drawings:
+def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
     """Scenes by count, per category, with the slots of dataset.json and the 95th percentile they come from."""
     training, drawings = facts.catalogue.column("split") == "train", []
     for k, name in enumerate(CATEGORIES):
@@ -258,7 +262,9 @@ def histograms(facts: Facts) -> Drawings:
             words.append(f"over slots {100 * (counts[training] > facts.slots[name]).mean():.1f} %")
         if name in facts.categories or name in facts.slots:
             drawings.append(
-                Drawing(count_histogram(name, counts, marks), " · ".join(part.replace(" ", NBSP) for part in words))
+                CaptionedSvg(
+                    draw_count_histogram(name, counts, marks), " · ".join(part.replace(" ", NBSP) for part in words)
+                )
             )
     note = "How many scenes (upwards) have how many primitives of a category (to the right)."
     if facts.description:
@@ -266,10 +272,10 @@ def histograms(facts: Facts) -> Drawings:
             " p95 is the 95th percentile of the training split; a tensor holds as many primitives of a category as it "
             "has slots, the nearest first. Over slots: the share of training scenes that have more."
         )
-    return Drawings("Primitives per scene", drawings, "small", note)
+    return DrawingsSection("Primitives per scene", drawings, "small", note)
 
 
-def size_sections(facts: Facts) -> list[Section | Drawings]:
+def make_size_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
     """Ranges of length, width and height per category, as a drawing and in numbers."""
     percentiles = {name: np.percentile(facts.sizes_m[name], PERCENTILES, axis=0) for name in facts.categories}
     if not percentiles:
@@ -280,25 +286,27 @@ def size_sections(facts: Facts) -> list[Section | Drawings]:
     )
     rows = []
     for name, values in percentiles.items():
-        spans = [f"{NBSP}·{NBSP}".join(map(_metres, column)) for column in values[[0, 2, 4]].T]
+        spans = [f"{NBSP}·{NBSP}".join(map(_format_metres, column)) for column in values[[0, 2, 4]].T]
         total = len(facts.sizes_m[name])
         labels = sorted(((n, label) for (c, label), n in facts.labels.items() if c == name), reverse=True)
         text = (
-            ", ".join(f"{label} {number(n)}" for n, label in labels) if [label for _, label in labels] != [name] else ""
+            ", ".join(f"{label} {format_number(n)}" for n, label in labels)
+            if [label for _, label in labels] != [name]
+            else ""
         )
-        rows.append((spelled(name).replace(" ", NBSP), total, round(total / len(facts.catalogue), 2), *spans, text))
+        rows.append((spell_name(name).replace(" ", NBSP), total, round(total / len(facts.catalogue), 2), *spans, text))
     columns = ("category", "primitives", "per scene", "length, m", "width, m", "height, m", "the dataset's own labels")
     return [
-        Drawings("Sizes", [Drawing(size_ranges(percentiles))], "wide", note),
+        DrawingsSection("Sizes", [CaptionedSvg(draw_size_ranges(percentiles))], "wide", note),
         Table("Categories", columns, rows, note="Sizes: 5th percentile · median · 95th percentile."),
     ]
 
 
-def _metres(value: float) -> str:
+def _format_metres(value: float) -> str:
     return f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
-def ground_shares(facts: Facts) -> Drawings:
+def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
     """Mean share of the grid per ground class and density label."""
     drawings = []
     for group in ("vegetation", "vehicle"):
@@ -308,39 +316,41 @@ def ground_shares(facts: Facts) -> Drawings:
             share = facts.catalogue.column(f"{name}_area_m2").astype(float) / facts.grid_area_m2
             chosen = {label: (labels == label) & np.isfinite(share) for label in (*DENSITIES, None)}
             shares[name] = {label or "no label": share[rows].mean() for label, rows in chosen.items() if rows.any()}
-        drawings.append(Drawing(share_bars(f"by {group} density", {n: by for n, by in shares.items() if by})))
+        drawings.append(CaptionedSvg(draw_share_bars(f"by {group} density", {n: by for n, by in shares.items() if by})))
     note = "Mean share of a scene's area that each ground class covers. Classes may overlap, and some of the area has none."
-    return Drawings("Ground", drawings, "pairs", note)
+    return DrawingsSection("Ground", drawings, "pairs", note)
 
 
-def label_sections(facts: Facts) -> list[Section | Drawings]:
+def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
     """Label pairs per split, and the thresholds behind them."""
     columns = [facts.catalogue.column(f"{group}_density") for group in ("vegetation", "vehicle")]
     names = [[*DENSITIES, *([None] if None in set(values) else [])] for values in columns]
     split, drawings = facts.catalogue.column("split"), []
-    for part, total in by_split(facts).items():
+    for part, total in group_by_split(facts).items():
         pairs = Counter(zip(*(values[split == part] for values in columns), strict=True))
         counts = np.array([[pairs[row, column] for column in names[1]] for row in names[0]])
-        drawings.append(Drawing(label_matrix(f"{part}, {number(total)} scenes", counts, *_named(names))))
+        drawings.append(
+            CaptionedSvg(draw_label_matrix(f"{part}, {format_number(total)} scenes", counts, *_name_rows(names)))
+        )
     note = "Scenes per pair of labels. low: count and volume both below their p25; high: both above their p75; else medium."
     if not facts.description:
-        return [Drawings("Labels", drawings, "small", "Scenes per pair of labels: what was asked for.")]
+        return [DrawingsSection("Labels", drawings, "small", "Scenes per pair of labels: what was asked for.")]
     found = {group: facts.description[f"{group}_thresholds"] for group in ("vegetation", "vehicle")}
     keys = list(found["vegetation"])
     heads = ("label", *(key.replace("_m3", ", m³").replace("_", " ") for key in keys))
     rows = [(group, *(values[key] for key in keys)) for group, values in found.items()]
     return [
-        Drawings("Labels", drawings, "small", note),
+        DrawingsSection("Labels", drawings, "small", note),
         Table("Label thresholds", heads, rows, note="Of the training split."),
     ]
 
 
-def _named(names: Sequence[Sequence[str | None]]) -> tuple[list[str], list[str]]:
+def _name_rows(names: Sequence[Sequence[str | None]]) -> tuple[list[str], list[str]]:
     first, second = ([label or "none" for label in labels] for labels in names)
     return first, second
 
 
-def reject_sections(facts: Facts) -> list[Section]:
+def make_reject_sections(facts: DatasetFacts) -> list[Section]:
     """Why scenes were left out."""
     if not facts.rejects:
         return [Text("Rejected scenes", ["Every pose became a scene."])] if facts.description else []
@@ -356,7 +366,7 @@ def reject_sections(facts: Facts) -> list[Section]:
     return [Table("Rejected scenes", ("scenes", "reason", "sequences", "for example"), rows, note=more)]
 
 
-def reader_sections(facts: Facts) -> list[Section]:
+def make_reader_sections(facts: DatasetFacts) -> list[Section]:
     """What the readers of raw drives dropped, per sequence: numbers, labels without a category, defective objects."""
     reports: Mapping[str, Mapping] = (facts.description or {}).get("reports") or {}
     if not reports:
@@ -375,7 +385,7 @@ def reader_sections(facts: Facts) -> list[Section]:
     sections: list[Section] = [
         Table(
             "What the readers found",
-            ("sequence", *map(spelled, names)),
+            ("sequence", *map(spell_name, names)),
             rows,
             note="Objects in the raw files by what became of them. dropped: known labels of no category; unknown: "
             "labels in no table; duplicates: objects written a second time; defects: objects that cannot be read.",
@@ -400,17 +410,17 @@ def reader_sections(facts: Facts) -> list[Section]:
     return sections
 
 
-def origin_sections(facts: Facts) -> list[Section]:
+def make_provenance_sections(facts: DatasetFacts) -> list[Section]:
     """The options each part was made with."""
     made = {facts.description["source"]: facts.description["options"]} if facts.description else {}
     sections: list[Section] = []
     for source, options in (made | facts.records).items():
-        rows = [(name, _plain(value)) for name, value in options.items()]
+        rows = [(name, _convert_to_plain(value)) for name, value in options.items()]
         sections.append(Table(f"How {source} was made", ("option", "value"), rows))
     return sections
 
 
-def _plain(value: object) -> str:
+def _convert_to_plain(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_plain(part)}" for name, part in value.items())
-    return ", ".join(map(_plain, value)) if isinstance(value, list) else "–" if value is None else str(value)
+        return ", ".join(f"{name} {_convert_to_plain(part)}" for name, part in value.items())
+    return ", ".join(map(_convert_to_plain, value)) if isinstance(value, list) else "–" if value is None else str(value)

@@ -9,9 +9,19 @@ import numpy as np
 
 from models.scene import CATEGORIES
 from pipelines.metrics.distributions import HISTOGRAMS
-from pipelines.reporting.chart import Chart, number
-from pipelines.reporting.dataset_charts import spelled
-from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, report_html
+from pipelines.reporting.chart import Chart, format_number
+from pipelines.reporting.dataset_charts import spell_name
+from pipelines.reporting.report import (
+    Charts,
+    Figure,
+    KeyFigures,
+    Picture,
+    Pictures,
+    Section,
+    Table,
+    Text,
+    render_report_html,
+)
 
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
@@ -46,7 +56,7 @@ VALIDITY = {
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ExamplePictures:
     """Pictures (H, W, 3) uint8 for the page: some of either side, and generated ones, each with its nearest real ones."""
 
     real: Sequence[np.ndarray]
@@ -55,24 +65,30 @@ class Shown:
     worst: Sequence[tuple[np.ndarray, str]] = ()
 
 
-def evaluation_html(scores: Mapping, counts: Mapping[str, np.ndarray], shown: Shown, protocol: Sequence[str]) -> str:
+def render_evaluation_html(
+    scores: Mapping, counts: Mapping[str, np.ndarray], shown: ExamplePictures, protocol: Sequence[str]
+) -> str:
     """The whole page from scores as `evaluate.plain` gives them; counts (n, 11) of either side by name, if known."""
     sections: list[Section] = [
-        in_short(scores),
+        make_summary(scores),
         Pictures("Real", [Picture("", image, "real") for image in shown.real], columns=6),
         Pictures("Generated", [Picture("", image, "generated") for image in shown.generated], columns=6),
-        score_table(scores),
+        build_score_table(scores),
     ]
     if "validity" in scores:
-        sections += [validity_table(scores["validity"]), count_charts(counts), statistics_table(scores["statistics"])]
-        sections.append(distance_table(scores))
+        sections += [
+            build_validity_table(scores["validity"]),
+            draw_count_charts(counts),
+            build_statistics_table(scores["statistics"]),
+        ]
+        sections.append(build_distance_table(scores))
     if shown.worst:
         worst = [Picture(reason, image, "generated") for image, reason in shown.worst]
         sections.append(Pictures("Where it fails", worst, columns=6, note="The generated scenes with most faults."))
-    sections += [neighbour_pictures(shown), memorisation_table(scores["memorisation"])]
+    sections += [draw_neighbour_pictures(shown), build_memorisation_table(scores["memorisation"])]
     sections.append(Text("How it was measured", [*protocol, INTERVALS]))
     title = f"{scores['scenes']['generated']} generated scenes against {scores['scenes']['real']} real ones"
-    return report_html("Evaluation", sections, title)
+    return render_report_html("Evaluation", sections, title)
 
 
 INTERVALS = (
@@ -81,43 +97,43 @@ INTERVALS = (
 )
 
 
-def written(value: Mapping | float | None) -> str | None:
+def format_value(value: Mapping | float | None) -> str | None:
     """`0.53 (0.49 to 0.57)`, or the number alone."""
     if isinstance(value, Mapping):
         if value["value"] is None:
             return None
         between = [value[end] for end in ("low", "high")]
-        ends = "" if None in between else f" ({number(between[0])} to {number(between[1])})"
-        return number(value["value"]) + ends
-    return None if value is None else number(value)
+        ends = "" if None in between else f" ({format_number(between[0])} to {format_number(between[1])})"
+        return format_number(value["value"]) + ends
+    return None if value is None else format_number(value)
 
 
-def leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | float]]:
+def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | float]]:
     """Names joined by dots, and what `written` takes, of nested scores in plain form; words and nulls left out."""
     for name, value in scores.items():
         if isinstance(value, Mapping) and set(value) != {"value", "low", "high"}:
-            yield from leaves(value, f"{prefix}{name}.")
+            yield from iterate_leaves(value, f"{prefix}{name}.")
         elif value is not None and not isinstance(value, str):
             yield prefix + name, value
 
 
-def headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
+def list_headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
     """The leaves that are told in short lists: none of single categories, classes or thresholds."""
-    return ((name, value) for name, value in leaves(scores) if not any(part in name for part in DETAILS))
+    return ((name, value) for name, value in iterate_leaves(scores) if not any(part in name for part in DETAILS))
 
 
-def in_short(scores: Mapping) -> KeyFigures:
+def make_summary(scores: Mapping) -> KeyFigures:
     names = ("fid", "kid", "layout_frechet", "precision_k3", "recall_k3", "random_precision_k3", "random_recall_k3")
     figures = [Figure(scores[name]["value"], name.replace("_", " ")) for name in names if name in scores]
     for name in ("overlapping", "road_connectivity"):
         if scores.get("validity", {}).get(name, {}).get("generated"):
             sides = scores["validity"][name]
-            note = "" if sides["real"] is None else f"{number(sides['real']['value'])} in real scenes"
+            note = "" if sides["real"] is None else f"{format_number(sides['real']['value'])} in real scenes"
             figures.append(Figure(sides["generated"]["value"], VALIDITY[name], note))
     return KeyFigures("In short", figures)
 
 
-def meaning(name: str) -> str:
+def explain_score(name: str) -> str:
     """In words, what a score says; `random_precision_k5` and the like by their parts."""
     if name in MEANINGS:
         return MEANINGS[name]
@@ -126,45 +142,46 @@ def meaning(name: str) -> str:
     return f"{MEANINGS[base]}{seen}; k = {k}"
 
 
-def score_table(scores: Mapping) -> Table:
+def build_score_table(scores: Mapping) -> Table:
     flat = {name: value for name, value in scores.items() if name in MEANINGS or "_k" in name}
     flat |= scores.get("label_fidelity", {})
-    rows = [(name.replace("_", " "), written(value)) for name, value in flat.items()]
+    rows = [(name.replace("_", " "), format_value(value)) for name, value in flat.items()]
     note = (
         ""
         if "fid" in scores
         else "FID, KID, Inception score and their like need local Inception weights: --inception FILE."
     )
-    return Table("Scores", ("score", "value"), rows, meanings=[meaning(name) for name in flat], note=note)
+    return Table("Scores", ("score", "value"), rows, meanings=[explain_score(name) for name in flat], note=note)
 
 
-def validity_table(validity: Mapping) -> Table:
+def build_validity_table(validity: Mapping) -> Table:
     rows = [
-        (words, *(written(validity[name][side]) for side in ("real", "generated"))) for name, words in VALIDITY.items()
+        (words, *(format_value(validity[name][side]) for side in ("real", "generated")))
+        for name, words in VALIDITY.items()
     ]
     note = "Real scenes give the level to compare with; it is not zero."
     return Table("Do scenes make sense?", ("share of", "real", "generated"), rows, note=note)
 
 
-def statistics_table(statistics: Mapping) -> Table:
+def build_statistics_table(statistics: Mapping) -> Table:
     rows = [
-        (name.replace("_", " "), *(written(sides[side]) for side in ("real", "generated")))
+        (name.replace("_", " "), *(format_value(sides[side]) for side in ("real", "generated")))
         for name, sides in statistics.items()
     ]
     note = "Numbers per scene, mean extents in metres, and shares of the scene's area."
     return Table("What scenes are made of", ("mean per scene", "real", "generated"), rows, note=note)
 
 
-def distance_table(scores: Mapping) -> Table:
+def build_distance_table(scores: Mapping) -> Table:
     units = {histogram.name: histogram.unit for histogram in HISTOGRAMS}
     named = {f"{name}.number": (found, "objects") for name, found in scores["count_distance"].items()}
     named |= {name: (found, units[name]) for name, found in scores["distance"].items()}
     rows = [
         (
-            spelled(name.removesuffix("_m").replace(".", ": ")),
+            spell_name(name.removesuffix("_m").replace(".", ": ")),
             unit,
-            written(found["between"]),
-            written(found["within_real"]),
+            format_value(found["between"]),
+            format_value(found["within_real"]),
         )
         for name, (found, unit) in sorted(named.items())
     ]
@@ -175,7 +192,7 @@ def distance_table(scores: Mapping) -> Table:
     return Table("How distributions differ", ("of", "unit", "real to generated", "within real"), rows, note=note)
 
 
-def count_charts(counts: Mapping[str, np.ndarray]) -> Charts:
+def draw_count_charts(counts: Mapping[str, np.ndarray]) -> Charts:
     charts = []
     for index, category in enumerate(CATEGORIES):
         series = {}
@@ -183,11 +200,11 @@ def count_charts(counts: Mapping[str, np.ndarray]) -> Charts:
             at = np.linspace(0, 100, min(len(values), 101))
             series[side] = (at.tolist(), np.percentile(values[:, index], at).tolist())
         if any(max(y) > 0 for _, y in series.values()):
-            charts.append(Chart(spelled(category), series, "percentile of scenes", "number per scene"))
+            charts.append(Chart(spell_name(category), series, "percentile of scenes", "number per scene"))
     return Charts("Numbers of objects", charts)
 
 
-def neighbour_pictures(shown: Shown) -> Pictures:
+def draw_neighbour_pictures(shown: ExamplePictures) -> Pictures:
     pictures = []
     for generated, nearest, distances in shown.neighbours:
         pictures.append(Picture("", generated, "generated"))
@@ -197,14 +214,14 @@ def neighbour_pictures(shown: Shown) -> Pictures:
     return Pictures("Is it memorised?", pictures, columns=columns, note=note)
 
 
-def memorisation_table(found: Mapping) -> Table:
+def build_memorisation_table(found: Mapping) -> Table:
     rows = [
-        (words, *(written(found[side][name]) for side in ("generated", "real")))
+        (words, *(format_value(found[side][name]) for side in ("generated", "real")))
         for name, words in (("mean", "mean"), ("median", "median"), ("minimum", "smallest"), ("maximum", "greatest"))
     ]
     note = (
-        f"In {found['features']} features. {written(found['memorised'])} of the generated scenes are nearer to a real "
+        f"In {found['features']} features. {format_value(found['memorised'])} of the generated scenes are nearer to a real "
         "one than all but 1 % of the real ones are to another; "
-        f"{written(found['copies'])} equal a real one."
+        f"{format_value(found['copies'])} equal a real one."
     )
     return Table("Distance to the nearest real scene", ("", "generated", "real, to another"), rows, note=note)

@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 
 from models.scene import CATEGORIES, GROUND_CLASSES
-from pipelines.io.web_export import web_scene
-from pipelines.rendering.render import bev_picture
+from pipelines.io.web_export import export_web_scene
+from pipelines.rendering.render import render_bev
 from pipelines.reporting.contact_sheet import CHUNK, Catalogue
-from pipelines.reporting.report import data_uri
+from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.report_style import STYLE
 from pipelines.schema.tables import Shard
 
@@ -36,12 +36,12 @@ def pack_scenes(row: dict) -> list[dict]:
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
-        content = gzip.compress(json.dumps(web_scene(scene), separators=(",", ":")).encode(), mtime=0)
-        out.append({"place": place, "picture": data_uri(bev_picture(scene, THUMBNAIL_PX, 2)), "packed": content})
+        content = gzip.compress(json.dumps(export_web_scene(scene), separators=(",", ":")).encode(), mtime=0)
+        out.append({"place": place, "picture": encode_data_uri(render_bev(scene, THUMBNAIL_PX, 2)), "packed": content})
     return out
 
 
-def gallery_html(
+def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
     """The whole page, about 35 kB a scene. Scenes are packed by Ray, a task per few of a shard."""
@@ -51,7 +51,7 @@ def gallery_html(
         {**asdict(shard), "rows": rows, "places": places} for shard, rows, places in catalogue.chunks(indices, CHUNK)
     ]
     graph = ray.data.from_items(tasks, override_num_blocks=len(tasks)).flat_map(pack_scenes)
-    values = scene_values(catalogue, indices)
+    values = list_scene_values(catalogue, indices)
     scenes: list[dict] = [{}] * len(indices)
     for row in graph.iter_rows():
         scenes[row["place"]] = {
@@ -69,10 +69,10 @@ def gallery_html(
         "choices": {name: found for name, found in choices.items() if len(found) > 1},
         "captions": CAPTIONS,
     }
-    return _page(title, f"{len(indices)} scenes", data)
+    return _render_page(title, f"{len(indices)} scenes", data)
 
 
-def scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
+def list_scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
     """What the page filters by and says of each scene: a number, word or null per column."""
     table = catalogue.scenes.take(pa.array(indices))
     names = [name for name in ("scene_id", *CHOICES, *NUMBERS) if name in table.column_names]
@@ -80,12 +80,12 @@ def scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
     return [{k: round(v, 1) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
 
 
-def script(name: str) -> str:
+def read_script(name: str) -> str:
     """A file of pipelines/web, as part of an inline module."""
     return files("pipelines").joinpath("web", name).read_text(encoding="utf-8").replace("export class", "class")
 
 
-def _page(title: str, subtitle: str, data: dict) -> str:
+def _render_page(title: str, subtitle: str, data: dict) -> str:
     content = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")  # cannot end its element
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>
@@ -102,8 +102,8 @@ def _page(title: str, subtitle: str, data: dict) -> str:
 <button id="previous" title="previous">←</button><button id="next" title="next">→</button><button id="close" title="close">✕</button></div>
 <div class="both"><canvas id="view"></canvas><dl id="values"></dl></div><p id="picked"></p></dialog>
 <script type="application/json" id="data">{content}</script>
-<script type="module">{script("viewer.js")}
-{script("gallery.js")}</script></body></html>"""
+<script type="module">{read_script("viewer.js")}
+{read_script("gallery.js")}</script></body></html>"""
 
 
 GALLERY_STYLE = """

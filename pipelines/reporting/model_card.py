@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.reporting.chart import Chart
-from pipelines.reporting.evaluation_report import VALIDITY, headlines, written
+from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
 
 HIDDEN = ("stage", "dataset", "lvae")  # of a run's options: paths and digests, told elsewhere
 
@@ -16,7 +16,7 @@ Points = tuple[Sequence[float], Sequence[float]]
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingRecord:
     """One run of training, as MLflow or the training.json of a published entry tells it."""
 
     name: str  # lvae, dit; dit-2 where a second run began with the first one's weights
@@ -52,14 +52,14 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Card:
+class ModelCard:
     """All that a card says. `scores` as metrics.json has them; `dataset` as dataset.json; `sampling`: how scenes were made."""
 
     name: str
     version: str
     label: str
     labels: Sequence[str]
-    trainings: Sequence[Training]
+    trainings: Sequence[TrainingRecord]
     dataset: Mapping
     sampling: Mapping
     real_split: str  # what generated scenes were scored against
@@ -86,31 +86,34 @@ class Card:
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training in self.trainings:
             yield f"## Training: {training.stage}\n\n![Losses by step]({training.picture})\n"
-            yield from table(("", ""), training.rows())
+            yield from render_table(("", ""), training.rows())
 
     def _scores(self) -> Iterator[str]:
         generation = self.scores["generation"]
         sides = generation["scenes"]
         yield f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones of split {self.real_split}, and the layout VAE's reconstructions of {self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` has every figure; docs/evaluation.md says what each is.\n"
-        yield from table(("score", "value"), ((name, written(value)) for name, value in headlines(self.scores)))
+        yield from render_table(
+            ("score", "value"), ((name, format_value(value)) for name, value in list_headlines(self.scores))
+        )
 
     def _limits(self) -> Iterator[str]:
         validity = self.scores["generation"]["validity"]
         yield "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*Those with most faults among the first scenes that were scored.*\n"
         rows = [
-            (VALIDITY[k], *(written(v[side]) or "–" for side in ("generated", "real"))) for k, v in validity.items()
+            (VALIDITY[k], *(format_value(v[side]) or "–" for side in ("generated", "real")))
+            for k, v in validity.items()
         ]
-        yield from table(("share of", "generated", "real"), rows)
+        yield from render_table(("share of", "generated", "real"), rows)
         yield "## Use and limits\n"
         yield "Meant for research on layouts, for trying the tools, and as a start for training on other data. It knows nothing but the data named above: a procedural town is no survey of any real place, and scenes must not be taken for one. Nothing here was tested for the safety of vehicles. Repair faults with `jobs/edit_scenes.py repair`.\n"
         yield "Licence: Apache-2.0, weights and code.\n"
 
     def _files(self) -> Iterator[str]:
         yield "## SHA-256\n"
-        yield from table(("file", "SHA-256"), self.checksums.items())
+        yield from render_table(("file", "SHA-256"), self.checksums.items())
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]] | Iterator) -> Iterator[str]:
+def render_table(head: Sequence[str], rows: Sequence[Sequence[str]] | Iterator) -> Iterator[str]:
     """Lines of a Markdown table, an empty one after it."""
     yield "| " + " | ".join(head) + " |"
     yield "|" + "---|" * len(head)

@@ -11,8 +11,8 @@ from models.scene import CATEGORIES, GROUND_CLASSES
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.metrics.reconstruction import MAX_DETECTIONS
 from pipelines.reporting.chart import Chart
-from pipelines.reporting.dataset_charts import spelled
-from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, report_html
+from pipelines.reporting.dataset_charts import spell_name
+from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, render_report_html
 
 MIB = 2**20  # the paper's MB
 # Paper, Tab. 1 and 2: KITTI-360, 1,233 test poses, three days of training on an A100.
@@ -42,51 +42,55 @@ MEMORY = {
 }
 
 
-def reconstruction_html(
+def render_reconstruction_html(
     scores: Mapping, scenes: pa.Table, best: Sequence[Mapping], worst: Sequence[Mapping], subtitle: str = ""
 ) -> str:
     """The whole page from `rebuild.Rebuilt` and the pictures of its first and last scenes (`rebuild.draw`)."""
     sections = [
-        key_figures(scores),
+        make_key_figures(scores),
         *(
-            scene_pictures(name, shown, scenes)
+            draw_scene_pictures(name, shown, scenes)
             for name, shown in (("Best scenes", best), ("Worst scenes", worst))
             if shown
         ),
-        curves(scores, scenes),
-        overall(scores),
-        categories(scores),
-        ground_classes(scores),
-        detection_variants(scores),
-        voxel_range(scores),
-        memory(scores),
-        definitions(scores),
+        draw_curves(scores, scenes),
+        build_overall_table(scores),
+        build_category_table(scores),
+        build_ground_class_table(scores),
+        build_detection_table(scores),
+        describe_voxel_range(scores),
+        build_memory_table(scores),
+        list_definitions(scores),
     ]
-    return report_html("Reconstruction", sections, subtitle)
+    return render_report_html("Reconstruction", sections, subtitle)
 
 
-def key_figures(scores: Mapping) -> KeyFigures:
+def make_key_figures(scores: Mapping) -> KeyFigures:
     voxels, matched = scores["voxels"], scores["matched"]
     return KeyFigures(
         "In short",
         [
             Figure(scores["scenes"], "scenes", "encoded and decoded"),
-            Figure(_percent(scores["ground_iou"]), "ground IoU"),
+            Figure(_format_percent(scores["ground_iou"]), "ground IoU"),
             Figure(f"{scores['height_rmse_m']:.3f} m", "ground height RMSE"),
-            Figure(_percent(scores["ap3d"]), "AP3D"),
-            Figure(_percent(scores["ap3d_50"]), "AP3D@50"),
-            Figure(_percent(matched["mean_iou3d"]), "mean IoU3D", f"{_percent(matched['found'])} of objects matched"),
-            Figure(_percent(voxels["iou"]), "voxel IoU"),
-            Figure(_percent(voxels["miou"]), "voxel mIoU"),
+            Figure(_format_percent(scores["ap3d"]), "AP3D"),
+            Figure(_format_percent(scores["ap3d_50"]), "AP3D@50"),
+            Figure(
+                _format_percent(matched["mean_iou3d"]),
+                "mean IoU3D",
+                f"{_format_percent(matched['found'])} of objects matched",
+            ),
+            Figure(_format_percent(voxels["iou"]), "voxel IoU"),
+            Figure(_format_percent(voxels["miou"]), "voxel mIoU"),
         ],
     )
 
 
-def _percent(share: float | None, digits: int = 1) -> str:
+def _format_percent(share: float | None, digits: int = 1) -> str:
     return "–" if share is None else f"{100 * share:.{digits}f} %"
 
 
-def scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pictures:
+def draw_scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pictures:
     """A row per scene: truth and reconstruction from above, then both oblique."""
     by_id, pictures = {row["scene_id"]: row for row in scenes.to_pylist()}, []
     for drawn in shown:
@@ -94,9 +98,9 @@ def scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pi
         rmse = "–" if row["height_rmse_m"] is None else f"{row['height_rmse_m']:.2f} m"
         captions = {
             "truth_above": drawn["scene_id"],
-            "rebuilt_above": f"ground IoU {_percent(row['ground_iou'], 0)} · RMSE {rmse}",
+            "rebuilt_above": f"ground IoU {_format_percent(row['ground_iou'], 0)} · RMSE {rmse}",
             "truth_oblique": f"{row['primitives']} primitives",
-            "rebuilt_oblique": f"{row['rebuilt_primitives']} primitives · voxel mIoU {_percent(row['voxel_miou'], 0)}",
+            "rebuilt_oblique": f"{row['rebuilt_primitives']} primitives · voxel mIoU {_format_percent(row['voxel_miou'], 0)}",
         }
         for name, caption in captions.items():
             pictures.append(Picture(caption, drawn[name], "truth" if name.startswith("truth") else "reconstruction"))
@@ -104,7 +108,7 @@ def scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pi
     return Pictures(title, pictures, columns=4, note=note)
 
 
-def curves(scores: Mapping, scenes: pa.Table) -> Charts:
+def draw_curves(scores: Mapping, scenes: pa.Table) -> Charts:
     thresholds = {
         label: (
             [float(t) for t in scores["detection"][name]["ap3d_at"]],
@@ -132,7 +136,7 @@ def curves(scores: Mapping, scenes: pa.Table) -> Charts:
     )
 
 
-def overall(scores: Mapping) -> Table:
+def build_overall_table(scores: Mapping) -> Table:
     voxels, matched, memory = scores["voxels"], scores["matched"], scores["memory_bytes"]
     bounds = scores["height_bounds_m"]
     rows = [
@@ -162,7 +166,7 @@ def overall(scores: Mapping) -> Table:
     )
 
 
-def categories(scores: Mapping) -> Table:
+def build_category_table(scores: Mapping) -> Table:
     ranked, kept, matched = scores["detection"]["ranked"], scores["detection"]["threshold"], scores["matched"]
     columns = {
         "AP3D": ranked["category_ap3d"],
@@ -174,7 +178,7 @@ def categories(scores: Mapping) -> Table:
         "voxel IoU": scores["voxels"]["class_iou"],
     }
     rows = [
-        (spelled(name), scores["truths"].get(name, 0), *(values.get(name) for values in columns.values()))
+        (spell_name(name), scores["truths"].get(name, 0), *(values.get(name) for values in columns.values()))
         for name in CATEGORIES
         if name in scores["truths"] or name in matched["category_right"]
     ]
@@ -182,7 +186,7 @@ def categories(scores: Mapping) -> Table:
     return Table("Categories", ("category", "in truth", *columns), rows, note=note)
 
 
-def ground_classes(scores: Mapping) -> Table:
+def build_ground_class_table(scores: Mapping) -> Table:
     columns = {
         "IoU": scores["ground_class_iou"],
         "RMSE, m": scores["class_height_rmse_m"],
@@ -191,14 +195,14 @@ def ground_classes(scores: Mapping) -> Table:
         "voxel IoU": scores["voxels"]["class_iou"],
     }
     rows = [
-        (spelled(name), *(values.get(name) for values in columns.values()))
+        (spell_name(name), *(values.get(name) for values in columns.values()))
         for name in GROUND_CLASSES
         if name in scores["ground_class_iou"]
     ]
     return Table("Ground", ("class", *columns), rows)
 
 
-def detection_variants(scores: Mapping) -> Table:
+def build_detection_table(scores: Mapping) -> Table:
     rows = [
         (*words, scores["detection"][name]["ap3d"], scores["detection"][name]["ap3d_50"])
         for name, words in VARIANTS.items()
@@ -209,24 +213,24 @@ def detection_variants(scores: Mapping) -> Table:
     return Table("AP3D by what counts as a detection", ("proposals", "at most", "AP3D", "AP3D@50"), rows, note=note)
 
 
-def voxel_range(scores: Mapping) -> Table:
+def describe_voxel_range(scores: Mapping) -> Table:
     voxels = scores["voxels"]
     rows = [("ground pixels", voxels["ground_outside"], voxels["ground_outside"])]
     rows.append(("all objects", voxels["objects_partly_outside"], voxels["objects_outside"]))
     for name, partly in voxels["category_partly_outside"].items():
-        rows.append((spelled(name), partly, voxels["category_outside"][name]))
+        rows.append((spell_name(name), partly, voxels["category_outside"][name]))
     note = f"Voxels reach from {voxels['bottom_m']:g} to {voxels['top_m']:g} m. Shares of the true scenes that lie beyond and do not count."
     return Table("What the voxels leave out", ("of", "partly outside", "wholly outside"), rows, note=note)
 
 
-def memory(scores: Mapping) -> Table:
+def build_memory_table(scores: Mapping) -> Table:
     found = scores["memory_bytes"]
     rows = [(name.replace("_", " "), round(found[name]), found[name] / MIB) for name in MEMORY]
     note = "Mean per scene. The paper gives 2.50 MB for rasters and 0.02 MB for primitives, in units of 2^20 bytes."
     return Table("Memory", ("form", "bytes", "MiB"), rows, meanings=list(MEMORY.values()), note=note)
 
 
-def definitions(scores: Mapping) -> Text:
+def list_definitions(scores: Mapping) -> Text:
     return Text(
         "What is measured",
         [

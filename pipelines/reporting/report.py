@@ -20,7 +20,7 @@ from uuid import uuid4
 import numpy as np
 from PIL import Image
 
-from pipelines.reporting.chart import Chart, chart_svg, number
+from pipelines.reporting.chart import Chart, draw_chart_svg, format_number
 from pipelines.reporting.report_style import STYLE
 
 Cell = str | int | float | bool | None
@@ -98,16 +98,16 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
     """Writes `report_html` to a temporary name beside `path` and moves it into place."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
-    temporary.write_text(report_html(title, sections, subtitle), encoding="utf-8")
+    temporary.write_text(render_report_html(title, sections, subtitle), encoding="utf-8")
     os.replace(temporary, path)
 
 
-def report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
+def render_report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
     """The whole page. Raises ValueError if a table's rows, or its meanings, do not fit its columns."""
     anchors = [f"{index}-{re.sub('[^a-z0-9]+', '-', s.title.lower())}" for index, s in enumerate(sections, 1)]
     links = [f'<a href="#{a}">{escape(s.title)}</a>' for a, s in zip(anchors, sections, strict=True)]
     bodies = [
-        f'<section id="{anchor}"><h2>{escape(section.title)}</h2>{_body(section)}</section>'
+        f'<section id="{anchor}"><h2>{escape(section.title)}</h2>{_render_body(section)}</section>'
         for anchor, section in zip(anchors, sections, strict=True)
     ]
     return "\n".join(
@@ -115,7 +115,7 @@ def report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> 
             '<!doctype html><html lang="en"><head><meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
-            f"<header><h1>{escape(title)}</h1>{_paragraph(subtitle)}<nav>{''.join(links)}</nav></header>",
+            f"<header><h1>{escape(title)}</h1>{_render_paragraph(subtitle)}<nav>{''.join(links)}</nav></header>",
             "<main>",
             *bodies,
             "</main></body></html>",
@@ -123,45 +123,45 @@ def report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> 
     )
 
 
-def _body(section: Section) -> str:
+def _render_body(section: Section) -> str:
     match section:
         case Text():
-            return "".join(map(_paragraph, section.paragraphs))
+            return "".join(map(_render_paragraph, section.paragraphs))
         case KeyFigures():
-            return f'<div class="figures">{"".join(map(_figure, section.figures))}</div>'
+            return f'<div class="figures">{"".join(map(_render_figure, section.figures))}</div>'
         case Pictures():
-            return _paragraph(section.note) + _pictures(section)
+            return _render_paragraph(section.note) + _render_pictures(section)
         case Charts():
-            return f'{_paragraph(section.note)}<div class="charts">{"".join(map(_chart, section.charts))}</div>'
+            return f'{_render_paragraph(section.note)}<div class="charts">{"".join(map(_render_chart, section.charts))}</div>'
         case Table():
-            return _paragraph(section.note) + _table(section)
+            return _render_paragraph(section.note) + _render_table(section)
     raise ValueError(f"not a section of a report: {section!r}")
 
 
-def _paragraph(text: str) -> str:
+def _render_paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>" if text else ""
 
 
-def _figure(figure: Figure) -> str:
+def _render_figure(figure: Figure) -> str:
     note = f"<small>{escape(figure.note)}</small>" if figure.note else ""
-    return f"<div><strong>{written(figure.value)}</strong><span>{escape(figure.label)}</span>{note}</div>"
+    return f"<div><strong>{format_cell(figure.value)}</strong><span>{escape(figure.label)}</span>{note}</div>"
 
 
-def _pictures(section: Pictures) -> str:
+def _render_pictures(section: Pictures) -> str:
     style = f' style="--columns: {section.columns}"' if section.columns else ""
     kind = "pictures fixed" if section.columns else "pictures"
-    return f'<div class="{kind}"{style}>{"".join(map(_picture, section.pictures))}</div>'
+    return f'<div class="{kind}"{style}>{"".join(map(_render_picture, section.pictures))}</div>'
 
 
-def _picture(picture: Picture) -> str:
+def _render_picture(picture: Picture) -> str:
     rows, cols = picture.image.shape[:2]
     size = f'width="{cols}" height="{rows}" loading="lazy"'
     tag = f'<span class="tag">{escape(picture.tag)}</span>' if picture.tag else ""
-    image = f'<img src="{data_uri(picture.image)}" {size} alt="{escape(picture.caption)}">'
+    image = f'<img src="{encode_data_uri(picture.image)}" {size} alt="{escape(picture.caption)}">'
     return f"<figure>{tag}{image}<figcaption>{escape(picture.caption)}</figcaption></figure>"
 
 
-def data_uri(image: np.ndarray) -> str:
+def encode_data_uri(image: np.ndarray) -> str:
     """(H, W, 3) uint8 as a data URI: exact PNG for up to 256 colours, WebP for pictures with shading."""
     picture, file = Image.fromarray(image), io.BytesIO()
     flat = picture.getcolors(256) is not None
@@ -173,11 +173,11 @@ def data_uri(image: np.ndarray) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def _chart(chart: Chart) -> str:
-    return f"<figure>{chart_svg(chart)}<figcaption>{escape(chart.title)}</figcaption></figure>"
+def _render_chart(chart: Chart) -> str:
+    return f"<figure>{draw_chart_svg(chart)}<figcaption>{escape(chart.title)}</figcaption></figure>"
 
 
-def _table(table: Table) -> str:
+def _render_table(table: Table) -> str:
     meanings = table.meanings or [None] * len(table.rows)
     if len(meanings) != len(table.rows):
         raise ValueError(f"table {table.title!r} has {len(table.rows)} rows and {len(meanings)} meanings")
@@ -186,29 +186,29 @@ def _table(table: Table) -> str:
         if len(row) != len(table.columns):
             raise ValueError(f"table {table.title!r} has {len(table.columns)} columns, a row has {len(row)} cells")
         last = "" if meaning is None else f'<td class="meaning">{escape(meaning)}</td>'
-        rows.append(f"<tr>{''.join(map(_cell, row))}{last}</tr>")
+        rows.append(f"<tr>{''.join(map(_render_cell, row))}{last}</tr>")
     numeric = [all(not isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
-    head = "".join(map(_head, table.columns, numeric)) + ("<th>what it means</th>" if table.meanings else "")
+    head = "".join(map(_render_head, table.columns, numeric)) + ("<th>what it means</th>" if table.meanings else "")
     body = f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
     return f'<div class="scroll"><table>{body}</table></div>'
 
 
-def _head(name: str, numeric: bool) -> str:
+def _render_head(name: str, numeric: bool) -> str:
     return f'<th class="number">{escape(name)}</th>' if numeric else f"<th>{escape(name)}</th>"
 
 
-def _cell(value: Cell) -> str:
+def _render_cell(value: Cell) -> str:
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
     if isinstance(value, bool | np.bool):
-        return f'<td class="number {"yes" if value else "no"}">{written(value)}</td>'
-    return f'<td class="number">{written(value)}</td>'
+        return f'<td class="number {"yes" if value else "no"}">{format_cell(value)}</td>'
+    return f'<td class="number">{format_cell(value)}</td>'
 
 
-def written(value: Cell) -> str:
+def format_cell(value: Cell) -> str:
     """A cell as people read it."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool):
         return "✓" if value else "✗"
-    return escape(value) if isinstance(value, str) else number(value)
+    return escape(value) if isinstance(value, str) else format_number(value)

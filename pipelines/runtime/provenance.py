@@ -14,7 +14,7 @@ import torch
 ROOT = Path(__file__).parents[2]
 
 
-def machine() -> str:
+def describe_machine() -> str:
     """Processor, cores, memory and GPUs, as in "AMD EPYC, 2 cores, 24 GiB"."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
@@ -24,7 +24,7 @@ def machine() -> str:
     return ", ".join([processor, f"{os.cpu_count()} cores", f"{memory_gib:.0f} GiB", *gpus])
 
 
-def commit() -> str:
+def find_commit() -> str:
     """The commit of this code, with a + if files have changed since; "unknown" outside a git checkout."""
 
     def git(*arguments: str) -> str:
@@ -38,7 +38,7 @@ def commit() -> str:
         return "unknown"
 
 
-def command() -> str:
+def format_command() -> str:
     """What was typed; of paths under $PRITTI_HOME or this checkout what comes after, of other absolute ones the last part."""
     roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
 
@@ -55,5 +55,5 @@ def command() -> str:
     return " ".join(word if "$PRITTI_HOME" in word else shlex.quote(word) for word in map(public, sys.argv))
 
 
-def versions() -> str:
+def list_versions() -> str:
     return f"Python {platform.python_version()}, torch {torch.__version__}"

@@ -13,17 +13,17 @@ from ray.util.annotations import RayDeprecationWarning
 MAX_RETRIES = 20
 
 
-def gpus_per_actor() -> int:
+def count_gpus_per_actor() -> int:
     """1 where the cluster has GPUs (the driver's machine need not have one), else 0."""
     return int(ray.cluster_resources().get("GPU", 0) > 0)
 
 
-def numbered(numbers: Sequence[int]) -> ray.data.Dataset:
+def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:
     """Rows {"id": number}, one a block: as many tasks."""
     return ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
 
 
-def per_row(
+def map_rows(
     dataset: ray.data.Dataset, function: Callable[[dict], dict], num_cpus: float = 1, at_once: int | None = None
 ) -> ray.data.Dataset:
     """One Ray task per row, `at_once` of them, tried again when its worker dies. Processes are used again, unlike actors'."""
@@ -33,7 +33,7 @@ def per_row(
         return dataset.map(function, num_cpus=num_cpus, compute=compute, max_retries=MAX_RETRIES)
 
 
-def fan_out(
+def map_actors(
     numbers: Sequence[int], actor: type, arguments: tuple, num_actors: int, **resources: float
 ) -> Iterator[dict]:
     """Rows that actors return for {"id": number}, as they come; nothing is started for no number.
@@ -42,10 +42,10 @@ def fan_out(
     """
     if not numbers:
         return
-    graph = numbered(numbers).map(
+    graph = make_numbered_rows(numbers).map(
         actor,
         fn_constructor_args=arguments,
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(numbers))),
-        **(resources or {"num_gpus": gpus_per_actor()}),
+        **(resources or {"num_gpus": count_gpus_per_actor()}),
     )
     yield from graph.iter_rows()

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 TEMPORARY = ".tmp-"
 
 
-def resolve(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
+def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
     """File system and path of a URI or a local path (made absolute)."""
     uri = os.fspath(uri)
     if "://" in uri:
@@ -23,31 +23,31 @@ def resolve(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
     return pafs.LocalFileSystem(), os.path.abspath(os.path.expanduser(uri))
 
 
-def join(uri: str | os.PathLike, *parts: str) -> str:
+def join_uri(uri: str | os.PathLike, *parts: str) -> str:
     return "/".join([os.fspath(uri).rstrip("/"), *parts])
 
 
 def exists(uri: str) -> bool:
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     return fs.get_file_info(path).type != pafs.FileType.NotFound
 
 
-def fingerprint(uri: str) -> list[str | int]:
+def fingerprint_file(uri: str) -> list[str | int]:
     """Path, size in bytes and time of change of a file: another one after it was written again."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     info = fs.get_file_info(path)
     return [path, info.size, str(info.mtime)]
 
 
 def list_files(uri: str, suffix: str) -> list[str]:
     """Sorted URIs of the files under a directory, hidden and temporary ones left out; empty if it is missing."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
     inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
     shown = [
         name for name, _ in inside if name.endswith(suffix) and not any(p.startswith(".") for p in name.split("/"))
     ]
-    return [join(uri, name) for name in sorted(shown)]
+    return [join_uri(uri, name) for name in sorted(shown)]
 
 
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
@@ -55,7 +55,7 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
     What killed writers of the same file left is deleted. Raises OSError naming the file and what to do.
     """
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     parent, name = path.rsplit("/", 1)
     # Does not end as the file does: what globs for *.parquet takes hidden files too (DuckDB).
     temporary = f"{parent}/{TEMPORARY}{name}-{os.getpid()}"
@@ -79,17 +79,20 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 def write_parquet(table: pa.Table, uri: str) -> None:
     write_whole(
-        uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=_dictionary(table))
+        uri,
+        lambda stream: pq.write_table(
+            table, stream, compression="zstd", use_dictionary=_list_dictionary_columns(table)
+        ),
     )
 
 
-def _dictionary(table: pa.Table) -> list[str]:
+def _list_dictionary_columns(table: pa.Table) -> list[str]:
     return [f.name for f in table.schema if pa.types.is_string(f.type)]
 
 
 def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None) -> pa.Table:
     """A whole Parquet file. Raises ValueError naming the file if it is missing, truncated or of another schema."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     try:
         table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=None)
     except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
@@ -108,7 +111,7 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
 
 def read_bytes(uri: str) -> bytes:
     """A whole file. Raises ValueError naming it if it cannot be read."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path, compression=None) as stream:
             return stream.read()
@@ -116,9 +119,9 @@ def read_bytes(uri: str) -> bytes:
         raise ValueError(f"{uri}: cannot be read ({error})") from error
 
 
-def file_bytes(uri: str) -> int:
+def measure_file_bytes(uri: str) -> int:
     """Size of a file."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     return fs.get_file_info(path).size
 
 
@@ -132,7 +135,7 @@ def write_json(value: Any, uri: str) -> None:
 
 def read_json(uri: str) -> Any:
     """Raises ValueError naming the file if it is missing or not JSON."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path) as stream:
             return json.loads(stream.read().decode())
@@ -142,7 +145,7 @@ def read_json(uri: str) -> Any:
 
 def clean_temporaries(uri: str) -> int:
     """Delete what killed writers left behind; how many there were."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     return _delete_files(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
 
 
@@ -157,20 +160,20 @@ def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) ->
 
 def delete_file(uri: str) -> None:
     """Delete a file if it is there."""
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     if fs.get_file_info(path).is_file:
         fs.delete_file(path)
 
 
 def delete_directory(uri: str) -> None:
-    fs, path = resolve(uri)
+    fs, path = resolve_uri(uri)
     if fs.get_file_info(path).type == pafs.FileType.Directory:
         fs.delete_dir(path)
 
 
-def move(source: str, target: str) -> None:
+def move_file(source: str, target: str) -> None:
     """Move one file into place, creating the directory."""
-    fs, path = resolve(source)
-    _, to = resolve(target)
+    fs, path = resolve_uri(source)
+    _, to = resolve_uri(target)
     fs.create_dir(to.rsplit("/", 1)[0], recursive=True)
     fs.move(path, to)

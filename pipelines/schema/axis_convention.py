@@ -7,7 +7,7 @@ import numpy as np
 Axes = tuple[str, str, str]  # of the file's first, second and third axis
 
 
-def scene_from_axes(axes: Axes) -> np.ndarray:
+def compute_scene_from_axes(axes: Axes) -> np.ndarray:
     """(3, 3) signed permutation; column k is the direction of the file's axis k in the scene frame.
 
     Raises ValueError unless each of x, y and z is named once, with a sign.

@@ -12,9 +12,9 @@ import pyarrow as pa
 
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid
-from pipelines.preprocess.shard_writer import widest
+from pipelines.preprocess.shard_writer import merge_extremes
 from pipelines.runtime import storage
-from pipelines.schema.density_labels import DensityThresholds, density, density_thresholds
+from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
 from pipelines.schema.tables import SCENES, Shard
 
 DESCRIPTION = "dataset.json"
@@ -31,12 +31,14 @@ class Statistics:
     spec: LayoutSpec
 
 
-def group_count(scenes: pa.Table, group: tuple[int, ...]) -> np.ndarray:
+def count_groups(scenes: pa.Table, group: tuple[int, ...]) -> np.ndarray:
     """(n,) primitives of a group of categories per row of `scenes`."""
     return sum(scenes[f"num_{CATEGORIES[k]}"].to_numpy() for k in group)
 
 
-def training_statistics(manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | None) -> Statistics:
+def compute_training_statistics(
+    manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | None
+) -> Statistics:
     """Thresholds, p95 counts and bounds of the training split. ValueError if it is empty.
 
     `slots` fixes the counts (the paper's N = 514) instead of the 95th percentile.
@@ -52,7 +54,7 @@ def training_statistics(manifests: list[dict], staging: str, grid: Grid, slots: 
     p95 = np.ceil(np.percentile(counts, 95, axis=0)).clip(1).astype(int)
     chosen = np.array(slots) if slots else p95
 
-    measured = widest(m["extremes"] for m in training)
+    measured = merge_extremes(m["extremes"] for m in training)
 
     def bounds(name: str, width: int) -> Bounds:
         low, high = (np.array(v) for v in measured.get(name, [[0.0] * width, [1.0] * width]))
@@ -72,7 +74,7 @@ def training_statistics(manifests: list[dict], staging: str, grid: Grid, slots: 
         surface=SURFACE[training[0]["source"]],
     )
     thresholds = [
-        density_thresholds(group_count(scenes, group), scenes[volume].to_numpy())
+        compute_density_thresholds(count_groups(scenes, group), scenes[volume].to_numpy())
         for group, volume in ((VEGETATION, "vegetation_volume_m3"), (VEHICLES, "vehicle_volume_m3"))
     ]
     return Statistics(*thresholds, spec)
@@ -82,7 +84,7 @@ def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
     """The scenes table with both density labels."""
     groups = (("vegetation", VEGETATION, statistics.vegetation), ("vehicle", VEHICLES, statistics.vehicle))
     for name, group, thresholds in groups:
-        labels = density(group_count(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
+        labels = classify_density(count_groups(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
         column = f"{name}_density"
         scenes = scenes.set_column(
             scenes.column_names.index(column), SCENES.field(column), pa.array(labels, pa.string())
@@ -104,7 +106,7 @@ class Dataset:
     @classmethod
     def open(cls, root: str) -> Dataset:
         """Raises ValueError if `root` holds no complete dataset."""
-        path = storage.join(root, DESCRIPTION)
+        path = storage.join_uri(root, DESCRIPTION)
         if not storage.exists(path):
             raise ValueError(f"{root}: no dataset.json here; run jobs/preprocess_scenes.py with --output {root} first")
         content = storage.read_json(path)

@@ -19,14 +19,14 @@ class DensityThresholds:
     volume_p75_m3: float
 
 
-def density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> DensityThresholds:
+def compute_density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> DensityThresholds:
     """Thresholds from the counts (n,) and volumes (n,) of a training split, before any truncation to slots."""
     if len(count) == 0:
         raise ValueError("density thresholds need at least one training scene; the training split is empty")
     return DensityThresholds(*np.percentile(count, [25, 75]), *np.percentile(volume_m3, [25, 75]))
 
 
-def density(count: np.ndarray, volume_m3: np.ndarray, thresholds: DensityThresholds) -> np.ndarray:
+def classify_density(count: np.ndarray, volume_m3: np.ndarray, thresholds: DensityThresholds) -> np.ndarray:
     """(n,) str: low if count and volume lie below their p25, high if both lie above their p75, else medium."""
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)

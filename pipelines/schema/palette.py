@@ -37,25 +37,25 @@ COLOR_HEX = {
 EMPTY_HEX = "ffffff"
 
 
-def rgb(color_hex: str) -> tuple[int, int, int]:
+def parse_rgb(color_hex: str) -> tuple[int, int, int]:
     """(red, green, blue), 0..255, sRGB, of six hexadecimal digits."""
     return tuple(bytes.fromhex(color_hex))
 
 
-def _colors_by_class_id() -> np.ndarray:
+def _list_colors_by_class_id() -> np.ndarray:
     colors = np.zeros((max(CLASS_ID.values()) + 1, 3), np.uint8)
-    colors[EMPTY] = rgb(EMPTY_HEX)
+    colors[EMPTY] = parse_rgb(EMPTY_HEX)
     for name, class_id in CLASS_ID.items():
-        colors[class_id] = rgb(COLOR_HEX[name])
+        colors[class_id] = parse_rgb(COLOR_HEX[name])
     return colors
 
 
-CLASS_COLORS = _colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white where there is nothing
+CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white where there is nothing
 CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) by category
 
 assert set(GROUND_CLASS_ID) == set(GROUND_CLASSES) and set(COLOR_HEX) == set(CLASS_ID)
 
 
-def ground_ids(scene: Scene) -> np.ndarray:
+def list_ground_ids(scene: Scene) -> np.ndarray:
     """(G + 1,) class id of each of the scene's ground classes; the last, also found at index -1, is EMPTY."""
     return np.array([GROUND_CLASS_ID[name] for name in scene.ground_classes] + [EMPTY], np.uint8)

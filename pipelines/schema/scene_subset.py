@@ -18,7 +18,7 @@ ONE_WORLD = ("kitti360",)  # sources whose drives share one world frame
 
 
 @dataclass(frozen=True)
-class Selection:
+class SceneSubset:
     """Scenes of a source and a split, at most `limit` of them, chosen by `pick`.
 
     * spread: evenly over all; first: the first ones.
@@ -48,7 +48,7 @@ class Selection:
 
     def files(self) -> list[list]:
         """The chosen files as they are now, with the rows to take: other ones once scenes have come, gone or changed."""
-        return [[*storage.fingerprint(shard.path("scenes")), rows] for shard, rows in self._shards]
+        return [[*storage.fingerprint_file(shard.path("scenes")), rows] for shard, rows in self._shards]
 
     @cached_property
     def _shards(self) -> list[tuple[Shard, list[int]]]:
@@ -70,39 +70,39 @@ class Selection:
         if self.pick == "first":
             return np.arange(wanted)
         if self.pick == "farthest":
-            return farthest(*poses(scenes, source), wanted)
+            return select_farthest(*read_poses(scenes, source), wanted)
         if self.pick == "apart":
-            kept = apart(*poses(scenes, source), self.apart_m)
-            return kept[evenly(len(kept), min(wanted, len(kept)))]
+            kept = select_apart(*read_poses(scenes, source), self.apart_m)
+            return kept[select_evenly(len(kept), min(wanted, len(kept)))]
         if self.pick == "balanced":
-            return balanced(label_pairs(scenes), wanted)
-        return evenly(total, wanted)
+            return select_balanced(list_label_pairs(scenes), wanted)
+        return select_evenly(total, wanted)
 
 
-def described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
+def read_described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
     """COLUMNS of the scenes of some shards' rows, in that order, and the source (n,) of each."""
     table = pa.concat_tables([shard.read("scenes", COLUMNS).take(rows) for shard, rows in parts])
     return table, np.repeat([shard.source for shard, _ in parts], [len(rows) for _, rows in parts])
 
 
-def label_pairs(scenes: pa.Table) -> np.ndarray:
+def list_label_pairs(scenes: pa.Table) -> np.ndarray:
     """(n,) both density labels of each scene as one word."""
     return np.array([str(pair) for pair in zip(*(scenes[name].to_pylist() for name in COLUMNS[-2:]), strict=True)])
 
 
-def evenly(total: int, count: int) -> np.ndarray:
+def select_evenly(total: int, count: int) -> np.ndarray:
     """`count` of the numbers 0 .. total - 1, evenly spaced."""
     return np.floor((np.arange(count) + 0.5) * total / max(count, 1)).astype(int)
 
 
-def poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, 2) metres and (n,) world of each scene. Poses of different worlds are infinitely far apart."""
     world = np.where(np.isin(source, ONE_WORLD), "", scenes["sequence"].to_numpy().astype(str))
     world = np.unique(np.char.add(np.char.add(source.astype(str), "/"), world), return_inverse=True)[1]
     return np.stack([scenes["x_m"].to_numpy(), scenes["y_m"].to_numpy()], axis=1), world
 
 
-def farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
+def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
     """(count,) indices by farthest point sampling of poses (n, 2), the first pose first; every prefix is a sample too."""
     nearest_m = np.full(len(xy_m), np.inf)
     chosen = np.zeros(count, int)
@@ -116,7 +116,7 @@ def farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
     return chosen
 
 
-def apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
+def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
     """Indices of the poses (n, 2), in order, that lie at least apart_m from every one taken before.
 
     A pose is compared with those in its own and the eight neighbouring cells of a grid of that width.
@@ -132,7 +132,7 @@ def apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
     return np.array(taken, int)
 
 
-def balanced(labels: np.ndarray, count: int) -> np.ndarray:
+def select_balanced(labels: np.ndarray, count: int) -> np.ndarray:
     """(count,) indices, equally many of each label; what a rare one lacks is shared among the others."""
     groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     shares = np.zeros(len(groups), int)
@@ -140,5 +140,5 @@ def balanced(labels: np.ndarray, count: int) -> np.ndarray:
         open_groups = [g for g, group in enumerate(groups) if shares[g] < len(group)]
         for g in open_groups[: max(1, left)]:
             shares[g] += min(max(1, left // len(open_groups)), len(groups[g]) - shares[g])
-    parts = [group[evenly(len(group), share)] for group, share in zip(groups, shares, strict=True)]
+    parts = [group[select_evenly(len(group), share)] for group, share in zip(groups, shares, strict=True)]
     return np.concatenate(parts)

@@ -45,22 +45,22 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
         if not np.isfinite(position_m).all():
             raise ValueError(f"sequence {sequence}: positions are not finite; fix or drop those poses first")
     if not any(len(position_m) for position_m in positions_by_sequence.values()):
-        return no_split(positions_by_sequence)
+        return make_no_split(positions_by_sequence)
 
-    driven_m, total_m = _distance_driven(list(positions_by_sequence.values()))
-    labels = _label_by_distance(driven_m, total_m, num_segments(total_m))
+    driven_m, total_m = _compute_distance_driven(list(positions_by_sequence.values()))
+    labels = _label_by_distance(driven_m, total_m, count_segments(total_m))
     bev_m = np.concatenate([np.asarray(p, np.float64)[:, :2] for p in positions_by_sequence.values()])
     labels = _remove_close(labels, bev_m)
     ends = np.cumsum([len(position_m) for position_m in positions_by_sequence.values()])
     return dict(zip(positions_by_sequence, np.split(labels, ends[:-1]), strict=True))
 
 
-def no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def make_no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Every pose trains."""
     return {sequence: np.full(len(p), TRAIN, object) for sequence, p in positions_by_sequence.items()}
 
 
-def num_segments(total_m: float) -> int:
+def count_segments(total_m: float) -> int:
     """min(100, floor(distance / 50 m)), at least 1; says so when it is fewer than the paper's 100."""
     count = max(1, min(MAX_SEGMENTS, int(total_m // MIN_SEGMENT_M)))
     if count < MAX_SEGMENTS:
@@ -75,7 +75,7 @@ def num_segments(total_m: float) -> int:
     return count
 
 
-def _distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """Distance driven at each pose of all sequences together (sum of p,), and in total; metres."""
     steps = [
         np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from models.geometry.cholesky import cholesky_parameters
+from models.geometry.cholesky import compute_cholesky_parameters
 from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines.runtime import storage
 
@@ -51,7 +51,7 @@ GROUND_MEANING = {
 # fmt: on
 
 
-def _schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
+def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
     """A schema that explains itself, from rows of (name, type, unit, description); unit "" where none applies.
 
     Every field carries `unit` and `description`. DuckDB does not show those, so the same rows stand once more, as
@@ -74,7 +74,7 @@ _FRAME = "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravi
 _SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
 _SEQUENCE = ("sequence", pa.string(), "", "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
 
-SCENES = _schema(
+SCENES = _make_schema(
     "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and totals. " + _FRAME,
     _SCENE_ID,
     _SEQUENCE,
@@ -95,7 +95,7 @@ SCENES = _schema(
     ("primitive_offset",     pa.int64(),   "1",   "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
 )
 
-PRIMITIVES = _schema(
+PRIMITIVES = _make_schema(
     "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen from several poses has a row in each. " + _FRAME,
     _SCENE_ID,
     ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
@@ -115,7 +115,7 @@ PRIMITIVES = _schema(
     ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
 )
 
-RASTERS = _schema(
+RASTERS = _make_schema(
     "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from above. " + _FRAME,
     _SCENE_ID,
     ("height",         pa.binary(),  "height_step_m", "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
@@ -129,7 +129,7 @@ RASTERS = _schema(
     ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
 )
 
-REJECTS = _schema(
+REJECTS = _make_schema(
     "One row per scene that was left out, or per drive that could not be read.",
     ("scene_id", pa.string(), "", "Name that the scene would have; without a frame it names the drive."),
     _SEQUENCE,
@@ -138,7 +138,7 @@ REJECTS = _schema(
 )
 
 
-EDITS = _schema(
+EDITS = _make_schema(
     "One row per primitive that a step of the list of edits touched, in the scene that was given under the same scene_id.",
     _SCENE_ID,
     ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
@@ -151,10 +151,10 @@ EDITS = _schema(
 )
 
 
-def latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
+def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """(C, h, w) posterior moments per scene; float16, channels first."""
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
-    return _schema(
+    return _make_schema(
         "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the rasters.",
         _SCENE_ID,
         ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
@@ -178,19 +178,19 @@ def decode_ground(
     height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
-    steps, mask = ground_steps(height, occupied, shape)
+    steps, mask = list_ground_steps(height, occupied, shape)
     height_m = np.zeros(shape, np.float32)
     height_m[mask] = steps * np.float32(step_m)
     return height_m, mask
 
 
-def ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Heights of the occupied pixels (m,) int16, in steps, and occupied (G, H, W) bool from one row of `rasters`."""
     mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
     return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
 
 
-def _scenes_table(scenes: Sequence[Scene]) -> pa.Table:
+def _make_scenes_table(scenes: Sequence[Scene]) -> pa.Table:
     counts = np.array([scene.counts() for scene in scenes]).reshape(-1, len(CATEGORIES))
     volumes = [scene.volume_m3 for scene in scenes]
 
@@ -220,11 +220,11 @@ def _scenes_table(scenes: Sequence[Scene]) -> pa.Table:
     return pa.table(columns, schema=SCENES)
 
 
-def _fixed_lists(values: np.ndarray, width: int) -> pa.Array:
+def _make_fixed_lists(values: np.ndarray, width: int) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values, np.float32).reshape(-1)), width)
 
 
-def primitives_table(scenes: Sequence[Scene]) -> pa.Table:
+def make_primitives_table(scenes: Sequence[Scene]) -> pa.Table:
     """The rows of `primitives` for some scenes, one or more."""
 
     def joined(name: str) -> np.ndarray:
@@ -244,14 +244,14 @@ def primitives_table(scenes: Sequence[Scene]) -> pa.Table:
         **{f"{axis}_m": size[:, k] for k, axis in enumerate(("length", "width", "height"))},
         "yaw_rad": yaw,
         "heading_rad": pa.array(heading, mask=np.isnan(heading)),
-        "rotation": _fixed_lists(rotation, 9),
-        "cholesky": _fixed_lists(cholesky_parameters(rotation, size), 6),
+        "rotation": _make_fixed_lists(rotation, 9),
+        "cholesky": _make_fixed_lists(compute_cholesky_parameters(rotation, size), 6),
         "existence": joined("existence"),
     }
     return pa.table(columns).cast(PRIMITIVES)
 
 
-def _rasters_table(scenes: Sequence[Scene]) -> pa.Table:
+def _make_rasters_table(scenes: Sequence[Scene]) -> pa.Table:
     encoded = [encode_ground(scene) for scene in scenes]
     columns = {
         "scene_id": [s.scene_id for s in scenes],
@@ -268,15 +268,19 @@ def _rasters_table(scenes: Sequence[Scene]) -> pa.Table:
     return pa.table(columns, schema=RASTERS)
 
 
-def scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
+def make_scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
     """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
-    return {"scenes": _scenes_table(scenes), "primitives": primitives_table(scenes), "rasters": _rasters_table(scenes)}
+    return {
+        "scenes": _make_scenes_table(scenes),
+        "primitives": make_primitives_table(scenes),
+        "rasters": _make_rasters_table(scenes),
+    }
 
 
 # -------------------------------------------------------------------------------------------------- from tables
 
 
-def scenes_from_tables(
+def parse_scenes(
     scenes: pa.Table,
     primitives: pa.Table,
     rasters: pa.Table,
@@ -285,7 +289,7 @@ def scenes_from_tables(
     rows: Sequence[int] | None = None,
 ) -> Iterator[Scene]:
     """The Scenes of one shard, or only those in `rows`, in that order; one at a time."""
-    fields = _primitive_fields(primitives)
+    fields = _read_primitive_fields(primitives)
     rows = list(range(len(scenes)) if rows is None else rows)
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
         if scene["scene_id"] != raster["scene_id"]:
@@ -316,7 +320,7 @@ def scenes_from_tables(
         )
 
 
-def category_indices(names: pa.ChunkedArray) -> np.ndarray:
+def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
     """(n,) int8 index into CATEGORIES. Raises ValueError for a name that is none."""
     category = pc.index_in(names, pa.array(CATEGORIES))
     if category.null_count:
@@ -324,13 +328,13 @@ def category_indices(names: pa.ChunkedArray) -> np.ndarray:
     return category.to_numpy().astype(np.int8)
 
 
-def fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
+def read_fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
     """(n, width) float32 of a column of fixed-size lists."""
     flat = pa.concat_arrays(column.chunks).flatten() if len(column) else pa.array([], pa.float32())
     return flat.to_numpy().reshape(-1, width)
 
 
-def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
+def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
     """The per-primitive arrays of a Scene for all rows of a primitives table."""
     primitives = primitives.combine_chunks()
 
@@ -341,9 +345,9 @@ def _primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
         return np.stack([column(name) for name in names], axis=1)
 
     return {
-        "category": category_indices(primitives["category"]),
+        "category": find_category_indices(primitives["category"]),
         "center_m": stacked("x_m", "y_m", "z_m"),
-        "rotation": fixed_lists(primitives["rotation"], 9).reshape(-1, 3, 3),
+        "rotation": read_fixed_lists(primitives["rotation"], 9).reshape(-1, 3, 3),
         "size_m": stacked("length_m", "width_m", "height_m"),
         "existence": column("existence"),
         "heading_rad": column("heading_rad").astype(np.float32),
@@ -366,7 +370,7 @@ class Shard:
 
     def path(self, table: str) -> str:
         name = f"part-{self.number:05d}.parquet"
-        return storage.join(self.root, table, f"source={self.source}", f"split={self.split}", name)
+        return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}", name)
 
     def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
         schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS, "edits": EDITS}.get(table)
@@ -376,12 +380,12 @@ class Shard:
         """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
         tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
         try:
-            return list(scenes_from_tables(*tables, self.source, self.split, rows))
+            return list(parse_scenes(*tables, self.source, self.split, rows))
         except ValueError as error:
             raise ValueError(f"{self.path('scenes')}: {error}") from error
 
     def write(self, scenes: Sequence[Scene]) -> None:
-        for table, content in scene_tables(scenes).items():
+        for table, content in make_scene_tables(scenes).items():
             storage.write_parquet(content, self.path(table))
 
     def is_written(self) -> bool:
@@ -391,14 +395,14 @@ class Shard:
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
     """The shards of a table, in order. Raises ValueError if there is none: nothing passes on empty input."""
     shards = []
-    for path in storage.list_files(storage.join(root, table), ".parquet"):
+    for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
         *_, source_part, split_part, name = path.split("/")
         found = (source_part.removeprefix("source="), split_part.removeprefix("split="))
         if (source or found[0], split or found[1]) == found:
             shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
     if not shards:
         place, wanted = (
-            storage.join(root, table),
+            storage.join_uri(root, table),
             "/".join(f"{k}={v}" for k, v in (("source", source), ("split", split)) if v),
         )
         there = sorted({"/".join(path.split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")})
@@ -423,5 +427,5 @@ def read_scenes(
             left = None if left is None else left - 1
 
 
-def rejects_table(rows: Iterable[dict]) -> pa.Table:
+def make_rejects_table(rows: Iterable[dict]) -> pa.Table:
     return pa.Table.from_pylist(list(rows), schema=REJECTS)

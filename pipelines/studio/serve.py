@@ -6,12 +6,14 @@ import ray.serve
 from fastapi import FastAPI
 from ray.serve import Application
 
-from pipelines.studio.session import Studio, studio_app
+from pipelines.studio.session import Studio, build_studio_app
 
 REQUESTS = 32  # at once; more wait, and beyond as many again are told to come back
 
 
-def deployment(model: str, tables: list[str], token: str, hosts: tuple[str, ...], threads: int | None) -> Application:
+def make_deployment(
+    model: str, tables: list[str], token: str, hosts: tuple[str, ...], threads: int | None
+) -> Application:
     """What ray.serve.run takes. The studio is made when the replica starts."""
 
     def app() -> FastAPI:
@@ -20,7 +22,7 @@ def deployment(model: str, tables: list[str], token: str, hosts: tuple[str, ...]
         if threads:
             torch.set_num_threads(threads)
         studio = Studio(model, tables)
-        return studio_app(lambda: studio, token, hosts)
+        return build_studio_app(lambda: studio, token, hosts)
 
     @ray.serve.deployment(
         name="studio",

@@ -21,19 +21,20 @@ from urllib.parse import urlsplit
 from fastapi import FastAPI, HTTPException, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.composition.extend import Side, extended, inpainting, region_blocks
-from models.composition.inpaint import Contents, polygon_region
+from models.composition.extend import Side, inpaint_blocks, split_region
+from models.composition.inpaint import Contents, select_polygon
 from models.labels import LABELS, require_labels
-from models.pipeline import PrITTIPipeline, Resampling
+from models.pipeline import PrITTIPipeline
+from models.sampling.repaint import RePaintConfig
 from models.scene import Scene
-from pipelines.editing.edit import edits_from_json, edits_to_json, replayed
-from pipelines.generation.sample import at_model_resolution, label_of, load_pipeline
-from pipelines.io.mesh_export import scene_glb
-from pipelines.io.opendrive import scene_opendrive
-from pipelines.io.web_export import web_scene
-from pipelines.rendering.render import bev_picture
+from pipelines.editing.edit import parse_edits, replay_edits, serialize_edits
+from pipelines.generation.sample import find_scene_label, load_pipeline, resample_to_model_resolution
+from pipelines.io.mesh_export import export_glb
+from pipelines.io.opendrive import export_opendrive
+from pipelines.io.web_export import export_web_scene
+from pipelines.rendering.render import render_bev
 from pipelines.reporting.contact_sheet import Catalogue
-from pipelines.reporting.report import data_uri
+from pipelines.reporting.report import encode_data_uri
 
 VISITORS, HISTORY, WAITING = 16, 50, 4
 MAX_BODY = 256 * 1024  # bytes of a request
@@ -47,7 +48,7 @@ class Cancelled(Exception):
 
 
 @dataclass
-class Work:
+class BackgroundTask:
     """Something that takes a while."""
 
     name: str
@@ -70,14 +71,14 @@ class Work:
 
 
 @dataclass
-class Desk:
+class Session:
     """A visitor's scene, what it was before, and what was undone."""
 
     scene: Scene | None = None
     past: list[tuple[str, Scene | None, list]] = field(default_factory=list)
     future: list[tuple[str, Scene | None, list]] = field(default_factory=list)
     edits: list = field(default_factory=list)  # since the scene was opened or made, where it is all edits
-    work: Work | None = None
+    work: BackgroundTask | None = None
 
     def put(self, name: str, scene: Scene, edits: list) -> None:
         """A new state after a step called `name`."""
@@ -104,52 +105,54 @@ class Desk:
     def state(self) -> dict:
         """What the page shows."""
         return {
-            "scene": None if self.scene is None else web_scene(self.scene) | {"label": self.scene.vegetation_density},
+            "scene": None
+            if self.scene is None
+            else export_web_scene(self.scene) | {"label": self.scene.vegetation_density},
             "undo": self.past[-1][0] if self.past else None,
             "redo": self.future[-1][0] if self.future else None,
-            "edits": edits_to_json(self.edits),
+            "edits": serialize_edits(self.edits),
             "work": self.work.state() if self.work else None,
         }
 
 
-class Asked(BaseModel):
+class StudioRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Open(Asked):
+class OpenRequest(StudioRequest):
     scene_id: str = Field(max_length=200)
 
 
-class Sampling(Asked):
+class SamplingRequest(StudioRequest):
     label: str = Field("", max_length=40)  # "": the scene's own, or the first
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
 
 
-class Generate(Sampling):
+class GenerateRequest(SamplingRequest):
     sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "dpm++"
 
 
-class Repaint(Sampling):
+class RepaintRequest(SamplingRequest):
     jump_length: int = Field(1, ge=1, le=100)
     resamplings: int = Field(1, ge=1, le=20)
-    known_guidance: float = Field(1.0, ge=0, le=10)
+    pseudoinverse_guidance: float = Field(1.0, ge=0, le=10)
     eta: float = Field(0.0, ge=0, le=1)
 
-    def resampling(self) -> Resampling:
-        return Resampling(self.steps, self.jump_length, self.resamplings, self.known_guidance, self.eta)
+    def repaint(self) -> RePaintConfig:
+        return RePaintConfig(self.steps, self.jump_length, self.resamplings, self.pseudoinverse_guidance, self.eta)
 
 
-class Inpaint(Repaint):
+class InpaintRequest(RepaintRequest):
     polygon_m: list[tuple[float, float]] = Field(min_length=3, max_length=500)
     contents: Contents = "both"
 
 
-class Extend(Repaint):
+class ExtendRequest(RepaintRequest):
     side: Side
 
 
-class Edits(Asked):
+class EditsRequest(StudioRequest):
     edits: list[dict] = Field(min_length=1, max_length=100)
 
 
@@ -159,15 +162,15 @@ class Studio:
     def __init__(self, model: str, tables: list[str]) -> None:
         """Raises ValueError for a directory without a model, or tables without scenes."""
         self.pipeline = load_pipeline(model)
-        self.plain = self.pipeline.scheduler
+        self.default_scheduler = self.pipeline.scheduler_config
         self.catalogues = [Catalogue.read(root) for root in tables]
-        self.desks: OrderedDict[str, Desk] = OrderedDict()
+        self.desks: OrderedDict[str, Session] = OrderedDict()
         self.busy, self.waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
-    def desk(self, visitor: str) -> Desk:
+    def desk(self, visitor: str) -> Session:
         """A visitor's desk; of too many the one longest unused goes."""
         with self.lock:
-            desk = self.desks.pop(visitor, None) or Desk()
+            desk = self.desks.pop(visitor, None) or Session()
             self.desks[visitor] = desk
             while len(self.desks) > VISITORS:
                 idle = next((name for name, other in self.desks.items() if not other.work or other.work.finished), None)
@@ -178,17 +181,17 @@ class Studio:
     def labels(self) -> tuple[str, ...]:
         return LABELS[self.pipeline.dit.config.label]
 
-    def label(self, asked: Sampling, scene: Scene | None) -> str:
+    def label(self, asked: SamplingRequest, scene: Scene | None) -> str:
         kind = self.pipeline.dit.config.label
         if asked.label:
             require_labels(kind, [asked.label])
             return asked.label
         try:
-            return label_of(scene, kind) if scene is not None else self.labels[0]
+            return find_scene_label(scene, kind) if scene is not None else self.labels[0]
         except ValueError:
             return self.labels[0]
 
-    def start(self, desk: Desk, name: str, total: int, make: Callable[[Work], Scene]) -> None:
+    def start(self, desk: Session, name: str, total: int, make: Callable[[BackgroundTask], Scene]) -> None:
         """Run `make` in a thread and put its scene on the desk. HTTP 429 if the visitor or everybody is busy."""
         with self.lock:
             if desk.work and not desk.work.finished:
@@ -196,7 +199,7 @@ class Studio:
             if self.waiting >= WAITING:
                 raise HTTPException(429, "others are waiting already; try again in a minute")
             self.waiting += 1
-            work = desk.work = Work(name, total)
+            work = desk.work = BackgroundTask(name, total)
 
         def run() -> None:
             try:
@@ -215,79 +218,73 @@ class Studio:
 
         threading.Thread(target=run, daemon=True).start()
 
-    def generate(self, desk: Desk, asked: Generate) -> None:
+    def generate(self, desk: Session, asked: GenerateRequest) -> None:
         label = self.label(asked, None)
 
-        def make(work: Work) -> Scene:
+        def make(work: BackgroundTask) -> Scene:
             self.pipeline.use_sampler(asked.sampler)
             try:
                 return self.pipeline.generate(
                     [label], asked.seed, num_inference_steps=asked.steps, run="studio", callback_on_step_end=work.step
                 )[0]
             finally:
-                self.pipeline.scheduler = self.plain
+                self.pipeline.scheduler = self.default_scheduler
 
         self.start(desk, f"generate {label}, seed {asked.seed}", asked.steps, make)
 
-    def inpaint(self, desk: Desk, asked: Inpaint) -> None:
-        scene = at_model_resolution(desk.require(), self.pipeline.spec)
-        region = polygon_region(scene.grid, asked.polygon_m)
+    def inpaint(self, desk: Session, asked: InpaintRequest) -> None:
+        scene = resample_to_model_resolution(desk.require(), self.pipeline.spec)
+        region = select_polygon(scene.grid, asked.polygon_m)
         if not region.any():
             raise ValueError("the region holds no pixel of the scene; draw a larger one")
-        label, resampling = self.label(asked, scene), asked.resampling()
-        blocks = len(region_blocks(self.pipeline, scene, region))
+        label, repaint = self.label(asked, scene), asked.repaint()
+        blocks = len(split_region(self.pipeline, scene, region))
 
-        def make(work: Work) -> Scene:
-            for step in inpainting(
+        def make(work: BackgroundTask) -> Scene:
+            for step in inpaint_blocks(
                 self.pipeline,
                 scene,
                 region,
                 label,
                 asked.contents,
                 asked.seed,
-                resampling=resampling,
+                repaint=repaint,
                 callback_on_step_end=work.step,
             ):
                 canvas = step.canvases[0]
             return canvas
 
-        self.start(desk, f"inpaint {asked.contents}", blocks * resampling.evaluations, make)
+        self.start(desk, f"inpaint {asked.contents}", blocks * repaint.num_evaluations, make)
 
-    def extend(self, desk: Desk, asked: Extend) -> None:
+    def extend(self, desk: Session, asked: ExtendRequest) -> None:
         small = self.pipeline.spec.grid
-        scene = at_model_resolution(desk.require(), self.pipeline.spec)
+        scene = resample_to_model_resolution(desk.require(), self.pipeline.spec)
         rows, cols = scene.grid.rows, scene.grid.cols
         if max(rows, cols) * small.resolution_m >= MAX_SIDE_M:
             raise ValueError(f"the scene is {MAX_SIDE_M:.0f} m long already; the studio stops there")
         across = cols if asked.side in ("ahead", "behind") else rows
         blocks = -(-(across - small.rows) // (small.rows // 2)) + 1
-        label, resampling = self.label(asked, scene), asked.resampling()
+        label, repaint = self.label(asked, scene), asked.repaint()
 
-        def make(work: Work) -> Scene:
-            return extended(
-                self.pipeline,
-                scene,
-                asked.side,
-                label,
-                asked.seed,
-                resampling=resampling,
-                callback_on_step_end=work.step,
+        def make(work: BackgroundTask) -> Scene:
+            return self.pipeline.outpaint(
+                scene, label, asked.seed, repaint=repaint, callback_on_step_end=work.step, side=asked.side
             )
 
-        self.start(desk, f"extend {asked.side}", blocks * resampling.evaluations, make)
+        self.start(desk, f"extend {asked.side}", blocks * repaint.num_evaluations, make)
 
-    def edit(self, desk: Desk, asked: Edits) -> None:
-        edits = edits_from_json(asked.edits)
+    def edit(self, desk: Session, asked: EditsRequest) -> None:
+        edits = parse_edits(asked.edits)
         if any(edit.select.where for edit in edits):
             raise ValueError(
                 "conditions in SQL are for jobs/edit_scenes.py; select by number, category or polygon here"
             )
         for edit in edits:
             edit.check()
-        scene, _ = replayed(desk.require(), edits)
+        scene, _ = replay_edits(desk.require(), edits)
         desk.put(", ".join(edit.name for edit in edits), scene, [*desk.edits, *edits])
 
-    def open(self, desk: Desk, scene_id: str) -> None:
+    def open(self, desk: Session, scene_id: str) -> None:
         for catalogue in self.catalogues:
             if scene_id in catalogue.scenes["scene_id"].to_pylist():
                 index = catalogue.find([scene_id])[0]
@@ -302,18 +299,18 @@ class Studio:
         for catalogue in self.catalogues:
             rows = catalogue.scenes.select(["scene_id", "vegetation_density", "num_primitives"]).to_pylist()
             found += [(catalogue, k, row) for k, row in enumerate(rows) if text.lower() in row["scene_id"].lower()]
-        shown = [row | {"picture": thumbnail(catalogue, k)} for catalogue, k, row in found[start : start + PAGE]]
+        shown = [row | {"picture": draw_thumbnail(catalogue, k)} for catalogue, k, row in found[start : start + PAGE]]
         return {"total": len(found), "start": start, "scenes": shown}
 
 
 @lru_cache(maxsize=512)
-def thumbnail(catalogue: Catalogue, index: int) -> str:
+def draw_thumbnail(catalogue: Catalogue, index: int) -> str:
     """A data URI."""
     scene = catalogue.shards[catalogue.shard[index]].scenes([int(catalogue.row[index])])[0]
-    return data_uri(bev_picture(scene, THUMBNAIL_PX))
+    return encode_data_uri(render_bev(scene, THUMBNAIL_PX))
 
 
-def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, ...] = LOOPBACK) -> FastAPI:
+def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, ...] = LOOPBACK) -> FastAPI:
     """The HTTP interface. `studio()` gives the one Studio; with a token, every request must bear it, once as ?token=.
 
     `hosts` are the names under which it may be asked: a page elsewhere cannot reach it by a name of its own.
@@ -346,13 +343,13 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
             response.set_cookie("studio", secrets.token_urlsafe(16), httponly=True, samesite="strict")
         return response
 
-    def desk_of(request: Request) -> Desk:
+    def desk_of(request: Request) -> Session:
         visitor = request.cookies.get("studio")
         if not visitor or len(visitor) > 64:
             raise HTTPException(400, "no cookie; open the studio's page first")
         return studio().desk(visitor)
 
-    def answered(request: Request, act: Callable[[Desk], None]) -> dict:
+    def answered(request: Request, act: Callable[[Session], None]) -> dict:
         desk = desk_of(request)
         try:
             act(desk)
@@ -360,7 +357,7 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
             raise HTTPException(400, str(error)) from error
         return desk.state()
 
-    def settled(desk: Desk) -> Desk:
+    def settled(desk: Session) -> Session:
         if desk.work and not desk.work.finished:
             raise HTTPException(409, f"{desk.work.name} is at work; wait for it or cancel it")
         return desk
@@ -391,11 +388,11 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
         return desk.state()
 
     @app.post("/api/open")
-    def open_scene(request: Request, asked: Open) -> dict:
+    def open_scene(request: Request, asked: OpenRequest) -> dict:
         return answered(request, lambda desk: studio().open(settled(desk), asked.scene_id))
 
     @app.post("/api/edit")
-    def edit(request: Request, asked: Edits) -> dict:
+    def edit(request: Request, asked: EditsRequest) -> dict:
         return answered(request, lambda desk: studio().edit(settled(desk), asked))
 
     @app.post("/api/undo")
@@ -407,15 +404,15 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
         return answered(request, lambda desk: settled(desk).redo())
 
     @app.post("/api/generate")
-    def generate(request: Request, asked: Generate) -> dict:
+    def generate(request: Request, asked: GenerateRequest) -> dict:
         return answered(request, lambda desk: studio().generate(desk, asked))
 
     @app.post("/api/inpaint")
-    def inpaint(request: Request, asked: Inpaint) -> dict:
+    def inpaint(request: Request, asked: InpaintRequest) -> dict:
         return answered(request, lambda desk: studio().inpaint(settled(desk), asked))
 
     @app.post("/api/extend")
-    def extend(request: Request, asked: Extend) -> dict:
+    def extend(request: Request, asked: ExtendRequest) -> dict:
         return answered(request, lambda desk: studio().extend(settled(desk), asked))
 
     @app.get("/scene.{kind}")
@@ -424,9 +421,9 @@ def studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, 
         try:
             scene = desk.require()
             content = {
-                "glb": lambda: scene_glb(scene),
-                "xodr": lambda: scene_opendrive(scene),
-                "json": lambda: json.dumps(edits_to_json(desk.edits), indent=1).encode(),
+                "glb": lambda: export_glb(scene),
+                "xodr": lambda: export_opendrive(scene),
+                "json": lambda: json.dumps(serialize_edits(desk.edits), indent=1).encode(),
             }[kind]()
         except ValueError as error:
             raise HTTPException(400, str(error)) from error

@@ -21,11 +21,11 @@ import pyarrow as pa
 import ray
 
 from models.augment import Augmentation
-from models.labels import LABELS, label_index
+from models.labels import LABELS, find_label_index
 from models.layout import LayoutSpec
 from models.scene import Grid
-from models.tensors import compact_height, compact_layout, compact_primitives, resampled
-from pipelines.schema.tables import Shard, category_indices, fixed_lists, ground_steps, scenes_from_tables
+from models.tensors import encode_height, encode_layout, encode_primitives, resample_ground
+from pipelines.schema.tables import Shard, find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
@@ -56,13 +56,13 @@ class Stream:
         shard, row = np.empty(count, np.int64), np.empty(count, np.int64)
         for epoch in np.unique(wanted // epoch_size):
             here = wanted // epoch_size == epoch
-            shards, rows = epoch_order(self.counts, self.seed, int(epoch))
+            shards, rows = shuffle_epoch(self.counts, self.seed, int(epoch))
             shard[here], row[here] = shards[wanted[here] % epoch_size], rows[wanted[here] % epoch_size]
         return shard, row
 
 
 @lru_cache(maxsize=4)
-def epoch_order(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
+def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
     """Every (shard, row) once: shards permuted, rows shuffled within windows of WINDOW_SHARDS shards."""
     rng = np.random.default_rng([seed, epoch])
     order = rng.permutation(len(counts))
@@ -92,7 +92,7 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
     return out
 
 
-def batches(
+def iterate_batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
     """Local batches of steps start_step .. stop_step - 1 for one worker; Ray tasks read AHEAD of them.
@@ -125,10 +125,10 @@ class LayoutReader:
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
         if self.augment:
-            scenes = scenes_from_tables(*_scene_tables(shard), shard.source, shard.split, rows.tolist())
-            layouts = (compact_layout(self.augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
+            scenes = parse_scenes(*_read_scene_tables(shard), shard.source, shard.split, rows.tolist())
+            layouts = (encode_layout(self.augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
         else:
-            stored = _stored_layouts(shard)
+            stored = _read_stored_layouts(shard)
             layouts = (stored.layout(int(row), self.spec) for row in rows)
         out: Arrays = {}
         for k, layout in enumerate(layouts):
@@ -140,7 +140,7 @@ class LayoutReader:
 
 
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
-def _scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
+def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
     return tuple(shard.read(table) for table in ("scenes", "primitives", "rasters"))
 
 
@@ -158,7 +158,7 @@ class StoredLayouts:
     def layout(self, row: int, spec: LayoutSpec) -> Arrays:
         """`compact_layout` of one scene."""
         here = slice(self.first[row], self.first[row] + self.count[row])
-        primitives = compact_primitives(self.category[here], self.center_m[here], self.cholesky[here], spec)
+        primitives = encode_primitives(self.category[here], self.center_m[here], self.cholesky[here], spec)
         return self.ground(row, spec) | primitives
 
     def ground(self, row: int, spec: LayoutSpec) -> Arrays:
@@ -166,25 +166,25 @@ class StoredLayouts:
         raster = {name: self.rasters[name][row].as_py() for name in self.rasters.column_names}
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
-        steps, mask = ground_steps(raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols))
+        steps, mask = list_ground_steps(raster["height"], raster["occupied"], (len(classes), grid.rows, grid.cols))
         height = np.zeros(mask.shape, np.uint16)
-        height[mask] = _scaled_steps(spec, raster["height_step_m"])[steps.view(np.uint16)]
+        height[mask] = _scale_steps(spec, raster["height_step_m"])[steps.view(np.uint16)]
         if classes != list(spec.ground_classes):
             place = [classes.index(name) if name in classes else -1 for name in spec.ground_classes]
             height, mask = (np.stack([v[k] if k >= 0 else np.zeros_like(v[0]) for k in place]) for v in (height, mask))
-        height, mask = resampled(height, mask, grid, spec.grid)
+        height, mask = resample_ground(height, mask, grid, spec.grid)
         return {"height": height, "occupied": mask}
 
 
 @lru_cache(maxsize=4)
-def _scaled_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
+def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
     """(65536,) uint16: `compact_height` of every 16-bit number of height steps."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
-    return compact_height(steps * np.float32(step_m), spec)
+    return encode_height(steps * np.float32(step_m), spec)
 
 
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
-def _stored_layouts(shard: Shard) -> StoredLayouts:
+def _read_stored_layouts(shard: Shard) -> StoredLayouts:
     scenes = shard.read("scenes", ["scene_id", "primitive_offset", "num_primitives"])
     primitives = shard.read("primitives", ["category", "x_m", "y_m", "z_m", "cholesky"]).combine_chunks()
     rasters = shard.read("rasters")
@@ -193,15 +193,15 @@ def _stored_layouts(shard: Shard) -> StoredLayouts:
     return StoredLayouts(
         first=scenes["primitive_offset"].to_numpy(),
         count=scenes["num_primitives"].to_numpy(),
-        category=category_indices(primitives["category"]),
+        category=find_category_indices(primitives["category"]),
         center_m=np.stack([primitives[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1),
-        cholesky=fixed_lists(primitives["cholesky"], 6),
+        cholesky=read_fixed_lists(primitives["cholesky"], 6),
         rasters=rasters.combine_chunks(),
     )
 
 
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
-def _latents(shard: Shard, latents_root: str, label: str) -> Arrays:
+def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
     table = Shard(latents_root, shard.source, shard.split, shard.number).read("latents")
     scenes = shard.read("scenes", ["scene_id", "vegetation_density", "vehicle_density"])
     if table["scene_id"].to_pylist() != scenes["scene_id"].to_pylist():
@@ -218,7 +218,7 @@ def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
         "none": LABELS["none"] * len(scenes),
     }
     names["joint"] = [f"{a}-{b}" for a, b in zip(names["vegetation"], names["vehicle"], strict=True)]
-    return np.array([label_index(label, name) for name in names[label]], np.int64)
+    return np.array([find_label_index(label, name) for name in names[label]], np.int64)
 
 
 @dataclass(frozen=True)
@@ -229,4 +229,4 @@ class LatentReader:
     label: str
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
-        return {name: values[rows] for name, values in _latents(shard, self.latents_root, self.label).items()}
+        return {name: values[rows] for name, values in _read_latents(shard, self.latents_root, self.label).items()}

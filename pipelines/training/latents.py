@@ -10,14 +10,14 @@ import pyarrow as pa
 import torch
 
 from models.lvae import LayoutVAE
-from models.tensors import layout_batch
+from models.tensors import make_layout_batch
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import fan_out
+from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.tables import Shard, find_shards, latents_schema
+from pipelines.schema.tables import Shard, find_shards, make_latents_schema
 
 
-def weights_digest(model: torch.nn.Module) -> str:
+def digest_weights(model: torch.nn.Module) -> str:
     """Twelve hex digits of a model's weights."""
     digest = hashlib.sha256()
     for name, value in sorted(model.state_dict().items()):
@@ -28,10 +28,10 @@ def weights_digest(model: torch.nn.Module) -> str:
 
 def load_lvae(directory: str) -> LayoutVAE:
     """Raises ValueError if the directory holds no LVAE."""
-    if not storage.exists(storage.join(directory, "config.json")):
+    if not storage.exists(storage.join_uri(directory, "config.json")):
         raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
     try:
-        return LayoutVAE.from_pretrained(directory, low_cpu_mem_usage=False).eval().requires_grad_(False)
+        return LayoutVAE.from_pretrained(directory).requires_grad_(False)
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(f"{directory}: no layout VAE here ({error}); run jobs/train_lvae.py first") from error
 
@@ -50,7 +50,9 @@ class Encoder:
         scenes, spec = shard.scenes(), self.model.spec
         parts = []
         for start in range(0, len(scenes), self.batch_size):
-            posterior = self.model.encode(layout_batch(scenes[start : start + self.batch_size], spec).to(self.device))
+            posterior = self.model.encode(
+                make_layout_batch(scenes[start : start + self.batch_size], spec).to(self.device)
+            )
             parts.append([v.half().cpu().numpy() for v in (posterior.mean, posterior.logvar)])
         mean, logvar = (np.concatenate(group) for group in zip(*parts, strict=True))
         return [scene.scene_id for scene in scenes], mean, logvar
@@ -63,7 +65,7 @@ class Encoder:
         else:
             ids, mean, logvar = self.encode(shard)
             tensors = [pa.FixedShapeTensorArray.from_numpy_ndarray(v) for v in (mean, logvar)]
-            schema = latents_schema(mean.shape[1:])
+            schema = make_latents_schema(mean.shape[1:])
             storage.write_parquet(pa.table([pa.array(ids), *tensors], schema=schema), target.path("latents"))
         values = mean.astype(np.float64)
         return {
@@ -90,7 +92,7 @@ def encode_latents(
     """
     model = load_lvae(lvae)
     dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
-    description, digest = storage.join(output, "latents.json"), weights_digest(model)
+    description, digest = storage.join_uri(output, "latents.json"), digest_weights(model)
     if storage.exists(description):
         found = storage.read_json(description)
         if found["lvae_digest"] != digest:
@@ -99,11 +101,11 @@ def encode_latents(
             return found
     content = {"lvae": lvae, "lvae_digest": digest, "dataset": dataset.root, "complete": False}
     storage.write_json(content, description)
-    storage.clean_temporaries(storage.join(output, "latents"))
+    storage.clean_temporaries(storage.join_uri(output, "latents"))
 
     shards = find_shards(dataset.root, source=dataset.source)
     total, square, cells, counts = 0.0, 0.0, 0, {}
-    for row in fan_out(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
+    for row in map_actors(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
         counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
         if row["split"] == "train":
             total, square = total + row["sum"], square + row["square"]

@@ -65,7 +65,7 @@ MAX_COORDINATE_M = 1e6
 MAX_HEIGHT_M = 1e4
 
 
-def logs(root: str | Path) -> list[tuple[str, str]]:
+def list_logs(root: str | Path) -> list[tuple[str, str]]:
     """(split, log id) of every annotated log under ROOT: train, then val. The test split has no annotations.
 
     Raises ValueError if there is none.
@@ -103,15 +103,15 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
     others = boxes["category"] != EGO_LABEL
     boxes, box_sweep = {name: column[others] for name, column in boxes.items()}, box_sweep[others]
     city_from_ego_of_box = city_from_ego[box_sweep]
-    center_ego_m = _columns(boxes, TRANSLATION)
-    rotation = city_from_ego_of_box[:, :, :3] @ _rotation(_columns(boxes, QUATERNION))
+    center_ego_m = _read_columns(boxes, TRANSLATION)
+    rotation = city_from_ego_of_box[:, :, :3] @ _make_rotation(_read_columns(boxes, QUATERNION))
     return Drive(
         source=SOURCE,
         sequence=log,
         category=np.array([CATEGORY_OF[label] for label in boxes["category"]], np.int8),
         center_m=np.einsum("nij,nj->ni", city_from_ego_of_box[:, :, :3], center_ego_m) + city_from_ego_of_box[:, :, 3],
         rotation=rotation,
-        size_m=_columns(boxes, SIZE),
+        size_m=_read_columns(boxes, SIZE),
         heading_rad=np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
         instance_id=_hash_ids(boxes["track_uuid"]),
         label=boxes["category"],
@@ -154,8 +154,8 @@ def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
     if len(missing):
         raise ValueError(f"{path}: no pose at the annotated timestamp {missing[0]}; download the log again")
     row = first[np.searchsorted(time, frame)]
-    rotation = _rotation(_columns(columns, QUATERNION)[row])
-    return np.concatenate([rotation, _columns(columns, TRANSLATION)[row][:, :, None]], axis=2)
+    rotation = _make_rotation(_read_columns(columns, QUATERNION)[row])
+    return np.concatenate([rotation, _read_columns(columns, TRANSLATION)[row][:, :, None]], axis=2)
 
 
 def _read_feather(
@@ -212,7 +212,7 @@ def _check_range(path: Path, name: str, values: np.ndarray, low: float, high: fl
 def _check_quaternion(path: Path, columns: dict[str, np.ndarray]) -> None:
     for name in QUATERNION:
         _check_range(path, name, columns[name], -2, 2)
-    norm = np.linalg.norm(_columns(columns, QUATERNION), axis=1)
+    norm = np.linalg.norm(_read_columns(columns, QUATERNION), axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
     if len(bad):
         raise ValueError(
@@ -220,12 +220,12 @@ def _check_quaternion(path: Path, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+def _read_columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
     """(n, len(names)) float64."""
     return np.stack([columns[name] for name in names], axis=1)
 
 
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
+def _make_rotation(quaternion: np.ndarray) -> np.ndarray:
     """(n, 3, 3) of (n, 4) quaternions, scalar first."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
 
@@ -244,20 +244,20 @@ def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
 
 def _read_ground(folder: Path) -> MapGround:
     """Drivable areas as road, pedestrian crossings as crossing, over the log's height raster."""
-    path = _only(folder, "log_map_archive_*.json")
+    path = _find_only_file(folder, "log_map_archive_*.json")
     content = _read_json(path)
-    areas, crossings = (_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
-    roads = [_points(path, area, "area_boundary", 3) for area in areas]
-    quads = [_quad(_points(path, c, "edge1", 2, 2), _points(path, c, "edge2", 2, 2)) for c in crossings]
+    areas, crossings = (_read_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
+    roads = [_read_points(path, area, "area_boundary", 3) for area in areas]
+    quads = [_read_quad(_read_points(path, c, "edge1", 2, 2), _read_points(path, c, "edge2", 2, 2)) for c in crossings]
     return MapGround(
         polygon_class=[GROUND_CLASSES.index("road")] * len(roads) + [GROUND_CLASSES.index("crossing")] * len(quads),
         polygons_m=roads + quads,
-        raster_m=_read_heights(_only(folder, "*_ground_height_surface____*.npy")),
-        raster_from_world=_read_sim2(_only(folder, "*___img_Sim2_city.json")),
+        raster_m=_read_heights(_find_only_file(folder, "*_ground_height_surface____*.npy")),
+        raster_from_world=_read_sim2(_find_only_file(folder, "*___img_Sim2_city.json")),
     )
 
 
-def _only(folder: Path, pattern: str) -> Path:
+def _find_only_file(folder: Path, pattern: str) -> Path:
     paths = sorted(folder.glob(pattern))
     if len(paths) != 1:
         raise ValueError(f"{folder / pattern}: {len(paths)} such files, expected 1; download the log again")
@@ -275,7 +275,7 @@ def _read_json(path: Path) -> dict:
     return content
 
 
-def _section(path: Path, content: dict, name: str) -> list[dict]:
+def _read_section(path: Path, content: dict, name: str) -> list[dict]:
     """The entries of one section of the map file."""
     section = content.get(name)
     if not isinstance(section, dict) or not all(isinstance(entry, dict) for entry in section.values()):
@@ -283,7 +283,7 @@ def _section(path: Path, content: dict, name: str) -> list[dict]:
     return list(section.values())
 
 
-def _points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
+def _read_points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
     """(n, 2) x and y of the points entry[name], metres, city frame."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
@@ -291,19 +291,19 @@ def _points(path: Path, entry: dict, name: str, least: int, most: int | None = N
             f"{path}: {name} of {ascii(entry.get('id'))[:40]} is no list of {least} points; download the log again"
         )
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
-    if not _all_numbers(values, MAX_COORDINATE_M):
+    if not _are_all_numbers(values, MAX_COORDINATE_M):
         raise ValueError(
             f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without sensible x, y; fix or drop it"
         )
     return np.array(values, np.float64).reshape(-1, 2)
 
 
-def _all_numbers(values: list, largest: float) -> bool:
+def _are_all_numbers(values: list, largest: float) -> bool:
     """Whether these JSON values are numbers in [-largest, largest]; NaN and true are not."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
-def _quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
+def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
     """(4, 2) outline between two edges (2, 2); they may run the same way or against each other."""
     if (edge1_m[1] - edge1_m[0]) @ (edge2_m[1] - edge2_m[0]) < 0:
         edge2_m = edge2_m[::-1]
@@ -338,7 +338,7 @@ def _read_sim2(path: Path) -> np.ndarray:
         isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
     ):
         raise ValueError(f"{path}: R or t is missing or not of 4 and 2 numbers; download the log again")
-    if not _all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
+    if not _are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
         raise ValueError(f"{path}: R, t or s is no sensible number; download the log again")
     matrix = np.array(rotation, np.float64).reshape(2, 2)
     if np.abs(matrix @ matrix.T - np.eye(2)).max() > 1e-3:

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 import shapely
 from scipy.spatial.transform import Rotation
 
-from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, yaw_rotation
+from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, make_yaw_rotation
 from pipelines.preprocess.sources.drive import STATIC, Drive, SurfaceGround
 from pipelines.schema.splits import TEST, TRAIN
 
@@ -67,7 +67,7 @@ SIGHT_M = 100.0  # a crop reaches 72 m
 # ----------------------------------------------------------------------------------------------------- the root
 
 
-def drives(root: str | Path) -> list[str]:
+def list_drives(root: str | Path) -> list[str]:
     """The drives under ROOT, sorted: every folder whose name does not begin with a dot.
 
     Raises ValueError if there is none, or one whose name could not go into a scene's id.
@@ -98,7 +98,7 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
     sides = _load_json(path)
     if not isinstance(sides, dict):
         raise ValueError(f'{path}: holds a {type(sides).__name__}, expected {{"drive": "train" or "test"}}')
-    names = drives(root)
+    names = list_drives(root)
     for name, side in sides.items():
         if name not in names:
             raise ValueError(f"{path}: {_show(name)} is no folder beside it; remove the entry or add the drive")
@@ -110,13 +110,13 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
     return sides
 
 
-def ground_classes(root: str | Path) -> tuple[str, ...]:
+def read_ground_classes(root: str | Path) -> tuple[str, ...]:
     """The ground classes that any drive under ROOT has, in the order of GROUND_CLASSES.
 
     A polygons file that cannot be read is left for `read_drive` to report. Raises ValueError if no drive has ground.
     """
     found, errors = set(), []
-    for name in drives(root):
+    for name in list_drives(root):
         try:
             found |= set(_read_polygons(Path(root, name)).texts("class"))
         except ValueError as error:
@@ -136,16 +136,16 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     """
     folder = Path(root, name)
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such drive; there are {', '.join(drives(root))[:200]}")
+        raise ValueError(f"{folder}: no such drive; there are {', '.join(list_drives(root))[:200]}")
     frame, world_from_ego = read_poses(root, name)
     boxes, polygons = _read_boxes(folder), _read_polygons(folder)
     classes = classes or tuple(c for c in GROUND_CLASSES if c in polygons.texts("class"))
     drive = Drive(
         source=SOURCE,
         sequence=name,
-        **_boxes(boxes),
+        **_make_boxes(boxes),
         ground_classes=classes,
-        ground=_ground(polygons, classes),
+        ground=_make_ground(polygons, classes),
         frame=frame,
         world_from_imu=world_from_ego,
     )
@@ -236,7 +236,7 @@ class _Table:
         self.require(given[0])
         if given[0] == ("yaw_rad",):
             yaw_rad = self.numbers(("yaw_rad",), -MAX_YAW_RAD, MAX_YAW_RAD, " (radians)")
-            return yaw_rotation(yaw_rad[:, 0])
+            return make_yaw_rotation(yaw_rad[:, 0])
         quaternion = self.numbers(QUATERNION, -2, 2)
         norm = np.linalg.norm(quaternion, axis=1)
         bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
@@ -346,30 +346,30 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
             " each frame once"
         )
     if "world_from_ego" in table.columns:
-        world_from_ego = _matrices(table)
+        world_from_ego = _read_matrices(table)
     else:
         table.require(PLACE)
         world_from_ego = np.concatenate([table.rotations(), table.places()[:, :, None]], axis=2)
     fallen = np.flatnonzero(world_from_ego[:, 2, 2] < MIN_UP)
     if len(fallen):
         raise ValueError(
-            f"{table.path}: the z axis of row {fallen[0]} points {_direction(world_from_ego[fallen[0], 2, 2])}; give"
+            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])}; give"
             " the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other axes)"
         )
     return frame, world_from_ego
 
 
-def _direction(up: float) -> str:
+def _read_direction(up: float) -> str:
     return "down" if up < -MIN_UP else "sideways"
 
 
-def _matrices(table: _Table) -> np.ndarray:
+def _read_matrices(table: _Table) -> np.ndarray:
     """(rows, 3, 4) of the column world_from_ego: 12 numbers, row-major."""
     others = [name for name in (*PLACE, "yaw_rad", *QUATERNION) if name in table.columns]
     if others:
         raise ValueError(f"{table.path}: has world_from_ego and {others[0]}; give the pose in one way only")
     for row, matrix in enumerate(table.columns["world_from_ego"]):
-        if type(matrix) is not list or len(matrix) != 12 or not _all_numbers(matrix, MAX_COORDINATE_M):
+        if type(matrix) is not list or len(matrix) != 12 or not _are_all_numbers(matrix, MAX_COORDINATE_M):
             raise ValueError(
                 f"{table.path}: world_from_ego of row {row} is {_show(matrix)}, expected 12 numbers (3 x 4, row by"
                 " row), metres"
@@ -402,7 +402,7 @@ def _is_whole(value: object) -> bool:
     return type(value) in (int, float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 
-def _all_numbers(values: list, largest: float) -> bool:
+def _are_all_numbers(values: list, largest: float) -> bool:
     """Whether these are numbers in [-largest, largest]; NaN and true are not."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
@@ -414,7 +414,7 @@ def _read_boxes(folder: Path) -> _Table:
     return _read_table(folder, "boxes", BOX_COLUMNS, ("category", *PLACE, *SIZE))
 
 
-def _boxes(table: _Table) -> dict[str, np.ndarray]:
+def _make_boxes(table: _Table) -> dict[str, np.ndarray]:
     """The per-box arrays of a Drive."""
     names = table.texts("category", CATEGORIES)
     category = np.array([CATEGORY_INDEX[name] for name in names], np.int8)
@@ -433,13 +433,13 @@ def _boxes(table: _Table) -> dict[str, np.ndarray]:
         "heading_rad": np.where(
             np.array(known, bool) & lies_flat, np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]), np.nan
         ),
-        "instance_id": _instance_ids(table),
+        "instance_id": _make_instance_ids(table),
         "label": np.array([own or name for own, name in zip(label, names, strict=True)], object),
         "timestamp": table.frames(missing=STATIC),
     }
 
 
-def _instance_ids(table: _Table) -> np.ndarray:
+def _make_instance_ids(table: _Table) -> np.ndarray:
     """(rows,) int64: numbers as they are, texts by the first 63 bits of their BLAKE2 hash, -1 where there is none."""
     ids = []
     for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
@@ -479,19 +479,19 @@ def _read_polygons(folder: Path) -> _Table:
     return table
 
 
-def _ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
+def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
     """Every outline cut into triangles between its own vertices."""
     of_row = [classes.index(name) for name in table.texts("class", classes)]
-    parts = [_triangles(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
+    parts = [_triangulate_polygon(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
     return SurfaceGround(
         triangles_m=np.concatenate([np.zeros((0, 3, 3)), *parts]),
         triangle_class=np.repeat(np.array(of_row, np.int64), [len(part) for part in parts]),
     )
 
 
-def _triangles(path: Path, row: int, value: object) -> np.ndarray:
+def _triangulate_polygon(path: Path, row: int, value: object) -> np.ndarray:
     """(t, 3, 3) corners of the constrained Delaunay triangulation of one outline, world."""
-    outline_m = _outline(path, row, value)
+    outline_m = _make_outline(path, row, value)
     flat = outline_m[:, :2] - outline_m[0, :2]
     reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
     if reason != "Valid Geometry":
@@ -505,12 +505,12 @@ def _triangles(path: Path, row: int, value: object) -> np.ndarray:
     return outline_m[[[vertex[tuple(corner)] for corner in triangle] for triangle in corners.tolist()]]
 
 
-def _outline(path: Path, row: int, value: object) -> np.ndarray:
+def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
     """(n, 3) float64, not closed, no point twice in succession."""
     if type(value) is not list:
         raise ValueError(f"{path}: outline of row {row} is {_show(value)}, expected a list of points [x, y, z]")
     for k, point in enumerate(value):
-        if type(point) is not list or len(point) != 3 or not _all_numbers(point, MAX_COORDINATE_M):
+        if type(point) is not list or len(point) != 3 or not _are_all_numbers(point, MAX_COORDINATE_M):
             raise ValueError(
                 f"{path}: point {k} of the outline of row {row} is {_show(point)}, expected [x, y, z] in metres"
             )

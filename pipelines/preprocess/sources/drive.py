@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from models.scene import Grid, Scene, canonical_boxes, yaw_rotation
-from pipelines.geometry.rasterize import fill_polygon, height_map
+from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
+from pipelines.geometry.rasterize import fill_polygon, rasterize_heights
 
 STATIC = -1
 EXTRUSION_M = 1e-3  # how far a slab's underside may be from a shifted copy of its top
@@ -27,10 +27,10 @@ class Pose:
 
     def to_ego(self, points_m: np.ndarray) -> np.ndarray:
         """World points (..., 3) in the ego frame. Subtracts in float64 before anything else."""
-        return (np.asarray(points_m, np.float64) - self.xyz_m) @ yaw_rotation(self.yaw_rad)
+        return (np.asarray(points_m, np.float64) - self.xyz_m) @ make_yaw_rotation(self.yaw_rad)
 
     def to_world(self, points_m: np.ndarray) -> np.ndarray:
-        return np.asarray(points_m, np.float64) @ yaw_rotation(self.yaw_rad).T + self.xyz_m
+        return np.asarray(points_m, np.float64) @ make_yaw_rotation(self.yaw_rad).T + self.xyz_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,9 @@ class SlabGround:
         inside[self.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
         triangles, slab = self._upper
         kept = np.flatnonzero(inside[slab])
-        return _heights(height_map(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes))
+        return _interpolate_heights(
+            rasterize_heights(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +128,7 @@ class MapGround:
                 continue
             covered = fill_polygon(local, grid) & np.isfinite(surface)
             height[index][covered] = surface[covered]
-        return _heights(height)
+        return _interpolate_heights(height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,17 +153,19 @@ class SurfaceGround:
         middle_m = np.array([(grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2, 0.0])
         center_m, reach_m = pose.to_world(middle_m)[:2], np.hypot(grid.rows, grid.cols) * grid.resolution_m / 2
         seen = self.near(center_m - reach_m, center_m + reach_m)
-        return _heights(height_map(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes))
+        return _interpolate_heights(
+            rasterize_heights(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes)
+        )
 
 
-def _heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate_heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """float32 heights, zero where there is none (-inf, which is overwritten), and where there is one."""
     occupied = height_m > -np.inf
     height_m[~occupied] = 0.0
     return height_m.astype(np.float32, copy=False), occupied
 
 
-def _reach_m(grid: Grid) -> float:
+def _compute_reach_m(grid: Grid) -> float:
     """Distance from the ego vehicle to the farthest corner of its crop."""
     return float(np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m))))
 
@@ -195,7 +199,7 @@ class Drive:
     def at(self, poses: np.ndarray, grid: Grid | None = None) -> Drive:
         """The drive with these poses only, and of its content what their crops can hold: scenes are cut faster."""
         xy = self.world_from_imu[poses, :2, 3]
-        reach_m = _reach_m(grid or Grid())
+        reach_m = _compute_reach_m(grid or Grid())
         low_m, high_m = xy.min(axis=0) - reach_m, xy.max(axis=0) + reach_m
         near = ((self.center_m[:, :2] >= low_m) & (self.center_m[:, :2] <= high_m)).all(axis=1)
         near &= (self.timestamp == STATIC) | np.isin(self.timestamp, self.frame[poses])
@@ -217,12 +221,12 @@ class Drive:
         """The Scene ahead of pose `index`: primitives whose centre lies in the crop, static or of this very frame."""
         grid = grid or Grid()
         pose, frame = self.pose(index), int(self.frame[index])
-        near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= _reach_m(grid)
+        near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= _compute_reach_m(grid)
         near = np.flatnonzero(near & ((self.timestamp == STATIC) | (self.timestamp == frame)))
         center = pose.to_ego(self.center_m[near])
         inside = grid.contains(center[:, 0], center[:, 1])
         near, center = near[inside], center[inside]
-        rotation, size = canonical_boxes(yaw_rotation(-pose.yaw_rad) @ self.rotation[near], self.size_m[near])
+        rotation, size = canonicalize_boxes(make_yaw_rotation(-pose.yaw_rad) @ self.rotation[near], self.size_m[near])
         heading = (self.heading_rad[near] - pose.yaw_rad + np.pi) % (2 * np.pi) - np.pi
         height, occupied = self.ground.rasterise(pose, grid, len(self.ground_classes))
         return Scene(

@@ -110,15 +110,15 @@ class ReadReport:
         """One line for a log."""
         parts = [f"{self.objects} objects: {self.boxes} boxes, {self.slabs} ground slabs"]
         parts += [f"{self.duplicates} duplicates dropped"] if self.duplicates else []
-        parts += [f"dropped labels {_counts(self.dropped)}"] if self.dropped else []
-        parts += [f"unknown labels {_counts(self.unknown)}"] if self.unknown else []
+        parts += [f"dropped labels {_count_labels(self.dropped)}"] if self.dropped else []
+        parts += [f"unknown labels {_count_labels(self.unknown)}"] if self.unknown else []
         if self.defects:
             first = self.defects[0]
             parts += [f"{len(self.defects)} defective, first object {first.index} ({first.label}): {first.reason}"]
         return "; ".join(parts)
 
 
-def sequences(root: str | Path) -> list[str]:
+def list_sequences(root: str | Path) -> list[str]:
     """The annotated sequences under ROOT, by their four digits.
 
     Raises ValueError if there is none, or none that has poses: `read_poses` names a single one that has not.
@@ -130,9 +130,9 @@ def sequences(root: str | Path) -> list[str]:
             f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that"
             " holds data_3d_bboxes and data_poses"
         )
-    if not any(_poses_path(root, name).is_file() for name in names):
+    if not any(_make_poses_path(root, name).is_file() for name in names):
         raise ValueError(
-            f"{_poses_path(root, names[0])}: missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
+            f"{_make_poses_path(root, names[0])}: missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
             " data_poses.zip here"
         )
     return names
@@ -146,7 +146,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     Raises ValueError, naming the file, for a missing or broken XML or poses file.
     """
     frame, world_from_imu = read_poses(root, sequence)
-    boxes, slabs, report = _read_objects(_boxes_path(root, sequence))
+    boxes, slabs, report = _read_objects(_make_boxes_path(root, sequence))
     drive = Drive(
         source=SOURCE,
         sequence=sequence,
@@ -166,10 +166,10 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
     seen: dict[tuple, list[np.ndarray]] = {}
     dropped, unknown, duplicates, defects = Counter(), Counter(), 0, []
     for fields in _stream_objects(path):
-        label = _label(fields)
-        plain = _plain(label)
+        label = _read_label(fields)
+        plain = _convert_to_plain(label)
         if not plain:
-            defects.append(Defect(_index(fields), label, "no label"))
+            defects.append(Defect(_read_index(fields), label, "no label"))
             continue
         if plain in DROPPED_LABELS:
             dropped[label] += 1
@@ -180,9 +180,9 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
         try:
             parsed = _parse_slab(fields, plain) if plain in GROUND_CLASS_OF else _parse_box(fields, label)
         except DefectiveObject as error:
-            defects.append(Defect(_index(fields), label, str(error)))
+            defects.append(Defect(_read_index(fields), label, str(error)))
             continue
-        if _seen_before(seen, (plain, parsed.timestamp), parsed.vertices_m):
+        if _find_copies(seen, (plain, parsed.timestamp), parsed.vertices_m):
             duplicates += 1
         else:
             (boxes if isinstance(parsed, _Box) else slabs).append(parsed)
@@ -196,11 +196,11 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
 # ------------------------------------------------------------------------------------------------------ poses
 
 
-def _boxes_path(root: str | Path, sequence: str) -> Path:
+def _make_boxes_path(root: str | Path, sequence: str) -> Path:
     return Path(root) / "data_3d_bboxes" / "train_full" / f"2013_05_28_drive_{sequence}_sync.xml"
 
 
-def _poses_path(root: str | Path, sequence: str) -> Path:
+def _make_poses_path(root: str | Path, sequence: str) -> Path:
     return Path(root) / "data_poses" / f"2013_05_28_drive_{sequence}_sync" / "poses.txt"
 
 
@@ -210,7 +210,7 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     Frames in which the car hardly moved are absent from the file.
     Raises ValueError, naming file and line, for a missing file, a bad line or a matrix that is no pose.
     """
-    path = _poses_path(root, sequence)
+    path = _make_poses_path(root, sequence)
     text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
     frame, rows = [], []
     for number, line in enumerate(text.splitlines(), 1):
@@ -221,7 +221,7 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
             raise ValueError(f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; is it cut off?")
         if not words[0].isdecimal() or len(words[0]) > 18:
             raise ValueError(f"{path}, line {number}: frame {words[0]!r} is not a whole number")
-        row = _floats(words[1:])
+        row = _read_floats(words[1:])
         if row is None or np.abs(row).max() > MAX_COORDINATE_M:
             raise ValueError(f"{path}, line {number}: {line.strip()[:80]!r} is not a pose; restore the line")
         if frame and int(words[0]) <= frame[-1]:
@@ -274,7 +274,7 @@ class DefectiveObject(ValueError):
     """One object cannot be read; the message says why."""
 
 
-def _text(fields: dict, tag: str, default: str | None = None) -> str:
+def _read_text(fields: dict, tag: str, default: str | None = None) -> str:
     text = (fields[tag].text or "").strip() if tag in fields else ""
     if text:
         return text
@@ -283,27 +283,27 @@ def _text(fields: dict, tag: str, default: str | None = None) -> str:
     return default
 
 
-def _label(fields: dict) -> str:
+def _read_label(fields: dict) -> str:
     """The object's label as written, empty if it has none."""
-    return " ".join(_text(fields, "label", " ").split())[:40]
+    return " ".join(_read_text(fields, "label", " ").split())[:40]
 
 
-def _integer(fields: dict, tag: str) -> int:
-    text = _text(fields, tag)
+def _read_integer(fields: dict, tag: str) -> int:
+    text = _read_text(fields, tag)
     if not re.fullmatch(r"-?\d{1,18}", text):
         raise DefectiveObject(f"{tag} is {text[:20]!r}, not a whole number")
     return int(text)
 
 
-def _index(fields: dict) -> int:
+def _read_index(fields: dict) -> int:
     """The object's own index, -1 if it has none."""
     try:
-        return _integer(fields, "index")
+        return _read_integer(fields, "index")
     except DefectiveObject:
         return -1
 
 
-def _floats(words: list[str]) -> np.ndarray | None:
+def _read_floats(words: list[str]) -> np.ndarray | None:
     """(n,) float64, or None if a word is no finite number."""
     try:
         values = np.array(words, np.float64)
@@ -312,27 +312,27 @@ def _floats(words: list[str]) -> np.ndarray | None:
     return values if np.isfinite(values).all() else None
 
 
-def _matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
+def _read_matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
     """(rows, cols) float64 of an OpenCV matrix."""
     if tag not in fields:
         raise DefectiveObject(f"no {tag}")
     parts = {child.tag: child for child in fields[tag]}
-    rows, stated_cols = _integer(parts, "rows"), _integer(parts, "cols")
-    words = _text(parts, "data", " ").split()
+    rows, stated_cols = _read_integer(parts, "rows"), _read_integer(parts, "cols")
+    words = _read_text(parts, "data", " ").split()
     if stated_cols != cols or rows * cols != len(words):
         raise DefectiveObject(f"{tag} is {rows} x {stated_cols} with {len(words)} numbers, expected n x {cols}")
-    values = _floats(words)
+    values = _read_floats(words)
     if values is None:
         raise DefectiveObject(f"{tag} holds something that is not a finite number")
     return values.reshape(rows, cols)
 
 
-def _vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read_vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Local vertices (v, 3), world_from_local (4, 4), world vertices (v, 3) in metres, all float64."""
-    world_from_local = _matrix(fields, "transform", 4)
+    world_from_local = _read_matrix(fields, "transform", 4)
     if world_from_local.shape != (4, 4) or np.abs(world_from_local[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DefectiveObject("transform is not an affine 4 x 4 matrix")
-    vertices = _matrix(fields, "vertices", 3)
+    vertices = _read_matrix(fields, "vertices", 3)
     if len(vertices) < 6:
         raise DefectiveObject(f"{len(vertices)} vertices are no solid")
     largest = max(np.abs(world_from_local).max(), np.abs(vertices).max())
@@ -361,22 +361,24 @@ class _Box:
 
 
 def _parse_box(fields: dict, label: str) -> _Box:
-    vertices, world_from_local, vertices_m = _vertices_and_transform(fields)
-    center_m, rotation, size_m = box_geometry(world_from_local, vertices)
-    category = CATEGORY_OF[_plain(label)]
+    vertices, world_from_local, vertices_m = _read_vertices_and_transform(fields)
+    center_m, rotation, size_m = compute_box_geometry(world_from_local, vertices)
+    category = CATEGORY_OF[_convert_to_plain(label)]
     if category == CATEGORY_INDEX["vegetation_cuboid"] and len(vertices) == SPHERE_VERTICES:
         category = CATEGORY_INDEX["vegetation_ellipsoid"]
-    timestamp = _integer(fields, "timestamp")
+    timestamp = _read_integer(fields, "timestamp")
     if timestamp < STATIC:
         raise DefectiveObject(f"timestamp is {timestamp}, expected a frame or -1")
-    instance_id = _integer(fields, "index" if timestamp == STATIC else "dynamicSeq")
+    instance_id = _read_integer(fields, "index" if timestamp == STATIC else "dynamicSeq")
     lies_flat = np.abs(rotation[2, 0]) < np.sqrt(0.5)
-    headed = _plain(label) in HEADED_LABELS and lies_flat
+    headed = _convert_to_plain(label) in HEADED_LABELS and lies_flat
     heading_rad = float(np.arctan2(rotation[1, 0], rotation[0, 0])) if headed else np.nan
     return _Box(category, label, center_m, rotation, size_m, heading_rad, instance_id, timestamp, vertices_m)
 
 
-def box_geometry(world_from_local: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def compute_box_geometry(
+    world_from_local: np.ndarray, vertices: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
 
     world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
@@ -426,11 +428,11 @@ class _Slab:
 
 
 def _parse_slab(fields: dict, plain: str) -> _Slab:
-    _, _, vertices_m = _vertices_and_transform(fields)
+    _, _, vertices_m = _read_vertices_and_transform(fields)
     extent_m = np.ptp(vertices_m, axis=0).max()
     if extent_m > MAX_SIZE_M:
         raise DefectiveObject(f"ground slab of {extent_m:.3g} m")
-    triangles = _matrix(fields, "faces", 3)
+    triangles = _read_matrix(fields, "faces", 3)
     if len(triangles) == 0:
         raise DefectiveObject("no faces")
     if (triangles % 1).any() or triangles.min() < 0 or triangles.max() >= len(vertices_m):
@@ -454,7 +456,7 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
 # ---------------------------------------------------------------------------------------------- small helpers
 
 
-def _seen_before(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
+def _find_copies(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
     """Whether an object of this key had this shape (v, 3) nearly here; if not, remembers it."""
     center_m = vertices_m.mean(axis=0)
     low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
@@ -482,11 +484,11 @@ def _is_copy(one_m: np.ndarray, other_m: np.ndarray) -> bool:
     )
 
 
-def _plain(label: str) -> str:
+def _convert_to_plain(label: str) -> str:
     return label.replace(" ", "").replace("_", "").lower()
 
 
-def _counts(counts: dict[str, int]) -> str:
+def _count_labels(counts: dict[str, int]) -> str:
     return ", ".join(f"{label} {count}" for label, count in sorted(counts.items()))
 
 

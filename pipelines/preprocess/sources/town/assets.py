@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipelines.preprocess.sources.town.districts import District, Mood
-from pipelines.preprocess.sources.town.land import Frame, Sheet
+from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
 Rect = tuple[float, float, float, float]  # s0, s1, t0, t1
 
@@ -45,7 +45,9 @@ class Site:
     mood: Mood
 
 
-def sizes(rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0) -> np.ndarray:
+def draw_sizes(
+    rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0
+) -> np.ndarray:
     """(n, 3) extents drawn for a kind of thing; l >= w."""
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
@@ -54,8 +56,8 @@ def sizes(rng: np.random.Generator, what: str, n: int, scale: float | tuple[floa
     return drawn
 
 
-def strip(
-    site: Site, frame: Frame, ground_class: str, start: float, end: float, t0: float, t1: float, piece: float
+def plant_strip(
+    site: Site, frame: LocalFrame, ground_class: str, start: float, end: float, t0: float, t1: float, piece: float
 ) -> None:
     """Slabs side by side from s = start to end, about `piece` long."""
     cuts = np.linspace(start, end, max(1, round((end - start) / piece)) + 1).tolist()
@@ -63,7 +65,7 @@ def strip(
         site.sheet.slab(frame, ground_class, [(a, t0), (b, t0), (b, t1), (a, t1)])
 
 
-def cars(site: Site, frame: Frame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
+def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
     """Cars parked at s; most look the way the traffic beside them goes."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
@@ -72,27 +74,29 @@ def cars(site: Site, frame: Frame, s: np.ndarray, t: float, yaw: float = np.pi) 
         "car",
         s + site.rng.normal(0, 0.25, n),
         t + site.rng.normal(0, 0.12, n),
-        sizes(site.rng, "car", n),
+        draw_sizes(site.rng, "car", n),
         turned,
     )
 
 
-def trees(site: Site, frame: Frame, s: np.ndarray, t: np.ndarray, what: str) -> None:
+def plant_trees(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray, what: str) -> None:
     """Ellipsoids at (s, t): crowns of trees start above the ground, bushes on it."""
     n = len(s)
     scale = site.district.tree_scale * site.mood.tree_size if what == "tree" else 1.0
-    size = sizes(site.rng, what, n, scale)
+    size = draw_sizes(site.rng, what, n, scale)
     bottom = site.rng.uniform(0.05, 0.3, n) * size[:, 2] if what == "tree" else 0.0
     site.sheet.boxes(frame, "vegetation", s, t, size, site.rng.uniform(-np.pi, np.pi, n), bottom, ellipsoid=True)
 
 
-def border(site: Site, frame: Frame, s0: float, t0: float, s1: float, t1: float, kind: str, cover: float) -> None:
+def plant_border(
+    site: Site, frame: LocalFrame, s0: float, t0: float, s1: float, t1: float, kind: str, cover: float
+) -> None:
     """A hedge or wall from (s0, t0) to (s1, t1), in pieces; `cover` is the share of its length that stands."""
     length = float(np.hypot(s1 - s0, t1 - t0))
     if length < 1.5:
         return
     mean = 6.2 if kind == "hedge" else 4.4
-    size = sizes(site.rng, kind, int(length * cover / mean + site.rng.random()))
+    size = draw_sizes(site.rng, kind, int(length * cover / mean + site.rng.random()))
     n = len(size)
     if not n:
         return
@@ -112,7 +116,9 @@ def border(site: Site, frame: Frame, s0: float, t0: float, s1: float, t1: float,
     site.sheet.boxes(frame, str(label), s, t, size, yaw)
 
 
-def garden(site: Site, frame: Frame, width: float, depth: float, taken: list[Rect], lush: float = 1.0) -> None:
+def plant_garden(
+    site: Site, frame: LocalFrame, width: float, depth: float, taken: list[Rect], lush: float = 1.0
+) -> None:
     """Shrubs, bushes and trees in a rectangle, outside the `taken` rectangles (s0, s1, t0, t1)."""
     free = width * depth - sum((b - a) * (d - c) for a, b, c, d in taken)
     wanted = (
@@ -128,7 +134,7 @@ def garden(site: Site, frame: Frame, width: float, depth: float, taken: list[Rec
             clear &= (s < a - 0.4) | (s > b + 0.4) | (t < c - 0.4) | (t > d + 0.4)
         s, t = s[clear][:n], t[clear][:n]
         if what == "shrub":
-            size = sizes(site.rng, "shrub", len(s))
+            size = draw_sizes(site.rng, "shrub", len(s))
             turned = np.minimum(s, width - s) < np.minimum(t, depth - t)  # along the nearest border
             yaw = np.pi / 2 * turned + site.rng.normal(0, 0.05, len(s))
             edge = site.rng.random(len(s)) < 0.55
@@ -139,4 +145,4 @@ def garden(site: Site, frame: Frame, width: float, depth: float, taken: list[Rec
                 clear &= (s <= a) | (s >= b) | (t <= c) | (t >= d)
             site.sheet.boxes(frame, "vegetation", s[clear], t[clear], size[clear], yaw[clear])
         else:
-            trees(site, frame, s, t, what)
+            plant_trees(site, frame, s, t, what)

@@ -9,32 +9,48 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipelines.preprocess.sources.town.assets import Site, border, cars, garden, sizes, strip, trees
-from pipelines.preprocess.sources.town.land import Frame
-from pipelines.preprocess.sources.town.plots import GROUND, NOTHING, TERRAIN, House, house_row, paint, plot
-from pipelines.preprocess.sources.town.streets import Block, kerb
+from pipelines.preprocess.sources.town.assets import (
+    Site,
+    draw_sizes,
+    place_cars,
+    plant_border,
+    plant_garden,
+    plant_strip,
+    plant_trees,
+)
+from pipelines.preprocess.sources.town.land import LocalFrame
+from pipelines.preprocess.sources.town.plots import (
+    GROUND,
+    NOTHING,
+    TERRAIN,
+    House,
+    build_house_row,
+    build_plot,
+    paint_plots,
+)
+from pipelines.preprocess.sources.town.streets import CityBlock, trace_kerb
 
 CAR_SLOT_M = 6.2
 BAY_DEPTH_M = 2.3
 
 
-def furnish(site: Site, block: Block) -> None:
+def furnish_block(site: Site, block: CityBlock) -> None:
     """Fills a block: its sides first, then what is left inside."""
-    depths = [_side_depth(site) if faces else (0.0, False, False) for faces in block.streets]
+    depths = [_compute_side_depth(site) if faces else (0.0, False, False) for faces in block.streets]
     for k in range(4):
         if block.streets[k]:
-            _side(site, block, k, depths)
+            _build_side(site, block, k, depths)
     if not any(block.streets):
-        _meadow(site, block)
+        _build_meadow(site, block)
         return
     use = site.rng.random()
     width, height = block.u1 - block.u0, block.v1 - block.v0
     whole = all(block.streets)
     if whole and use < site.district.parks:
-        _park(site, _interior(block, depths))
+        _build_park(site, _fill_interior(block, depths))
     elif whole and use < site.district.parks + site.district.courts and min(width, height) > 45:
-        fill = _garage_court if site.rng.random() < 0.6 else _court
-        fill(site, _interior(block, depths))
+        fill = _build_garage_court if site.rng.random() < 0.6 else _build_court
+        fill(site, _fill_interior(block, depths))
     else:
         rows = (0, 2) if width >= height else (1, 3)
         for k in rows if whole else [block.streets.index(True)]:
@@ -42,28 +58,28 @@ def furnish(site: Site, block: Block) -> None:
             before, own, after = depths[k - 1][0], depths[k][0], depths[(k + 1) % 4][0]
             across = height if k % 2 == 0 else width
             depth = (across - own - depths[(k + 2) % 4][0]) / 2 if whole else across - own
-            house_row(site, frame.at(before, own), length - before - after, depth)
+            build_house_row(site, frame.at(before, own), length - before - after, depth)
 
 
-def _interior(block: Block, depths: list) -> tuple[Frame, float, float]:
+def _fill_interior(block: CityBlock, depths: list) -> tuple[LocalFrame, float, float]:
     """What the sides leave of a block: a frame along its longer side, width, depth."""
     south, east, north, west = (d[0] for d in depths)
     width, depth = block.u1 - block.u0 - west - east, block.v1 - block.v0 - south - north
     if width >= depth:
-        return Frame((block.u0 + west, block.v0 + south), (1.0, 0.0), (0.0, 1.0)), width, depth
-    return Frame((block.u1 - east, block.v0 + south), (0.0, 1.0), (-1.0, 0.0)), depth, width
+        return LocalFrame((block.u0 + west, block.v0 + south), (1.0, 0.0), (0.0, 1.0)), width, depth
+    return LocalFrame((block.u1 - east, block.v0 + south), (0.0, 1.0), (-1.0, 0.0)), depth, width
 
 
 # ---------------------------------------------------------------- sides of a block
 
 
-def _side_depth(site: Site) -> tuple[float, bool, bool]:
+def _compute_side_depth(site: Site) -> tuple[float, bool, bool]:
     """(depth, has a sidewalk, has parking bays) of one side."""
     sidewalk, bay = bool(site.rng.random() < site.district.sidewalks), bool(site.rng.random() < site.district.bays)
     return float(site.rng.uniform(2.25, 3.0)) + BAY_DEPTH_M * bay, sidewalk, bay
 
 
-def _side(site: Site, block: Block, k: int, depths: list) -> None:
+def _build_side(site: Site, block: CityBlock, k: int, depths: list) -> None:
     frame, length, r0, r1 = block.side(k)
     depth, sidewalk, bay = depths[k]
     before, after = depths[k - 1], depths[(k + 1) % 4]
@@ -72,26 +88,26 @@ def _side(site: Site, block: Block, k: int, depths: list) -> None:
     if r0:
         corner_class = "sidewalk" if sidewalk or before[1] else "terrain"
         start = max(r0, depth, before[0]) + 0.5
-        _corner(site, frame, r0, start, depth, before[0], corner_class)
+        _build_corner(site, frame, r0, start, depth, before[0], corner_class)
     if r1:
         end = length - max(r1, depth, after[0]) - 0.5
     if bay:
-        _bays(site, frame, start, end, paved)
-    strip(site, frame, paved, start, end, BAY_DEPTH_M * bay, depth, 9.0 if sidewalk else 18.0)
+        _place_bays(site, frame, start, end, paved)
+    plant_strip(site, frame, paved, start, end, BAY_DEPTH_M * bay, depth, 9.0 if sidewalk else 18.0)
     if not bay:
-        _curb_cars(site, frame, start + 3, end - 3)
-    _furniture(site, frame, start, end, depth, bool(r0))
+        _place_curb_cars(site, frame, start + 3, end - 3)
+    _place_furniture(site, frame, start, end, depth, bool(r0))
 
 
-def _corner(
-    site: Site, frame: Frame, r: float, size: float, depth: float, depth_before: float, ground_class: str
+def _build_corner(
+    site: Site, frame: LocalFrame, r: float, size: float, depth: float, depth_before: float, ground_class: str
 ) -> None:
     """The piece of sidewalk round a kerb of radius r; `size` along both streets."""
     inside = [(0.0, size), (depth_before, size), (depth_before, depth), (size, depth), (size, 0.0)]
-    site.sheet.slab(frame, ground_class, inside + kerb(0.0, 0.0, r))
+    site.sheet.slab(frame, ground_class, inside + trace_kerb(0.0, 0.0, r))
 
 
-def _bays(site: Site, frame: Frame, start: float, end: float, paved: str) -> None:
+def _place_bays(site: Site, frame: LocalFrame, start: float, end: float, paved: str) -> None:
     """Parking bays along the road, with a tree between every few."""
     s = start
     occupancy = min(0.9, 1.5 * site.district.curb_parking * site.mood.cars)
@@ -103,42 +119,42 @@ def _bays(site: Site, frame: Frame, start: float, end: float, paved: str) -> Non
         if slots:
             site.sheet.slab(frame, "parking", [(s, 0), (s + run, 0), (s + run, BAY_DEPTH_M), (s, BAY_DEPTH_M)])
             at = s + (np.arange(slots) + 0.5) * run / slots
-            cars(site, frame, at[site.rng.random(slots) < occupancy], 1.1)
+            place_cars(site, frame, at[site.rng.random(slots) < occupancy], 1.1)
             s += run
         gap = min(end - s, float(site.rng.uniform(2.0, 3.0)))
         if gap > 0:
             site.sheet.slab(frame, paved, [(s, 0), (s + gap, 0), (s + gap, BAY_DEPTH_M), (s, BAY_DEPTH_M)])
             if site.rng.random() < 0.12 * site.district.street_trees_per_100m:
-                trees(site, frame, np.array([s + gap / 2]), np.array([1.1]), "tree")
+                plant_trees(site, frame, np.array([s + gap / 2]), np.array([1.1]), "tree")
         s += gap
 
 
-def _curb_cars(site: Site, frame: Frame, start: float, end: float) -> None:
+def _place_curb_cars(site: Site, frame: LocalFrame, start: float, end: float) -> None:
     slots = int(max(0.0, end - start) / CAR_SLOT_M)
     if not slots:
         return
     at = start + (np.arange(slots) + 0.5) * (end - start) / slots
     taken = site.rng.random(slots) < min(0.85, site.district.curb_parking * site.mood.cars)
-    cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)  # half on the sidewalk as a rule
+    place_cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)  # half on the sidewalk as a rule
     free = at[~taken]
     trucks = free[site.rng.random(len(free)) < site.district.trucks_per_100m * CAR_SLOT_M / 100]
     if len(trucks):
         label = str(site.rng.choice(["truck", "truck", "bus"]))
         site.sheet.boxes(
-            frame, label, trucks[:1], -1.3, sizes(site.rng, "truck", 1, 1.0 + 0.15 * (label == "bus")), np.pi
+            frame, label, trucks[:1], -1.3, draw_sizes(site.rng, "truck", 1, 1.0 + 0.15 * (label == "bus")), np.pi
         )
 
 
-def _furniture(site: Site, frame: Frame, start: float, end: float, depth: float, corner: bool) -> None:
+def _place_furniture(site: Site, frame: LocalFrame, start: float, end: float, depth: float, corner: bool) -> None:
     """Lamps, signs, traffic lights, street trees, people on one side."""
     length = max(0.0, end - start)
     n = site.rng.poisson(site.district.lamps_per_100m * site.mood.furniture * length / 100)
     if n:
         s = start + (np.arange(n) + site.rng.uniform(0.25, 0.75)) * length / n
-        pole = sizes(site.rng, "bigPole", n)
+        pole = draw_sizes(site.rng, "bigPole", n)
         site.sheet.boxes(frame, "bigPole", s, depth - 0.4, pole, site.rng.normal(0, 0.2, n))
         lit = site.rng.random(n) < 0.9
-        head = sizes(site.rng, "lamp", n)[lit]
+        head = draw_sizes(site.rng, "lamp", n)[lit]
         bottom = (pole[lit, 2] - 0.2).clip(2, 6)
         site.sheet.boxes(frame, "lamp", s[lit], np.full(lit.sum(), depth - 0.8), head, np.pi / 2, bottom)
     n = site.rng.poisson(site.district.signs_per_100m * site.mood.furniture * length / 100)
@@ -146,38 +162,38 @@ def _furniture(site: Site, frame: Frame, start: float, end: float, depth: float,
         s = np.where(
             site.rng.random(n) < 0.5, start + site.rng.uniform(0, 4, n), site.rng.uniform(start, max(end, start + 4), n)
         )
-        _sign(site, frame, s, np.full(n, 0.5))
+        _place_sign(site, frame, s, np.full(n, 0.5))
     if corner and site.rng.random() < site.district.lights:
-        site.sheet.boxes(frame, "smallPole", start, 0.5, sizes(site.rng, "bigPole", 1, 0.75))
+        site.sheet.boxes(frame, "smallPole", start, 0.5, draw_sizes(site.rng, "bigPole", 1, 0.75))
         low_high = np.array([2.2, 2.9])
         site.sheet.boxes(
-            frame, "trafficLight", [start] * 2, [0.5] * 2, sizes(site.rng, "trafficLight", 2), np.pi / 2, low_high
+            frame, "trafficLight", [start] * 2, [0.5] * 2, draw_sizes(site.rng, "trafficLight", 2), np.pi / 2, low_high
         )
     n = site.rng.poisson(site.district.street_trees_per_100m * site.mood.trees * length / 100)
     if n:
         s = start + (np.arange(n) + site.rng.uniform(0.2, 0.8, n)) * length / n
-        trees(site, frame, s, np.full(n, depth - 0.6), "tree")
+        plant_trees(site, frame, s, np.full(n, depth - 0.6), "tree")
     groups = site.rng.poisson(site.district.people_per_100m * site.mood.people * length / 100 / 1.6)
     for _ in range(groups):
         n = 1 + site.rng.poisson(0.6)
         s, t = site.rng.uniform(start, end) + site.rng.normal(0, 0.6, n), site.rng.uniform(0.6, depth - 0.3, n)
         site.sheet.boxes(
-            frame, "pedestrian", s, t, sizes(site.rng, "pedestrian", n), site.rng.uniform(-np.pi, np.pi, n)
+            frame, "pedestrian", s, t, draw_sizes(site.rng, "pedestrian", n), site.rng.uniform(-np.pi, np.pi, n)
         )
 
 
-def _sign(site: Site, frame: Frame, s: np.ndarray, t: np.ndarray) -> None:
+def _place_sign(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray) -> None:
     n = len(s)
-    pole = sizes(site.rng, "smallPole", n)
+    pole = draw_sizes(site.rng, "smallPole", n)
     pole[:, 2] = pole[:, 2].clip(2.0, None)
     site.sheet.boxes(frame, "smallPole", s, t, pole)
-    site.sheet.boxes(frame, "trafficSign", s, t, sizes(site.rng, "trafficSign", n), np.pi / 2, pole[:, 2])
+    site.sheet.boxes(frame, "trafficSign", s, t, draw_sizes(site.rng, "trafficSign", n), np.pi / 2, pole[:, 2])
 
 
 # ---------------------------------------------------------------- blocks without rows
 
 
-def _park(site: Site, interior: tuple[Frame, float, float]) -> None:
+def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
     """Lawn with a path through it, trees, a hedge or wall round it, benches, people."""
     frame, width, depth = interior
     middle = float(site.rng.uniform(0.35, 0.65)) * depth
@@ -192,39 +208,45 @@ def _park(site: Site, interior: tuple[Frame, float, float]) -> None:
             for c, d in pairwise(rows):
                 site.sheet.slab(frame, ground_class, [(a, c), (b, c), (b, d), (a, d)])
     path = (0.0, width, middle - 1.2, middle + 1.2)
-    garden(site, frame, width, depth, [path])
+    plant_garden(site, frame, width, depth, [path])
     kind = "hedge" if site.rng.random() < 0.75 else "wall"
     gaps = ((0.5, 0.5, width - 0.5, 0.5), (0.5, depth - 0.5, width - 0.5, depth - 0.5))
     gaps += ((0.5, 0.5, 0.5, middle - 2), (0.5, middle + 2, 0.5, depth - 0.5))
     gaps += ((width - 0.5, 0.5, width - 0.5, middle - 2), (width - 0.5, middle + 2, width - 0.5, depth - 0.5))
     for line in gaps:
-        border(site, frame, *line, kind, 0.8)
+        plant_border(site, frame, *line, kind, 0.8)
     n = 2 + site.rng.poisson(3 * site.mood.things)
     site.sheet.boxes(
         frame,
         "box",
         site.rng.uniform(2, width - 2, n),
         middle + site.rng.choice([-1.6, 1.6], n),
-        sizes(site.rng, "box", n),
+        draw_sizes(site.rng, "box", n),
     )
     n = site.rng.poisson(1.8 * site.mood.people)
     s, t = site.rng.uniform(2, width - 2, n), middle + site.rng.uniform(-1, 1, n)
-    site.sheet.boxes(frame, "pedestrian", s, t, sizes(site.rng, "pedestrian", n), site.rng.uniform(-np.pi, np.pi, n))
+    site.sheet.boxes(
+        frame, "pedestrian", s, t, draw_sizes(site.rng, "pedestrian", n), site.rng.uniform(-np.pi, np.pi, n)
+    )
 
 
-def _meadow(site: Site, block: Block) -> None:
+def _build_meadow(site: Site, block: CityBlock) -> None:
     """Land outside the last street's corner: lawn where the district has lawns, and its vegetation."""
-    frame, width, depth = Frame((block.u0, block.v0), (1.0, 0.0), (0.0, 1.0)), block.u1 - block.u0, block.v1 - block.v0
+    frame, width, depth = (
+        LocalFrame((block.u0, block.v0), (1.0, 0.0), (0.0, 1.0)),
+        block.u1 - block.u0,
+        block.v1 - block.v0,
+    )
     if site.rng.random() < site.district.terrain_back:
         for a in (0.0, width / 2):
-            strip(site, frame, "terrain", 0.0, depth, a, a + width / 2, 20.0)
-    garden(site, frame, width, depth, [])
+            plant_strip(site, frame, "terrain", 0.0, depth, a, a + width / 2, 20.0)
+    plant_garden(site, frame, width, depth, [])
 
 
-def _garage_court(site: Site, interior: tuple[Frame, float, float]) -> None:
+def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
     """Two rows of garages that face each other across a court, hedges behind them, a house at each end."""
     frame, width, depth = interior
-    g = sizes(site.rng, "garage", 1)[0]
+    g = draw_sizes(site.rng, "garage", 1)[0]
     margin, aisle = (depth - 2 * g[0] - 9.0) / 2, 9.0
     start = float(site.rng.uniform(4, max(4.5, width * 0.2)))
     n = int((width - start - 18) / (g[1] + 0.1))
@@ -234,21 +256,23 @@ def _garage_court(site: Site, interior: tuple[Frame, float, float]) -> None:
         here = at[site.rng.random(n) < 0.92]
         size = np.exp(0.02 * site.rng.standard_normal((len(here), 3))) * g
         site.sheet.boxes(frame, "garage", here, low + g[0] / 2, size, np.pi / 2, -0.1)
-    strip(site, frame, "parking", 0.0, end, margin + g[0], margin + g[0] + aisle, end / 2)
+    plant_strip(site, frame, "parking", 0.0, end, margin + g[0], margin + g[0] + aisle, end / 2)
     here = at[site.rng.random(n) < 0.25 * site.mood.cars]
-    cars(site, frame, here, margin + g[0] + 2.7, np.pi / 2)
+    place_cars(site, frame, here, margin + g[0] + 2.7, np.pi / 2)
     for low in (0.0, depth - margin):
         edge = frame.at(0.0, low)
         if margin > 1 and site.rng.random() < site.district.terrain_front:
-            strip(site, frame, "terrain", 0.0, width, low, low + margin, 25.0)
+            plant_strip(site, frame, "terrain", 0.0, width, low, low + margin, 25.0)
         if margin > 1.5:
-            garden(site, edge, width, margin, [])
-        border(site, edge, 0.5, margin / 2, width - 0.5, margin / 2, "hedge", 0.8 * min(1.0, site.district.hedges))
+            plant_garden(site, edge, width, margin, [])
+        plant_border(
+            site, edge, 0.5, margin / 2, width - 0.5, margin / 2, "hedge", 0.8 * min(1.0, site.district.hedges)
+        )
     house = frame.at(end + 1, margin)
-    plot(site, house, width - end - 1, depth - 2 * margin, House(12.0, 16.0, 10.0))
+    build_plot(site, house, width - end - 1, depth - 2 * margin, House(12.0, 16.0, 10.0))
 
 
-def _court(site: Site, interior: tuple[Frame, float, float]) -> None:
+def _build_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
     """A large building behind its car park, with rows of cars, a garden and a wall at the back."""
     frame, width, depth = interior
     lot = float(site.rng.uniform(16.0, 19.0))
@@ -256,11 +280,11 @@ def _court(site: Site, interior: tuple[Frame, float, float]) -> None:
     for a, b in pairwise(beds):
         site.sheet.slab(frame, "terrain", [(a, 0), (b, 0), (b, 2.5), (a, 2.5)])
         site.sheet.slab(frame, "parking", [(a, 2.5), (b, 2.5), (b, 2.5 + lot), (a, 2.5 + lot)])
-    garden(site, frame, width, 2.5, [], lush=2.0)
+    plant_garden(site, frame, width, 2.5, [], lush=2.0)
     slots = np.arange(2.0, width - 2.0, 2.75)
     for t, yaw in ((5.1, np.pi / 2), (lot, -np.pi / 2)):
         taken = site.rng.random(len(slots)) < min(0.8, 0.25 * site.mood.cars)
-        cars(site, frame, slots[taken], t, yaw)
+        place_cars(site, frame, slots[taken], t, yaw)
 
     yard, behind = frame.at(0.0, 2.5 + lot), depth - 2.5 - lot
     forecourt, deep = min(6.0, behind * 0.2), min(20.0, behind * 0.6)
@@ -270,9 +294,9 @@ def _court(site: Site, interior: tuple[Frame, float, float]) -> None:
     site.sheet.boxes(yard, "building", middle, forecourt + deep / 2, big, 0.0, -0.2)
     paved = (house[0] - 2.0, house[1] + 2.0, 0.0, forecourt)
     lawn = TERRAIN if site.rng.random() < site.district.terrain_back else NOTHING
-    paint(site, yard, width, behind, lawn, lawn, behind, [(GROUND, paved), (NOTHING, house)])
-    garden(site, yard, width, behind, [house, paved])
-    border(site, yard, 0.5, behind - 0.6, width - 0.5, behind - 0.6, "wall", 0.8)
-    border(site, yard, width - 0.5, 1.0, width - 0.5, behind - 1, "hedge", 0.7)
+    paint_plots(site, yard, width, behind, lawn, lawn, behind, [(GROUND, paved), (NOTHING, house)])
+    plant_garden(site, yard, width, behind, [house, paved])
+    plant_border(site, yard, 0.5, behind - 0.6, width - 0.5, behind - 0.6, "wall", 0.8)
+    plant_border(site, yard, width - 0.5, 1.0, width - 0.5, behind - 1, "hedge", 0.7)
     if site.rng.random() < 0.2:
-        site.sheet.boxes(yard, "truck", middle, -2.0, sizes(site.rng, "truck", 1), 0.0)
+        site.sheet.boxes(yard, "truck", middle, -2.0, draw_sizes(site.rng, "truck", 1), 0.0)

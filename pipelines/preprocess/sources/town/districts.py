@@ -159,7 +159,7 @@ class Mood:
     people: float
 
 
-def random_mood(rng: np.random.Generator) -> Mood:
+def draw_mood(rng: np.random.Generator) -> Mood:
     """A block's Mood. The gammas' shapes are what makes counts over-dispersed: 1 is widest."""
 
     def gamma(shape: float) -> float:

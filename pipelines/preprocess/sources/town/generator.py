@@ -12,32 +12,30 @@ import numpy as np
 
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
-from pipelines.preprocess.sources.town.assets import Site, sizes
-from pipelines.preprocess.sources.town.blocks import furnish
-from pipelines.preprocess.sources.town.districts import DISTRICTS, Mood, random_mood
+from pipelines.preprocess.sources.town.assets import Site, draw_sizes
+from pipelines.preprocess.sources.town.blocks import furnish_block
+from pipelines.preprocess.sources.town.districts import DISTRICTS, Mood, draw_mood
 from pipelines.preprocess.sources.town.kitti360_writer import write_kitti360
 from pipelines.preprocess.sources.town.land import (
     SLAB_THICKNESS_M,
-    Frame,
     Land,
+    LocalFrame,
     Sheet,
     clip_ears,
-    random_land,
-    subdivided,
+    draw_land,
+    subdivide_outline,
 )
-from pipelines.preprocess.sources.town.reference_statistics import TARGETS, measure, sample_of
-from pipelines.preprocess.sources.town.streets import Route, blocks_of, drive_route, lay_streets, pave
+from pipelines.preprocess.sources.town.reference_statistics import TARGETS
+from pipelines.preprocess.sources.town.streets import Route, lay_streets, list_blocks, pave_streets, plan_route
 
 __all__ = [
     "TARGETS",
     "TEST_SEEDS_START",
     "TOWN_VERSION",
     "TRAIN_SEEDS_START",
-    "measure",
-    "sample_of",
-    "take",
-    "town_drive",
-    "town_plan",
+    "generate_town",
+    "plan_town_parts",
+    "select_poses",
     "write_kitti360",
 ]
 
@@ -79,7 +77,7 @@ TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("
 SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
 
 
-def town_drive(seed: int) -> Drive:
+def generate_town(seed: int) -> Drive:
     """One town and one drive of up to MAX_POSES poses through its streets, at least 10 m apart.
 
     Frames grow along the drive; moving boxes carry the frame they belong to. Which districts a town has follows
@@ -87,7 +85,7 @@ def town_drive(seed: int) -> Drive:
     """
     rng = np.random.default_rng([7301, seed])
     main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
-    land = random_land(rng)
+    land = draw_land(rng)
     columns, rows = (4, 5) if main != "green" else (4, 4)
     split = 3 if rng.random() < 0.5 else columns - 1
     spacing_u = [rng.uniform(*SPACING_M[main if i < split else edge]) for i in range(columns)]
@@ -96,29 +94,29 @@ def town_drive(seed: int) -> Drive:
     border = streets.u_m[split]
 
     sheet = Sheet()
-    pave(streets, sheet)
+    pave_streets(streets, sheet)
     mood_of_town = np.exp(rng.normal(0, [0.04, 0.0, 0.1, 0.1, 0.1, 0.05, 0.08, 0.1, 0.1, 0.1, 0.15, 0.15]))
-    for block in blocks_of(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=48.0):
-        mood = random_mood(rng)
+    for block in list_blocks(streets, cells, lambda u, v: main if u < border else edge, outskirts_m=48.0):
+        mood = draw_mood(rng)
         mood = Mood(*(np.array(list(vars(mood).values())) * mood_of_town).tolist())
-        furnish(Site(sheet, rng, DISTRICTS[block.kind], mood), block)
+        furnish_block(Site(sheet, rng, DISTRICTS[block.kind], mood), block)
 
-    route = drive_route(rng, streets)
-    at = _pose_samples(rng, route, land)
-    frame = np.round(_travelled(route, land)[at] / METRES_PER_FRAME).astype(np.int64)
-    _traffic(sheet, rng, route, at, frame)
+    route = plan_route(rng, streets)
+    at = _sample_poses(rng, route, land)
+    frame = np.round(_measure_travel(route, land)[at] / METRES_PER_FRAME).astype(np.int64)
+    _place_traffic(sheet, rng, route, at, frame)
     return Drive(
         source="town",
         sequence=f"{seed:05d}",
-        **_boxes(sheet, rng, land),
+        **_collect_boxes(sheet, rng, land),
         ground_classes=KITTI_GROUND_CLASSES,
-        ground=_ground(sheet, land),
+        ground=_collect_ground(sheet, land),
         frame=frame,
-        world_from_imu=_poses(rng, route, at, land),
+        world_from_imu=_make_poses(rng, route, at, land),
     )
 
 
-def town_plan(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> list[tuple[int, str, int]]:
+def plan_town_parts(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> list[tuple[int, str, int]]:
     """(town seed, split, scenes taken) of every town, exactly num_train and num_test scenes in all.
 
     Train and test are different towns. Small requests are spread over several towns too; `take` says which poses of
@@ -136,7 +134,7 @@ def town_plan(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> 
     return plan
 
 
-def take(num_poses: int, num_scenes: int) -> np.ndarray:
+def select_poses(num_poses: int, num_scenes: int) -> np.ndarray:
     """(num_scenes,) indices of the poses taken when fewer scenes than poses are wanted: spread over the drive.
 
     Raises ValueError if the drive has too few poses.
@@ -149,17 +147,17 @@ def take(num_poses: int, num_scenes: int) -> np.ndarray:
 # ---------------------------------------------------------------- the drive
 
 
-def _travelled(route: Route, land: Land) -> np.ndarray:
+def _measure_travel(route: Route, land: Land) -> np.ndarray:
     steps = np.linalg.norm(np.diff(land.xy(route.uv), axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _pose_samples(rng: np.random.Generator, route: Route, land: Land) -> np.ndarray:
+def _sample_poses(rng: np.random.Generator, route: Route, land: Land) -> np.ndarray:
     """Samples of the route at which a pose is kept: each at least POSE_SPACING_M from every other, even on revisits."""
     xy = land.xy(route.uv)
     kept: list[int] = []
     points = np.empty((0, 2))
-    distance, wait = _travelled(route, land), 0.0
+    distance, wait = _measure_travel(route, land), 0.0
     for k in range(len(xy)):
         if distance[k] < wait or len(kept) == MAX_POSES:
             continue
@@ -171,7 +169,7 @@ def _pose_samples(rng: np.random.Generator, route: Route, land: Land) -> np.ndar
     return np.array(kept)
 
 
-def _poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -> np.ndarray:
+def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -> np.ndarray:
     """(p, 3, 4) world from IMU: x forward, y right, z down; tilted by about 3 degrees as a car's IMU is."""
     xy = land.xy(route.uv[at])
     ahead = land.direction(route.uv[at], route.heading[at])
@@ -188,7 +186,7 @@ def _poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -
     return np.stack([forward, right, down, np.column_stack([xy, z])], axis=2)
 
 
-def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
+def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
     """Moving boxes: cars ahead and oncoming, a truck or bicycle now and then, people on the sidewalk.
 
     A track appears at a few successive poses; each of its boxes belongs to that pose's frame.
@@ -201,7 +199,7 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
         what = str(rng.choice(["car", "bicycle", "pedestrian", "truck"], p=[0.84, 0.05, 0.08, 0.03]))
         oncoming = rng.random() < 0.6
         count = int(rng.integers(1, 3) if oncoming else rng.integers(2, 6))
-        size = sizes(rng, what, 1)[0]
+        size = draw_sizes(rng, what, 1)[0]
         ahead = float(rng.uniform(12, 55))
         for k in range(first, min(first + count, len(at))):
             sample = at[k] + int(ahead)
@@ -214,7 +212,7 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
                 if not ((np.abs(others @ heading) < 5.6) & (np.abs(others @ left) < 2.0)).any():
                     moving[int(frame[k])].append(place[None])
                     yaw = (np.pi if oncoming else 0.0) + rng.normal(0, 0.02)
-                    here = Frame(tuple(place.tolist()), tuple(heading.tolist()), tuple(left.tolist()))
+                    here = LocalFrame(tuple(place.tolist()), tuple(heading.tolist()), tuple(left.tolist()))
                     sheet.boxes(here, what, 0.0, 0.0, size, yaw, timestamp=frame[k], track=track)
             step = at[min(k + 1, len(at) - 1)] - at[k]
             ahead -= step * {"pedestrian": 0.85, "bicycle": 0.5}.get(what, 1.8 if oncoming else rng.uniform(-0.2, 0.2))
@@ -225,7 +223,7 @@ def _traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarra
 # ---------------------------------------------------------------- board -> world
 
 
-def _boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
+def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
     """The Drive's arrays of primitives: placed on the surface and turned with the streets."""
     rows, label = np.concatenate(sheet.box_rows), np.array(sheet.box_label, dtype=object)
     category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
@@ -266,9 +264,9 @@ def _boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.n
     }
 
 
-def _ground(sheet: Sheet, land: Land) -> SlabGround:
+def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
     """Closed slabs: top SLAB_THICKNESS_M / 2 above the surface, n top vertices, then n bottom ones."""
-    outlines = [subdivided(outline) for _, outline in sheet.slabs]
+    outlines = [subdivide_outline(outline) for _, outline in sheet.slabs]
     xy = land.xy(np.concatenate(outlines))
     middle = land.surface_m(xy)
     vertices, owner, triangles, done, written = [], [], [], 0, 0
@@ -279,13 +277,13 @@ def _ground(sheet: Sheet, land: Land) -> SlabGround:
         top = np.column_stack([xy[here], middle[here] + SLAB_THICKNESS_M / 2])
         vertices += [top, top - [0.0, 0.0, SLAB_THICKNESS_M]]
         owner.append(np.full(2 * n, index))
-        triangles.append(slab_faces(clip_ears(xy[here] - xy[here][0]), n) + written)
+        triangles.append(list_slab_faces(clip_ears(xy[here] - xy[here][0]), n) + written)
         written += 2 * n
     slab_class = np.array([KITTI_GROUND_CLASSES.index(name) for name, _ in sheet.slabs])
     return SlabGround(slab_class, np.concatenate(vertices), np.concatenate(owner), np.concatenate(triangles))
 
 
-def slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
+def list_slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
     """(4 n - 4, 3) faces of a slab in KITTI-360's order: top, bottom, then two per side."""
     top = np.array(top)
     ring = np.arange(n - 1)

@@ -47,7 +47,7 @@ BOX_FACES = np.array(
 )
 
 
-def sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
+def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
     """(63, 3) vertices and (80, 3) faces of the unit sphere: 7 rows from pole to pole of y, 9 columns, first = last."""
     row, column = np.meshgrid(np.arange(7) * np.pi / 6, np.arange(9) * np.pi / 4, indexing="ij")
     vertices = np.stack([-np.sin(row) * np.cos(column), np.cos(row), np.sin(row) * np.sin(column)], axis=-1)
@@ -68,32 +68,32 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     rng = np.random.default_rng([7302, seed])
     name = f"2013_05_28_drive_{int(drive.sequence) % 10_000:04d}_sync"
     boxes, poses = Path(root) / "data_3d_bboxes" / "train_full", Path(root) / "data_poses" / name
-    slabs = _slabs(drive.ground)
+    slabs = _write_slabs(drive.ground)
     boxes.mkdir(parents=True, exist_ok=True)
     poses.mkdir(parents=True, exist_ok=True)
 
-    box_windows = _windows(drive, drive.center_m)
-    slab_windows = _windows(drive, np.array([slab[0].mean(axis=0) for slab in slabs]))
-    sphere, box = sphere_mesh(), (BOX_VERTICES, BOX_FACES)
+    box_windows = _list_windows(drive, drive.center_m)
+    slab_windows = _list_windows(drive, np.array([slab[0].mean(axis=0) for slab in slabs]))
+    sphere, box = make_sphere_mesh(), (BOX_VERTICES, BOX_FACES)
     objects, twice = [], []
     for k in range(len(drive.category)):
         static = drive.timestamp[k] == STATIC
         round_ = drive.category[k] == ELLIPSOID
-        fields = _head(drive, str(drive.label[k]), "instance", k, box_windows[k][0])
-        fields["transform"] = _matrix(_transform(drive, k, 0.5 if round_ else 1.0, rng if defects else None))
-        fields |= _mesh("", *(sphere if round_ else box)) | _mesh("_plane")
-        fields["transform_plane"] = _matrix(None)
+        fields = _write_head(drive, str(drive.label[k]), "instance", k, box_windows[k][0])
+        fields["transform"] = _write_matrix(_transform(drive, k, 0.5 if round_ else 1.0, rng if defects else None))
+        fields |= _write_mesh("", *(sphere if round_ else box)) | _write_mesh("_plane")
+        fields["transform_plane"] = _write_matrix(None)
         objects.append((int(drive.instance_id[k]) if static else len(drive.category) + k, fields))
         if defects and static and len(box_windows[k]) > 1 and rng.random() < 0.5:
-            twice.append(fields | _window(drive, box_windows[k][1]))
+            twice.append(fields | _write_window(drive, box_windows[k][1]))
     for k, (vertices, faces) in enumerate(slabs):
         label = XML_GROUND[drive.ground_classes[drive.ground.slab_class[k]]]
-        fields = _head(drive, label, "stuff", None, slab_windows[k][0]) | _slab(vertices, faces)
+        fields = _write_head(drive, label, "stuff", None, slab_windows[k][0]) | _write_slab(vertices, faces)
         if defects and rng.random() < 0.1:
-            fields |= _mesh("_plane") | {"transform_plane": _matrix(None)}
+            fields |= _write_mesh("_plane") | {"transform_plane": _write_matrix(None)}
         objects.append((2 * len(drive.category) + k, fields))
         if defects and len(slab_windows[k]) > 1 and rng.random() < 0.5:
-            twice.append(fields | _window(drive, slab_windows[k][1]))
+            twice.append(fields | _write_window(drive, slab_windows[k][1]))
     after = 2 * len(drive.category) + len(slabs)
     if defects:
         for label in rng.choice(STRAY_LABELS, 12):
@@ -106,7 +106,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     with open(boxes / f"{name}.xml", "w", encoding="ascii") as file:
         file.write('<?xml version="1.0"?>\n<opencv_storage>\n')
         for number, (index, fields) in enumerate(objects, 1):
-            items = [_element(tag, content) for tag, content in ({"index": str(index)} | fields).items()]
+            items = [_write_element(tag, content) for tag, content in ({"index": str(index)} | fields).items()]
             if defects and rng.random() < 0.2:
                 items = [items[k] for k in rng.permutation(len(items))]
             file.write(f"<object{number}>\n" + "\n".join(items) + f"\n</object{number}>\n")
@@ -118,7 +118,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     (poses / "poses.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _windows(drive: Drive, points_m: np.ndarray) -> list[list[int]]:
+def _list_windows(drive: Drive, points_m: np.ndarray) -> list[list[int]]:
     """The annotation windows an object belongs to: that of its nearest pose, and the next one if that is near too."""
     poses = drive.world_from_imu[:, :2, 3]
     found = []
@@ -130,12 +130,12 @@ def _windows(drive: Drive, points_m: np.ndarray) -> list[list[int]]:
     return found
 
 
-def _window(drive: Drive, window: int) -> dict[str, str]:
+def _write_window(drive: Drive, window: int) -> dict[str, str]:
     last = min(len(drive) - 1, (window + 1) * WINDOW_POSES - 1)
     return {"start_frame": str(drive.frame[window * WINDOW_POSES]), "end_frame": str(drive.frame[last])}
 
 
-def _head(drive: Drive, label: str, category: str, box: int | None, window: int) -> dict[str, str]:
+def _write_head(drive: Drive, label: str, category: str, box: int | None, window: int) -> dict[str, str]:
     moving = box is not None and drive.timestamp[box] != STATIC
     return {
         "label": label,
@@ -146,7 +146,7 @@ def _head(drive: Drive, label: str, category: str, box: int | None, window: int)
         "dynamicSeq": str(drive.instance_id[box]) if moving else "-1",
         "dynamicIdx": str(box) if moving else "-1",
         "timestamp": str(drive.timestamp[box]) if moving else "-1",
-        **_window(drive, window),
+        **_write_window(drive, window),
     }
 
 
@@ -162,7 +162,7 @@ def _transform(drive: Drive, k: int, scale: float, rng: np.random.Generator | No
     return matrix
 
 
-def _slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
+def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
     """Vertices (2 n, 3), n top ones first, and faces (4 n - 4, 3) of each slab."""
     first = np.searchsorted(ground.vertex_slab, np.arange(len(ground.slab_class) + 1))
     owner = ground.vertex_slab[ground.triangles[:, 0]]
@@ -173,21 +173,25 @@ def _slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
     ]
 
 
-def _slab(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
+def _write_slab(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
     """A slab about its own centre, and its mid-plane: the true surface."""
     n = len(vertices) // 2
     matrix = np.eye(4)
     matrix[:3, 3] = vertices.mean(axis=0)
     local = vertices - matrix[:3, 3]
-    fields = {"transform": _matrix(matrix), **_mesh("", local, faces)}
-    return fields | {"transform_plane": _matrix(matrix)} | _mesh("_plane", (local[:n] + local[n:]) / 2, faces[: n - 2])
+    fields = {"transform": _write_matrix(matrix), **_write_mesh("", local, faces)}
+    return (
+        fields
+        | {"transform_plane": _write_matrix(matrix)}
+        | _write_mesh("_plane", (local[:n] + local[n:]) / 2, faces[: n - 2])
+    )
 
 
-def _mesh(suffix: str, vertices: np.ndarray | None = None, faces: np.ndarray | None = None) -> dict[str, str]:
-    return {f"vertices{suffix}": _matrix(vertices), f"faces{suffix}": _matrix(faces, "u")}
+def _write_mesh(suffix: str, vertices: np.ndarray | None = None, faces: np.ndarray | None = None) -> dict[str, str]:
+    return {f"vertices{suffix}": _write_matrix(vertices), f"faces{suffix}": _write_matrix(faces, "u")}
 
 
-def _matrix(values: np.ndarray | None, kind: str = "f") -> str:
+def _write_matrix(values: np.ndarray | None, kind: str = "f") -> str:
     """The inside of an OpenCV matrix element; None is an empty one."""
     rows, cols = (0, 0) if values is None else values.shape
     flat = [] if values is None else values.ravel().tolist()
@@ -195,6 +199,6 @@ def _matrix(values: np.ndarray | None, kind: str = "f") -> str:
     return f"\n<rows>{rows}</rows>\n<cols>{cols}</cols>\n<dt>{kind}</dt>\n<data>\n{data} </data>"
 
 
-def _element(tag: str, content: str) -> str:
+def _write_element(tag: str, content: str) -> str:
     is_matrix = content.startswith("\n<rows>")
     return f'<{tag} type_id="opencv-matrix">{content}</{tag}>' if is_matrix else f"<{tag}>{content}</{tag}>"

@@ -31,8 +31,8 @@ class Land:
         return np.array([[cos, -sin], [sin, cos]])
 
     def _bent(self, uv: np.ndarray) -> np.ndarray:
-        x = uv[..., 0] + _waves(self.bend_u, uv[..., 1])
-        return np.stack([x, uv[..., 1] + _waves(self.bend_v, x)], axis=-1)
+        x = uv[..., 0] + _draw_waves(self.bend_u, uv[..., 1])
+        return np.stack([x, uv[..., 1] + _draw_waves(self.bend_v, x)], axis=-1)
 
     def xy(self, uv: np.ndarray) -> np.ndarray:
         """(..., 2) world x, y of board points (..., 2)."""
@@ -41,8 +41,8 @@ class Land:
     def direction(self, uv: np.ndarray, along: np.ndarray) -> np.ndarray:
         """(..., 2) unit world direction of the board direction `along` (..., 2) at `uv`."""
         bent = self._bent(uv)
-        dx = along[..., 0] + _slopes(self.bend_u, uv[..., 1]) * along[..., 1]
-        dy = along[..., 1] + _slopes(self.bend_v, bent[..., 0]) * dx
+        dx = along[..., 0] + _compute_slopes(self.bend_u, uv[..., 1]) * along[..., 1]
+        dy = along[..., 1] + _compute_slopes(self.bend_v, bent[..., 0]) * dx
         world = np.stack([dx, dy], axis=-1) @ self._turn().T
         return world / np.linalg.norm(world, axis=-1, keepdims=True)
 
@@ -57,15 +57,15 @@ class Land:
         return (self.hills[:, 0] * np.cos(phase)) @ self.hills[:, 1:3]
 
 
-def _waves(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _draw_waves(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
     return (waves[:, 0] * np.sin(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
 
 
-def _slopes(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _compute_slopes(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
     return (waves[:, 0] * waves[:, 1] * np.cos(at[..., None] * waves[:, 1] + waves[:, 2])).sum(axis=-1)
 
 
-def random_land(rng: np.random.Generator) -> Land:
+def draw_land(rng: np.random.Generator) -> Land:
     """Gentle bends (up to about 15 degrees each way) and hills (grade at most 3 %) somewhere in the world."""
 
     def bends() -> np.ndarray:
@@ -84,7 +84,7 @@ def random_land(rng: np.random.Generator) -> Land:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LocalFrame:
     """A place on the board to draw from: s runs along a street, t away from it; axes are unit board directions."""
 
     origin: tuple[float, float]
@@ -96,10 +96,10 @@ class Frame:
         (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
         return np.stack([ou + s * au + t * iu, ov + s * av + t * iv], axis=-1)
 
-    def at(self, s: float, t: float) -> Frame:
+    def at(self, s: float, t: float) -> LocalFrame:
         """The same axes with the origin moved to (s, t)."""
         (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
-        return Frame((ou + s * au + t * iu, ov + s * av + t * iv), self.along, self.inward)
+        return LocalFrame((ou + s * au + t * iu, ov + s * av + t * iv), self.along, self.inward)
 
 
 class Sheet:
@@ -112,14 +112,14 @@ class Sheet:
             np.ndarray
         ] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, ellipsoid, timestamp, track
 
-    def slab(self, frame: Frame, ground_class: str, outline_st: list[tuple[float, float]]) -> None:
+    def slab(self, frame: LocalFrame, ground_class: str, outline_st: list[tuple[float, float]]) -> None:
         """A slab by its outline in (s, t)."""
         st = np.asarray(outline_st, np.float64)
         self.slabs.append((ground_class, frame.uv(st[:, 0], st[:, 1])))
 
     def boxes(
         self,
-        frame: Frame,
+        frame: LocalFrame,
         label: str,
         s: np.ndarray,
         t: np.ndarray,
@@ -143,7 +143,7 @@ class Sheet:
         self.box_rows.append(rows)
 
 
-def outlines_of(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
+def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
     """Outlines of the 4-connected patches of equal value >= 0 in a grid of cells, for slabs that are not rectangles.
 
     cells (len(s) - 1, len(t) - 1) int; s, t: ascending grid lines. Returns (value, outline) per patch; patches must
@@ -196,7 +196,7 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
             return outline
 
 
-def subdivided(outline: np.ndarray) -> np.ndarray:
+def subdivide_outline(outline: np.ndarray) -> np.ndarray:
     """The outline (m, 2) with long edges cut at multiples of EDGE_STEP_M, so that neighbours share the cuts.
 
     Edges parallel to a board axis are cut on the lattice, slanted ones are left alone. Counter-clockwise. Should

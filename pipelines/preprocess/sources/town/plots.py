@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.preprocess.sources.town.assets import Rect, Site, border, cars, garden, sizes
-from pipelines.preprocess.sources.town.land import Frame, outlines_of
+from pipelines.preprocess.sources.town.assets import Rect, Site, draw_sizes, place_cars, plant_border, plant_garden
+from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
 
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
@@ -25,12 +25,12 @@ class House:
     drive_m: float = 0.0
 
 
-def house_row(site: Site, frame: Frame, length: float, depth: float) -> None:
+def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) -> None:
     """Houses side by side along a street, each on its plot; plots give or take a little so that the row is full."""
     planned, used = [], 0.0
     scale = np.array(site.district.house_scale) * [site.mood.room, site.mood.room**0.5, 1.0]
     while True:
-        size = sizes(site.rng, "building", 1, scale)[0]
+        size = draw_sizes(site.rng, "building", 1, scale)[0]
         front, back = (size[0], size[1]) if site.rng.random() < 0.55 else (size[1], size[0])
         garage = bool(site.rng.random() < site.district.garages * site.mood.garages)
         gaps = float((site.rng.uniform(*site.district.gap_m, 2) * site.mood.room**2).sum())
@@ -46,20 +46,20 @@ def house_row(site: Site, frame: Frame, length: float, depth: float) -> None:
     for need, house in planned:
         house = replace(house, front_m=house.front_m * squeeze, drive_m=house.drive_m * squeeze)
         width = need * squeeze + extra
-        plot(site, frame.at(s, 0.0), width, depth, house)
+        build_plot(site, frame.at(s, 0.0), width, depth, house)
         s += width
     if not planned and length > 6:
-        paint(site, frame, length, depth, TERRAIN, TERRAIN, depth, [])
-        garden(site, frame, length, depth, [])
+        paint_plots(site, frame, length, depth, TERRAIN, TERRAIN, depth, [])
+        plant_garden(site, frame, length, depth, [])
 
 
-def plot(site: Site, frame: Frame, width: float, depth: float, house: House) -> None:
+def build_plot(site: Site, frame: LocalFrame, width: float, depth: float, house: House) -> None:
     """One plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles; or an orchard."""
     if site.rng.random() < site.mood.vacant:
         lawn = TERRAIN if site.rng.random() < site.district.terrain_front else NOTHING
-        paint(site, frame, width, depth, lawn, lawn, depth, [])
-        garden(site, frame, width, depth, [])
-        _borders(site, frame, width, depth, 4.0, (0.0, 0.0), False)
+        paint_plots(site, frame, width, depth, lawn, lawn, depth, [])
+        plant_garden(site, frame, width, depth, [])
+        _plant_borders(site, frame, width, depth, 4.0, (0.0, 0.0), False)
         return
     setback = site.district.setback_m * np.exp(0.75 * site.rng.standard_normal())
     setback = float(np.clip(setback, 0.2, max(0.3, depth - house.back_m - 2)))
@@ -67,11 +67,11 @@ def plot(site: Site, frame: Frame, width: float, depth: float, house: House) -> 
     spare = max(0.0, width - house.front_m - house.drive_m)
     s0 = (house.drive_m if drive_left else 0.0) + spare * site.rng.uniform(0.25, 0.75)
     walls = (s0, s0 + house.front_m, setback, setback + house.back_m)
-    _house(site, frame, walls, house)
+    _build_house(site, frame, walls, house)
     painted = [(NOTHING, walls)]
     if house.garage:
         room = house.drive_m + spare / 2
-        painted += _garage(site, frame, width, depth, walls, room, drive_left)
+        painted += _build_garage(site, frame, width, depth, walls, room, drive_left)
     gate = painted[1][1][:2] if len(painted) > 1 else (0.0, 0.0)
     court = bool(site.rng.random() < site.district.court_front)
     if not court and setback > 1.0:
@@ -82,37 +82,37 @@ def plot(site: Site, frame: Frame, width: float, depth: float, house: House) -> 
         deep = min(float(site.rng.uniform(3.0, 6.0)), depth - walls[3] - 0.5)
         left = float(site.rng.uniform(s0, s0 + house.front_m / 2))
         terrace = (left, left + house.front_m / 2, walls[3], walls[3] + deep)
-        if not any(_overlap(terrace, rect) for rect in taken[1:]):
+        if not any(_compute_overlap(terrace, rect) for rect in taken[1:]):
             painted.append((GROUND, terrace))
     front = (PARKING if site.rng.random() < 0.4 else GROUND) if court else TERRAIN
     if not court and site.rng.random() > site.district.terrain_front:
         front = NOTHING
     back = TERRAIN if site.rng.random() < site.district.terrain_back else NOTHING
-    paint(site, frame, width, depth, front, back, setback, painted)
+    paint_plots(site, frame, width, depth, front, back, setback, painted)
     if front == PARKING and setback > 5:
         at = np.arange(walls[0] + 1.5, walls[1] - 1.2, 2.7)
-        cars(site, frame, at[site.rng.random(len(at)) < 0.5 * site.mood.cars], setback - 2.9, np.pi / 2)
+        place_cars(site, frame, at[site.rng.random(len(at)) < 0.5 * site.mood.cars], setback - 2.9, np.pi / 2)
         taken.append((walls[0], walls[1], 0.0, setback))
 
-    garden(site, frame, width, depth, taken)
-    _borders(site, frame, width, depth, setback, gate, court)
-    _belongings(site, frame, walls, gate)
+    plant_garden(site, frame, width, depth, taken)
+    _plant_borders(site, frame, width, depth, setback, gate, court)
+    _place_belongings(site, frame, walls, gate)
 
 
-def _house(site: Site, frame: Frame, walls: Rect, house: House) -> None:
+def _build_house(site: Site, frame: LocalFrame, walls: Rect, house: House) -> None:
     size = np.array([*sorted((house.front_m, house.back_m), reverse=True), house.height_m])
     yaw = (0.0 if house.front_m >= house.back_m else np.pi / 2) + site.rng.normal(0, 0.015)
     site.sheet.boxes(frame, "building", (walls[0] + walls[1]) / 2, (walls[2] + walls[3]) / 2, size, yaw, -0.2)
 
 
-def _garage(
-    site: Site, frame: Frame, width: float, depth: float, walls: Rect, room: float, left: bool
+def _build_garage(
+    site: Site, frame: LocalFrame, width: float, depth: float, walls: Rect, room: float, left: bool
 ) -> list[tuple[int, Rect]]:
     """A garage beside the house where there is room, else behind it, and the driveway to it, perhaps with a car.
 
     Returns what to paint, the driveway first; nothing if the plot is too shallow.
     """
-    size = sizes(site.rng, "garage", 1)[0]
+    size = draw_sizes(site.rng, "garage", 1)[0]
     beside = max(2.8, min(room, size[1]))
     fits = size[1] <= beside
     front = walls[2] + site.rng.uniform(0, 4) + 1.0 if fits else walls[3] + site.rng.uniform(0.3, 2.5)
@@ -123,17 +123,17 @@ def _garage(
     d0, d1 = (0.15, 0.15 + beside) if left else (width - 0.15 - beside, width - 0.15)
     site.sheet.boxes(frame, "garage", (a + b) / 2, front + size[0] / 2, size, np.pi / 2, -0.1)
     if site.rng.random() < site.district.driveway_cars * site.mood.cars and front > 5.2:
-        cars(site, frame, np.array([(d0 + d1) / 2]), float(site.rng.uniform(2.7, front - 2.5)), np.pi / 2)
+        place_cars(site, frame, np.array([(d0 + d1) / 2]), float(site.rng.uniform(2.7, front - 2.5)), np.pi / 2)
     drive = GROUND if site.rng.random() < site.district.rough_drives else PARKING
     return [(drive, (d0, d1, 0.0, front)), (NOTHING, (a, b, front, front + size[0]))]
 
 
-def _overlap(a: Rect, b: Rect) -> bool:
+def _compute_overlap(a: Rect, b: Rect) -> bool:
     return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
 
 
-def _borders(
-    site: Site, frame: Frame, width: float, depth: float, setback: float, gate: tuple[float, float], court: bool
+def _plant_borders(
+    site: Site, frame: LocalFrame, width: float, depth: float, setback: float, gate: tuple[float, float], court: bool
 ) -> None:
     """Hedges and walls round a plot, open at the gate (s0, s1) and before a court; steps and low walls inside."""
     g0, g1 = gate
@@ -152,16 +152,16 @@ def _borders(
     for line in lines:
         pick = site.rng.random() * total
         if pick < hedges:
-            border(site, frame, *line, "hedge", float(site.rng.uniform(0.5, 1.0)))
+            plant_border(site, frame, *line, "hedge", float(site.rng.uniform(0.5, 1.0)))
         elif pick < hedges + walls:
-            border(site, frame, *line, "wall", float(site.rng.uniform(0.5, 1.0)))
+            plant_border(site, frame, *line, "wall", float(site.rng.uniform(0.5, 1.0)))
     n = site.rng.poisson(site.district.walls * site.mood.walls)  # steps, retaining walls, porches
     if n:
         s, t = site.rng.uniform(0.5, width - 0.5, n), site.rng.uniform(0.4, max(0.8, setback + 2), n)
-        site.sheet.boxes(frame, "wall", s, t, sizes(site.rng, "wall", n), np.pi / 2 * site.rng.integers(0, 2, n))
+        site.sheet.boxes(frame, "wall", s, t, draw_sizes(site.rng, "wall", n), np.pi / 2 * site.rng.integers(0, 2, n))
 
 
-def _belongings(site: Site, frame: Frame, walls: Rect, gate: tuple[float, float]) -> None:
+def _place_belongings(site: Site, frame: LocalFrame, walls: Rect, gate: tuple[float, float]) -> None:
     """Bins, boxes and bicycles before the house and beside its drive."""
     s0, s1, t0, _ = walls
     n = site.rng.poisson(site.district.things_per_plot * site.mood.things)
@@ -169,17 +169,17 @@ def _belongings(site: Site, frame: Frame, walls: Rect, gate: tuple[float, float]
         row = (gate[1] if site.rng.random() < 0.5 and gate[1] else site.rng.uniform(s0, s1)) + 1.2 * np.arange(n)
         label = "trashbin" if site.rng.random() < 0.5 else "box"
         aside = max(0.4, t0 * site.rng.uniform(0.1, 0.9))
-        site.sheet.boxes(frame, label, row, aside, sizes(site.rng, label, n), site.rng.normal(0, 0.1, n))
+        site.sheet.boxes(frame, label, row, aside, draw_sizes(site.rng, label, n), site.rng.normal(0, 0.1, n))
     n = site.rng.poisson(site.district.bicycles_per_plot * site.mood.bicycles)
     if n:
         label = "bicycle" if site.rng.random() < 0.8 else "motorcycle"
         row, yaw = site.rng.uniform(s0, s1) + 0.9 * np.arange(n), np.pi / 2 + site.rng.normal(0, 0.1, n)
-        site.sheet.boxes(frame, label, row, max(0.2, t0 - 1.2), sizes(site.rng, "bicycle", n), yaw)
+        site.sheet.boxes(frame, label, row, max(0.2, t0 - 1.2), draw_sizes(site.rng, "bicycle", n), yaw)
 
 
-def paint(
+def paint_plots(
     site: Site,
-    frame: Frame,
+    frame: LocalFrame,
     width: float,
     depth: float,
     front: int,
@@ -196,17 +196,17 @@ def paint(
             a, b, c, d = max(a, 0.0), min(b, width), max(c, low), min(d, high)
             if b - a > 0.05 and d - c > 0.05:
                 here.append((value, a, b, c, d))
-        s = _lines([0.0, width] + [x for r in here for x in r[1:3]])
-        t = _lines([low, high] + [x for r in here for x in r[3:5]])
+        s = _list_lines([0.0, width] + [x for r in here for x in r[1:3]])
+        t = _list_lines([low, high] + [x for r in here for x in r[3:5]])
         cells = np.full((len(s) - 1, len(t) - 1), base)
         ms, mt = (np.array(s)[:-1] + np.array(s)[1:]) / 2, (np.array(t)[:-1] + np.array(t)[1:]) / 2
         for value, a, b, c, d in here:
             cells[np.ix_((ms > a) & (ms < b), (mt > c) & (mt < d))] = value
-        for value, outline in outlines_of(cells, s, t):
+        for value, outline in trace_outlines(cells, s, t):
             site.sheet.slab(frame, CELL_CLASS[value], outline)
 
 
-def _lines(values: list[float]) -> list[float]:
+def _list_lines(values: list[float]) -> list[float]:
     """Sorted distinct grid lines, at least a centimetre apart."""
     out: list[float] = []
     for value in sorted(values):

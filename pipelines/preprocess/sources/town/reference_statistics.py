@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from models.scene import CATEGORIES, DENSITIES, VEGETATION, Scene
-from pipelines.schema.density_labels import density, density_thresholds
+from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 
 COUNT_TOLERANCE = 0.20  # relative; absolute COUNT_TOLERANCE_SMALL where the target is under 3
 COUNT_TOLERANCE_SMALL = 0.5
@@ -82,11 +82,11 @@ class Sample:
 
     def labels(self) -> np.ndarray:
         """(n,) vegetation density of each scene by the sample's own percentiles."""
-        thresholds = density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
-        return density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
+        thresholds = compute_density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
+        return classify_density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
 
 
-def sample_of(scenes: Iterable[Scene]) -> Sample:
+def make_sample(scenes: Iterable[Scene]) -> Sample:
     """The numbers of a stream of scenes; no scene is kept."""
     counts, volumes, areas, size_of = [], [], [], {name: [np.zeros((0, 3))] for name in SIZES_M}
     for scene in scenes:
@@ -103,12 +103,12 @@ def sample_of(scenes: Iterable[Scene]) -> Sample:
     return Sample(np.array(counts), np.array(volumes), np.array(areas), size_m)
 
 
-def measure(scenes: Iterable[Scene] | Sample) -> list[Row]:
+def measure_town(scenes: Iterable[Scene] | Sample) -> list[Row]:
     """Measured beside target for every number of TARGETS; labels come from the scenes' own percentiles.
 
     A category or label that never occurs gives nan and is not ok.
     """
-    sample = scenes if isinstance(scenes, Sample) else sample_of(scenes)
+    sample = scenes if isinstance(scenes, Sample) else make_sample(scenes)
     label = sample.labels()
     rows = []
     for k, which in enumerate(DENSITIES):
@@ -117,18 +117,18 @@ def measure(scenes: Iterable[Scene] | Sample) -> list[Row]:
         for index, name in enumerate(CATEGORIES):
             target = float(COUNTS[name][k])
             tolerance = COUNT_TOLERANCE_SMALL if target < 3 else COUNT_TOLERANCE * target
-            rows.append(_row(f"mean count {name}", which, target, mean[index], tolerance))
+            rows.append(_make_row(f"mean count {name}", which, target, mean[index], tolerance))
         share = sample.areas[here].mean(axis=0) if here.any() else np.full(len(AREAS), np.nan)
         for index, name in enumerate(AREAS):
-            rows.append(_row(f"area share {name}", which, AREAS[name][k], share[index], AREA_TOLERANCE))
+            rows.append(_make_row(f"area share {name}", which, AREAS[name][k], share[index], AREA_TOLERANCE))
     for name, target_size in SIZES_M.items():
         size = sample.size_m[name]
         median = np.median(size, axis=0) if len(size) else np.full(3, np.nan)
         for axis, extent in enumerate(("length", "width", "height")):
             target = float(target_size[axis])
-            rows.append(_row(f"median {extent} {name}", "all", target, median[axis], SIZE_TOLERANCE * target))
+            rows.append(_make_row(f"median {extent} {name}", "all", target, median[axis], SIZE_TOLERANCE * target))
     return rows
 
 
-def _row(what: str, label: str, target: float, measured: float, tolerance: float) -> Row:
+def _make_row(what: str, label: str, target: float, measured: float, tolerance: float) -> Row:
     return Row(what, label, target, float(measured), bool(abs(measured - target) <= tolerance))

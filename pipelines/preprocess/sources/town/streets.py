@@ -12,10 +12,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipelines.preprocess.sources.town.land import Frame, Sheet
+from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
 ROAD_SLAB_M = 30.0  # about 200 m2 of a street
-BOARD = Frame((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+BOARD = LocalFrame((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 ARMS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # east, north, west, south
 
 Node = tuple[int, int]
@@ -48,7 +48,7 @@ class Streets:
 
 
 @dataclass(frozen=True)
-class Block:
+class CityBlock:
     """A rectangle of the board between road edges, and which of its sides face a street.
 
     `streets` are (south, east, north, west); `corners` kerb radii (SW, SE, NE, NW), 0 where no kerb turns.
@@ -62,7 +62,7 @@ class Block:
     corners: tuple[float, float, float, float]
     kind: str
 
-    def side(self, index: int) -> tuple[Frame, float, float, float]:
+    def side(self, index: int) -> tuple[LocalFrame, float, float, float]:
         """Frame of a side (origin at its left end seen from the street's middle, t inward), length, corner radii."""
         u0, u1, v0, v1 = self.u0, self.u1, self.v0, self.v1
         origin, along, inward, length = (
@@ -71,7 +71,7 @@ class Block:
             ((u1, v1), (-1.0, 0.0), (0.0, -1.0), u1 - u0),
             ((u0, v1), (0.0, -1.0), (1.0, 0.0), v1 - v0),
         )[index]
-        return Frame(origin, along, inward), length, self.corners[index], self.corners[(index + 1) % 4]
+        return LocalFrame(origin, along, inward), length, self.corners[index], self.corners[(index + 1) % 4]
 
 
 def lay_streets(
@@ -108,12 +108,12 @@ def lay_streets(
     return Streets(u, v, half_u, half_v, frozenset(edges), corner), sorted(cells)
 
 
-def blocks_of(
+def list_blocks(
     streets: Streets,
     cells: list[tuple[int, int, int, int]],
     kind_at: Callable[[float, float], str],
     outskirts_m: float,
-) -> list[Block]:
+) -> list[CityBlock]:
     """The blocks between the streets, and a ring of blocks of depth outskirts_m outside the outermost ones.
 
     kind_at(u, v) names the district of a board point.
@@ -124,26 +124,30 @@ def blocks_of(
         corners = tuple(streets.corner_m[n] for n in ((i0, j0), (i1, j0), (i1, j1), (i0, j1)))
         kind = kind_at((u[i0] + u[i1]) / 2, (v[j0] + v[j1]) / 2)
         box = (u[i0] + hu[i0], u[i1] - hu[i1], v[j0] + hv[j0], v[j1] - hv[j1])
-        blocks.append(Block(*map(float, box), (True,) * 4, corners, kind))
+        blocks.append(CityBlock(*map(float, box), (True,) * 4, corners, kind))
     south, north, west, east = v[0] - hv[0], v[-1] + hv[-1], u[0] - hu[0], u[-1] + hu[-1]
     d, none = outskirts_m, (0.0,) * 4
     for i in range(len(u) - 1):
         left, right = (west if i == 0 else u[i]), (east if i == len(u) - 2 else u[i + 1])
         middle = (u[i] + u[i + 1]) / 2
-        blocks.append(Block(left, right, south - d, south, (False, False, True, False), none, kind_at(middle, v[0])))
-        blocks.append(Block(left, right, north, north + d, (True, False, False, False), none, kind_at(middle, v[-1])))
+        blocks.append(
+            CityBlock(left, right, south - d, south, (False, False, True, False), none, kind_at(middle, v[0]))
+        )
+        blocks.append(
+            CityBlock(left, right, north, north + d, (True, False, False, False), none, kind_at(middle, v[-1]))
+        )
     for j in range(len(v) - 1):
         low, high = (south if j == 0 else v[j]), (north if j == len(v) - 2 else v[j + 1])
         middle = (v[j] + v[j + 1]) / 2
-        blocks.append(Block(west - d, west, low, high, (False, True, False, False), none, kind_at(u[0], middle)))
-        blocks.append(Block(east, east + d, low, high, (False, False, False, True), none, kind_at(u[-1], middle)))
+        blocks.append(CityBlock(west - d, west, low, high, (False, True, False, False), none, kind_at(u[0], middle)))
+        blocks.append(CityBlock(east, east + d, low, high, (False, False, False, True), none, kind_at(u[-1], middle)))
     for left, right, i in ((west - d, west, 0), (east, east + d, -1)):
         for low, high, j in ((south - d, south, 0), (north, north + d, -1)):
-            blocks.append(Block(left, right, low, high, (False,) * 4, none, kind_at(u[i], v[j])))
-    return [Block(*map(float, (b.u0, b.u1, b.v0, b.v1)), b.streets, b.corners, b.kind) for b in blocks]
+            blocks.append(CityBlock(left, right, low, high, (False,) * 4, none, kind_at(u[i], v[j])))
+    return [CityBlock(*map(float, (b.u0, b.u1, b.v0, b.v1)), b.streets, b.corners, b.kind) for b in blocks]
 
 
-def pave(streets: Streets, sheet: Sheet) -> None:
+def pave_streets(streets: Streets, sheet: Sheet) -> None:
     """Road slabs of all streets and junctions; their edges abut exactly."""
     for a, b in sorted(streets.edges):
         axis = 0 if a[1] == b[1] else 1
@@ -156,10 +160,10 @@ def pave(streets: Streets, sheet: Sheet) -> None:
             corners = [(low, middle - half), (high, middle - half), (high, middle + half), (low, middle + half)]
             sheet.slab(BOARD, "road", corners if axis == 0 else [(y, x) for x, y in corners])
     for node in sorted(streets.corner_m):
-        sheet.slab(BOARD, "road", junction_outline(streets, node))
+        sheet.slab(BOARD, "road", trace_junction(streets, node))
 
 
-def junction_outline(streets: Streets, node: Node) -> list[tuple[float, float]]:
+def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
     """Counter-clockwise outline of a junction: kerbs turn on aside circles between neighbouring arms."""
     (u, v), arms, r = streets.at(node), streets.arms(node), streets.corner_m[node]
     hu, hv = streets.half_u_m[node[0]], streets.half_v_m[node[1]]
@@ -170,14 +174,14 @@ def junction_outline(streets: Streets, node: Node) -> list[tuple[float, float]]:
         along_first = (hu + r, hv) if quadrant % 2 == 0 else (hu, hv + r)
         along_second = (hu, hv + r) if quadrant % 2 == 0 else (hu + r, hv)
         if first and second:
-            local = kerb(hu, hv, r)[:: 1 if quadrant % 2 == 0 else -1]
+            local = trace_kerb(hu, hv, r)[:: 1 if quadrant % 2 == 0 else -1]
         else:
             local = [along_first] * first + [(hu, hv)] + [along_second] * second
         points += [(float(u + su * x), float(v + sv * y)) for x, y in local]
     return points
 
 
-def kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
+def trace_kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
     """A quarter circle of radius r round a block's corner, as seen from a junction with half-widths hu and hv."""
     angle = np.linspace(1.5 * np.pi, np.pi, 5)  # from the arm along u to the arm along v
     return list(zip((hu + r + r * np.cos(angle)).tolist(), (hv + r + r * np.sin(angle)).tolist(), strict=True))
@@ -192,14 +196,14 @@ class Route:
     lane_m: np.ndarray  # (k,) distance from the lane's middle to the street's
 
 
-def drive_route(rng: np.random.Generator, streets: Streets) -> Route:
+def plan_route(rng: np.random.Generator, streets: Streets) -> Route:
     """A route on the right-hand lanes that passes every street at least once."""
     nodes = _walk(rng, streets)
     uv, lane = [], []
     for k, (a, b) in enumerate(pairwise(nodes)):
-        start, end, aside = _lane(streets, a, b)
+        start, end, aside = _compute_lane(streets, a, b)
         if k:
-            uv.append(_turn(uv[-1][-1], _direction(nodes[k - 1], a), start, _direction(a, b)))
+            uv.append(_compute_turn(uv[-1][-1], _compute_direction(nodes[k - 1], a), start, _compute_direction(a, b)))
             lane.append(np.full(len(uv[-1]), aside))
         steps = max(2, int(np.abs(end - start).max()))
         uv.append(start + (end - start) * np.linspace(0, 1, steps)[:, None])
@@ -209,20 +213,20 @@ def drive_route(rng: np.random.Generator, streets: Streets) -> Route:
     return Route(uv, ahead / np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9), lane)
 
 
-def _direction(a: Node, b: Node) -> np.ndarray:
+def _compute_direction(a: Node, b: Node) -> np.ndarray:
     return np.sign(np.array(b, float) - np.array(a, float))
 
 
-def _lane(streets: Streets, a: Node, b: Node) -> tuple[np.ndarray, np.ndarray, float]:
+def _compute_lane(streets: Streets, a: Node, b: Node) -> tuple[np.ndarray, np.ndarray, float]:
     axis = 0 if a[1] == b[1] else 1
-    along = _direction(a, b)
+    along = _compute_direction(a, b)
     aside = float(streets.half_v_m[a[1]] if axis == 0 else streets.half_u_m[a[0]]) * 0.28
     right = np.array([along[1], -along[0]]) * aside
     start = streets.at(a) + along * streets.reach(a, axis) + right
     return start, streets.at(b) - along * streets.reach(b, axis) + right, aside
 
 
-def _turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: np.ndarray) -> np.ndarray:
+def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: np.ndarray) -> np.ndarray:
     """(k, 2) a parabola from one lane to the next; U-turns become a straight jump."""
     knee = start + heading * ((end - start) @ heading) if abs(heading @ out) < 0.5 else (start + end) / 2
     steps = max(3, int(np.linalg.norm(end - start)))
@@ -245,17 +249,17 @@ def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
         if new:
             weight = np.ones(len(new))
             if len(walk) > 1:
-                weight += [2.0 * (_direction(walk[-2], here) @ _direction(here, n) > 0.5) for n in new]
+                weight += [2.0 * (_compute_direction(walk[-2], here) @ _compute_direction(here, n) > 0.5) for n in new]
             path = [new[rng.choice(len(new), p=weight / weight.sum())]]
         else:
-            path = _shortest(near, here, {n for edge in fresh for n in edge}, walk[-2] if len(walk) > 1 else None)
+            path = _find_shortest(near, here, {n for edge in fresh for n in edge}, walk[-2] if len(walk) > 1 else None)
         for there in path:
             fresh.discard((min(walk[-1], there), max(walk[-1], there)))
             walk.append(there)
     return walk
 
 
-def _shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], behind: Node | None) -> list[Node]:
+def _find_shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], behind: Node | None) -> list[Node]:
     """The shortest path from start to the nearest goal, not beginning with a U-turn; excludes start."""
     came: dict[Node, Node] = {n: start for n in near[start] if n != behind}
     queue = deque(came)

@@ -1,0 +1,77 @@
+"""Samplers by name: schedulers of diffusers, which is imported only when one of them is built.
+
+DDPM, the paper's sampler, is `diffusion.sample` and needs the numbers of its config only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from diffusers import SchedulerMixin
+
+# The paper's noise schedule in the words of diffusers' DDPMScheduler.
+DDPM_CONFIG = {
+    "num_train_timesteps": 1000,
+    "beta_start": 0.0015,
+    "beta_end": 0.015,
+    "beta_schedule": "linear",
+    "trained_betas": None,
+    "variance_type": "fixed_small",
+    "clip_sample": False,
+    "clip_sample_range": 1.0,
+    "prediction_type": "epsilon",
+    "thresholding": False,
+    "dynamic_thresholding_ratio": 0.995,
+    "sample_max_value": 1.0,
+    "timestep_spacing": "leading",
+    "steps_offset": 0,
+    "rescale_betas_zero_snr": False,
+}
+
+# Class and options of each sampler. DPM-Solver++ takes timesteps that are uniform in the log of signal to noise: on a
+# Gaussian of a tenth of the latent's deviation, 20 of them keep 93 % of it, 20 that are uniform in time keep 31 %.
+SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "ddpm": ("DDPMScheduler", {"timestep_spacing": "leading"}),
+    "ddim": ("DDIMScheduler", {"timestep_spacing": "leading"}),
+    "dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}),
+    "sde-dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}),
+}
+
+
+@dataclass(frozen=True)
+class SchedulerConfig:
+    """A scheduler of diffusers by the name of its class and its options."""
+
+    class_name: str
+    config: dict[str, Any]
+
+    @classmethod
+    def ddpm(cls) -> SchedulerConfig:
+        """The paper's noise schedule and sampler."""
+        return cls("DDPMScheduler", dict(DDPM_CONFIG))
+
+    def with_sampler(self, name: str) -> SchedulerConfig:
+        """The same noise schedule with another sampler.
+
+        Raises:
+            ValueError: The name is not in `SAMPLERS`.
+        """
+        if name not in SAMPLERS:
+            raise ValueError(f"sampler {name!r} is unknown, expected one of: {', '.join(SAMPLERS)}")
+        class_name, options = SAMPLERS[name]
+        return SchedulerConfig(class_name, self.config | options)
+
+    def build(self) -> SchedulerMixin:
+        """Import diffusers and build the scheduler.
+
+        Raises:
+            ValueError: diffusers has no scheduler of this name.
+        """
+        import diffusers  # costs seconds; DDPM never gets here
+
+        kind = getattr(diffusers, self.class_name, None)
+        if not (isinstance(kind, type) and issubclass(kind, diffusers.SchedulerMixin)):
+            raise ValueError(f"scheduler {self.class_name!r} is not one of diffusers'")
+        return kind.from_config(self.config)

@@ -1,0 +1,169 @@
+"""Convolutional encoder and decoder of image autoencoders (Rombach et al., 2022), for the ground branch.
+
+Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`, and outputs agree to the
+last bit (tests/unit/test_convolutional.py). They stand here because importing diffusers costs each process two to three
+seconds.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+EPSILON = 1e-6  # of every group normalisation
+
+
+class ResnetBlock(nn.Module):
+    """Two normalised 3 x 3 convolutions beside a skip connection, which is 1 x 1 if the number of channels changes."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm_groups: int) -> None:
+        super().__init__()
+        self.norm1 = nn.GroupNorm(norm_groups, in_channels, EPSILON)
+        self.conv1 = nn.Conv2d(in_channels, out_channels, 3, padding=1)
+        self.norm2 = nn.GroupNorm(norm_groups, out_channels, EPSILON)
+        self.conv2 = nn.Conv2d(out_channels, out_channels, 3, padding=1)
+        self.conv_shortcut = nn.Conv2d(in_channels, out_channels, 1) if in_channels != out_channels else None
+
+    def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h w"]:
+        y = self.conv1(F.silu(self.norm1(x)))
+        y = self.conv2(F.silu(self.norm2(y)))
+        if self.conv_shortcut is not None:
+            x = self.conv_shortcut(x.contiguous() if self.training else x)  # DDP expects the strides of a dense input
+        return x + y
+
+
+class CellAttention(nn.Module):
+    """Single-head self-attention over all cells of a feature map, with a skip connection."""
+
+    def __init__(self, channels: int, norm_groups: int) -> None:
+        super().__init__()
+        self.group_norm = nn.GroupNorm(norm_groups, channels, EPSILON)
+        self.to_q = nn.Linear(channels, channels)
+        self.to_k = nn.Linear(channels, channels)
+        self.to_v = nn.Linear(channels, channels)
+        self.to_out = nn.ModuleList([nn.Linear(channels, channels)])
+
+    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h w"]:
+        cells = self.group_norm(x.flatten(2)).transpose(1, 2)
+        query, key, value = (layer(cells)[:, None] for layer in (self.to_q, self.to_k, self.to_v))
+        attended = F.scaled_dot_product_attention(query, key, value)[:, 0]
+        return self.to_out[0](attended).transpose(1, 2).reshape(x.shape) + x
+
+
+class Downsample(nn.Module):
+    """Halve the resolution: a 3 x 3 convolution of stride 2, padded below and to the right."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, stride=2)
+
+    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h2 w2"]:
+        return self.conv(F.pad(x, (0, 1, 0, 1)))
+
+
+class Upsample(nn.Module):
+    """Double the resolution: nearest neighbours, then a 3 x 3 convolution."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h2 w2"]:
+        return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
+
+
+class DownBlock(nn.Module):
+    """One residual block, then a `Downsample` unless it is the last block."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm_groups: int, last: bool) -> None:
+        super().__init__()
+        self.resnets = nn.ModuleList([ResnetBlock(in_channels, out_channels, norm_groups)])
+        self.downsamplers = nn.ModuleList([] if last else [Downsample(out_channels)])
+
+    def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h2 w2"]:
+        for layer in (*self.resnets, *self.downsamplers):
+            x = layer(x)
+        return x
+
+
+class UpBlock(nn.Module):
+    """Two residual blocks, then an `Upsample` unless it is the last block."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm_groups: int, last: bool) -> None:
+        super().__init__()
+        self.resnets = nn.ModuleList(ResnetBlock(c, out_channels, norm_groups) for c in (in_channels, out_channels))
+        self.upsamplers = nn.ModuleList([] if last else [Upsample(out_channels)])
+
+    def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h2 w2"]:
+        for layer in (*self.resnets, *self.upsamplers):
+            x = layer(x)
+        return x
+
+
+class MidBlock(nn.Module):
+    """Two residual blocks with attention between them, if there is any."""
+
+    def __init__(self, channels: int, norm_groups: int, attention: bool) -> None:
+        super().__init__()
+        first = ResnetBlock(channels, channels, norm_groups)
+        self.attentions = nn.ModuleList([CellAttention(channels, norm_groups)] if attention else [])
+        self.resnets = nn.ModuleList([first, ResnetBlock(channels, channels, norm_groups)])
+
+    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h w"]:
+        first, second = self.resnets
+        for layer in (first, *self.attentions, second):
+            x = layer(x)
+        return x
+
+
+class ConvolutionalEncoder(nn.Module):
+    """Maps (batch, in_channels, H, W) -> (batch, out_channels, h, w); all blocks but the last halve the resolution."""
+
+    def __init__(
+        self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
+    ) -> None:
+        super().__init__()
+        self.conv_in = nn.Conv2d(in_channels, channels[0], 3, padding=1)
+        self.down_blocks = nn.ModuleList(
+            DownBlock(before, after, norm_groups, last=k == len(channels) - 1)
+            for k, (before, after) in enumerate(pairwise((channels[0], *channels)))
+        )
+        self.mid_block = MidBlock(channels[-1], norm_groups, attention)
+        self.conv_norm_out = nn.GroupNorm(norm_groups, channels[-1], EPSILON)
+        self.conv_out = nn.Conv2d(channels[-1], out_channels, 3, padding=1)
+
+    def forward(self, maps: Float[Tensor, "batch c1 rows cols"]) -> Float[Tensor, "batch c2 h w"]:
+        x = self.conv_in(maps)
+        for block in self.down_blocks:
+            x = block(x)
+        return self.conv_out(F.silu(self.conv_norm_out(self.mid_block(x))))
+
+
+class ConvolutionalDecoder(nn.Module):
+    """Maps (batch, in_channels, h, w) -> (batch, out_channels, H, W); all blocks but the last double the resolution."""
+
+    def __init__(
+        self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
+    ) -> None:
+        super().__init__()
+        upward = tuple(reversed(channels))
+        self.conv_in = nn.Conv2d(in_channels, upward[0], 3, padding=1)
+        self.up_blocks = (
+            nn.ModuleList()
+        )  # before the middle in the order of parameters, after it in that of random numbers
+        self.mid_block = MidBlock(upward[0], norm_groups, attention)
+        self.up_blocks.extend(
+            UpBlock(before, after, norm_groups, last=k == len(upward) - 1)
+            for k, (before, after) in enumerate(pairwise((upward[0], *upward)))
+        )
+        self.conv_norm_out = nn.GroupNorm(norm_groups, upward[-1], EPSILON)
+        self.conv_out = nn.Conv2d(upward[-1], out_channels, 3, padding=1)
+
+    def forward(self, latent: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 rows cols"]:
+        x = self.mid_block(self.conv_in(latent))
+        for block in self.up_blocks:
+            x = block(x)
+        return self.conv_out(F.silu(self.conv_norm_out(x)))
