@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import torch
 import torch.nn.functional as F
@@ -83,6 +83,9 @@ class DiT(ConfiguredModel):
     not carry its input's noise through all its layers.
     """
 
+    positions: Tensor
+    noise_shares: Tensor
+
     @register_to_config
     def __init__(
         self,
@@ -130,16 +133,17 @@ class DiT(ConfiguredModel):
                 nn.init.xavier_uniform_(module.weight)
                 nn.init.zeros_(module.bias)
         nn.init.xavier_uniform_(self.patch_in.weight.view(len(self.patch_in.weight), -1))
-        nn.init.zeros_(self.patch_in.bias)
-        for layer in (self.label_embedding, self.timestep_mlp[0], self.timestep_mlp[2]):
-            nn.init.normal_(layer.weight, std=0.02)
+        nn.init.zeros_(cast(Tensor, self.patch_in.bias))
+        first, _, second = self.timestep_mlp
+        for layer in (self.label_embedding, first, second):
+            nn.init.normal_(cast(Tensor, layer.weight), std=0.02)
         for layer in (*self.list_modulations(), self.patch_out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
     def list_modulations(self) -> list[nn.Linear]:
         """The layers that the condition goes through: one per block, and the output's."""
-        return [*(block.modulation for block in self.blocks), self.modulation]
+        return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
 
     @property
     def null_label(self) -> int:

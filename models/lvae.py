@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -59,35 +59,38 @@ class LayoutVAE(ConfiguredModel):
         super().__init__()
         if branches not in BRANCHES:
             raise ValueError(f"LayoutVAE: branches is {branches!r}, expected one of {BRANCHES}")
-        ground, objects = _parse_options(GroundConfig, ground), _parse_options(ObjectConfig, objects)
-        if objects.decoder not in ("detr", "cells"):
-            raise ValueError(f"LayoutVAE: decoder is {objects.decoder!r}, expected 'detr' (the paper's) or 'cells'")
+        ground_config: GroundConfig = _parse_options(GroundConfig, ground)
+        object_config: ObjectConfig = _parse_options(ObjectConfig, objects)
+        if object_config.decoder not in ("detr", "cells"):
+            raise ValueError(
+                f"LayoutVAE: decoder is {object_config.decoder!r}, expected 'detr' (the paper's) or 'cells'"
+            )
         spec = LayoutSpec.from_dict(layout)
-        if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground.cell_px:
-            raise ValueError(f"LayoutVAE needs a square grid divisible by {ground.cell_px}, got {spec.grid}")
-        size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
+        if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground_config.cell_px:
+            raise ValueError(f"LayoutVAE needs a square grid divisible by {ground_config.cell_px}, got {spec.grid}")
+        size, num_classes = spec.grid.rows // ground_config.cell_px, len(spec.ground_classes)
         # A cell's proposals give positions as fractions of the cell; losses therefore measure metres in cells. The
         # queries of the paper's DETR search the whole crop and are trained on normalised numbers.
         self.feature_unit = (
             spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
-            if objects.decoder == "cells"
+            if object_config.decoder == "cells"
             else (1.0,) * FEATURES
         )
         self.latent_shape = (latent_channels * (2 if branches == "both" else 1), size, size)  # of the joint latent
         seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
-            self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
-            self.ground_decoder = GroundDecoder(num_classes, seen, ground, shortcut)
+            self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground_config, shortcut)
+            self.ground_decoder = GroundDecoder(num_classes, seen, ground_config, shortcut)
             with torch.no_grad():
                 logvar = SOLVED_LOGVAR if shortcut else INITIAL_LOGVAR
-                self.ground_encoder.net.conv_out.bias[latent_channels:] = logvar
+                cast(Tensor, self.ground_encoder.net.conv_out.bias)[latent_channels:] = logvar
         if branches != "ground":
-            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, objects, shortcut)
-            if objects.decoder == "detr":
-                self.object_decoder = ObjectDecoder(spec.slots, seen, size, objects)
+            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, object_config, shortcut)
+            if object_config.decoder == "detr":
+                self.object_decoder = ObjectDecoder(spec.slots, seen, size, object_config)
             else:
-                self.object_decoder = CellDecoder(spec.slots, seen, size, objects)
+                self.object_decoder = CellDecoder(spec.slots, seen, size, object_config)
             with torch.no_grad():
                 self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,9 +46,6 @@ from models.sampling.schedulers import SchedulerConfig
 from models.scene import Scene
 from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene, make_layout_batch
 
-if TYPE_CHECKING:
-    from diffusers import SchedulerMixin
-
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 
@@ -85,7 +82,7 @@ class PrITTIPipeline:
     Args:
         lvae: Layout VAE.
         dit: Diffusion transformer on its latents.
-        scheduler: Noise schedule and sampler (default: the paper's DDPM).
+        scheduler: A SchedulerConfig or a scheduler of diffusers: noise schedule and sampler (default: the paper's DDPM).
         noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`); not in
             the paper.
         existence_threshold: A scene keeps the primitives whose existence probability is higher; 0.3 in the paper.
@@ -98,7 +95,7 @@ class PrITTIPipeline:
         self,
         lvae: LayoutVAE,
         dit: DiT,
-        scheduler: SchedulerConfig | SchedulerMixin | None = None,
+        scheduler: Any = None,
         noise_scaling: float = 1.0,
         existence_threshold: float = EXISTENCE_THRESHOLD,
     ) -> None:
@@ -153,14 +150,14 @@ class PrITTIPipeline:
         write_config(type(self).__name__, index | self.config, path / INDEX_NAME)
 
     @property
-    def scheduler(self) -> SchedulerMixin:
+    def scheduler(self) -> Any:
         """The sampler as an object of diffusers, which is imported on first use."""
         if self._scheduler is None:
             self._scheduler = self.scheduler_config.build()
         return self._scheduler
 
     @scheduler.setter
-    def scheduler(self, scheduler: SchedulerConfig | SchedulerMixin) -> None:
+    def scheduler(self, scheduler: Any) -> None:
         if isinstance(scheduler, SchedulerConfig):
             self.scheduler_config, self._scheduler = scheduler, None
             return
@@ -226,7 +223,8 @@ class PrITTIPipeline:
         """Shift and scale of the latents, (c, 1, 1) each."""
         channels = self.dit.config.channels
         shift, scale = self.dit.config.shift or [0.0] * channels, self.dit.config.scale or [1.0] * channels
-        return tuple(torch.tensor(values, device=self.device)[:, None, None] for values in (shift, scale))
+        shift, scale = (torch.tensor(values, device=self.device)[:, None, None] for values in (shift, scale))
+        return shift, scale
 
     @torch.no_grad()
     def encode(self, scenes: Sequence[Scene]) -> Float[Tensor, "b c h w"]:

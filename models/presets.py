@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from models.vae.config import GroundConfig, LayoutVAEConfig, ObjectConfig
 
@@ -37,7 +37,8 @@ class LVAEPreset:
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
-QUICK = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "warmup_steps": 50, "grad_clip": 1.0}
+LOWER_RATE: dict[str, Any] = {"learning_rate": 1e-3}
+QUICK: dict[str, Any] = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "warmup_steps": 50, "grad_clip": 1.0}
 
 # The paper's networks (supplement B.2), and small ones that read primitives off latent cells.
 PAPER = LayoutVAEConfig(32, GroundConfig((64, 128, 256, 512), 32), ObjectConfig(512, 6, 8, 1024, 1024))
@@ -58,7 +59,7 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000),
     # The paper's object encoder with the town's ground branch and cells: the same latent at a fraction of the cost.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,
-                                 **QUICK | {"learning_rate": 1e-3}),
+                                 **(QUICK | LOWER_RATE)),
 }
 # fmt: on
 
@@ -95,7 +96,7 @@ class DiTPreset:
 
 
 SMALL_DIT = DiTConfig(2, 6, 256, 4, prediction="v_prediction")
-TOWN_TRAINING = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
+TOWN_TRAINING: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-3, "ema_decay": 0.999}
 
 # fmt: off
 DIT_PRESETS: dict[str, DiTPreset] = {

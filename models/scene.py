@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -90,7 +91,7 @@ class Grid:
             stop = max(start, min(count, others - ahead))
             here.append(slice(start, stop))
             there.append(slice(start + ahead, stop + ahead))
-        return tuple(here), tuple(there)
+        return (here[0], here[1]), (there[0], there[1])
 
     def upsample_cells(self, cells: np.ndarray) -> np.ndarray:
         """(rows, cols): each of the coarser (h, w) cells as its block of pixels. h divides rows and w cols."""
@@ -143,6 +144,9 @@ def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     return np.stack(rows, -2)
 
 
+_UNSET = cast(np.ndarray, None)  # replaced by the default that fits the number of primitives
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """One scene. n primitives, G ground classes on an H x W grid; metres, radians, scene frame.
@@ -165,10 +169,10 @@ class Scene:
     height_m: np.ndarray  # (G, H, W) float32
     occupied: np.ndarray  # (G, H, W) bool
     grid: Grid = field(default_factory=Grid)
-    existence: np.ndarray | None = None  # (n,) float32, 1 for annotated primitives
-    heading_rad: np.ndarray | None = None  # (n,) float32
-    instance_id: np.ndarray | None = None  # (n,) int64, -1 where there is none
-    label: np.ndarray | None = None  # (n,) str, the dataset's own class name
+    existence: np.ndarray = _UNSET  # (n,) float32; default: 1, as for annotated primitives
+    heading_rad: np.ndarray = _UNSET  # (n,) float32; default: NaN
+    instance_id: np.ndarray = _UNSET  # (n,) int64; default: -1, none
+    label: np.ndarray = _UNSET  # (n,) str, the dataset's own class name; default: the category's
     world_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_yaw_rad: float = 0.0
     world_from_imu: np.ndarray | None = None
@@ -288,6 +292,6 @@ def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> S
     return replace(like, height_m=height, occupied=occupied, **concatenate_primitives(parts))
 
 
-def concatenate_primitives(scenes: Sequence[Scene]) -> dict[str, np.ndarray]:
+def concatenate_primitives(scenes: Sequence[Scene]) -> dict[str, Any]:
     """The primitives of all scenes, one after the other, as fields of a Scene."""
     return {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in PER_PRIMITIVE}

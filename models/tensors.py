@@ -39,8 +39,8 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
     Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
     nearest. Raises ValueError if the grids do not cover the same ground, or if the ratio of pixels is not whole.
     """
-    covers = [(g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid)]
-    if not np.allclose(*covers):
+    covered, wanted = ((g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid))
+    if not np.allclose(covered, wanted):
         raise ValueError(f"the scene covers {own}, wanted is {grid}")
     if grid.rows == own.rows:
         return height, occupied
@@ -54,11 +54,12 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
         return np.where(keep, mean, 0).astype(height.dtype), keep
     if grid.rows % own.rows == 0:
         f = grid.rows // own.rows
-        return tuple(a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
+        height, occupied = (a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
+        return height, occupied
     raise ValueError(f"{own.rows} pixels do not divide into {grid.rows}")
 
 
-def _sum_blocks(values: np.ndarray, f: int, dtype: type) -> np.ndarray:
+def _sum_blocks(values: np.ndarray, f: int, dtype: np.typing.DTypeLike) -> np.ndarray:
     """(G, H / f, W / f) sums over f x f blocks: whole rows first, then strided columns of what is left."""
     rows = sum(
         (values[:, i::f].astype(dtype, copy=False) for i in range(1, f)), values[:, ::f].astype(dtype, copy=False)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -215,7 +215,8 @@ class Trainer:
             part = slice(first, first + size)
             share = len(positions[part]) / len(positions)
             more = first + size < len(positions)
-            with self.wrapped.no_sync() if more and hasattr(self.wrapped, "no_sync") else nullcontext():
+            no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # of DistributedDataParallel
+            with no_sync() if more else nullcontext():
                 losses = self._losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
                     raise NonFiniteLossError(self.steps_done, self._find_nonfinite_samples(arrays, positions))
@@ -225,8 +226,7 @@ class Trainer:
         norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.grad_clip or math.inf)
         self.optimiser.step()
         self.steps_done += 1
-        if self.ema:
-            self.update_ema()
+        self.update_ema()
         return totals | {"grad_norm": norm}
 
     def _losses(self, network: nn.Module, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
@@ -255,8 +255,12 @@ class Trainer:
     @torch.no_grad()
     def update_ema(self) -> None:
         """Exponential moving average with warm-up: decay = min(ema_decay, 1 - (1 + step)^-3/4), as diffusers does."""
+        if self.ema is None or self.settings.ema_decay is None:
+            return
         decay = min(self.settings.ema_decay, 1 - (1 + self.steps_done) ** -0.75)
-        torch._foreach_lerp_(list(self.ema.values()), list(self.parameters.values()), 1 - decay)
+        parameters: list[Tensor] = list(self.parameters.values())
+        lerp = torch._foreach_lerp_  # pyright: ignore[reportPrivateImportUsage]
+        lerp(list(self.ema.values()), parameters, 1 - decay)
 
     @torch.no_grad()
     def ema_model(self) -> ConfiguredModel:
@@ -301,7 +305,7 @@ class Trainer:
             kind, name = path.split(".", 1)
             if kind == "model":
                 model[name] = value
-            elif kind == "ema":
+            elif kind == "ema" and self.ema is not None:
                 self.ema[name].copy_(value)
             else:
                 key, name = name.split(".", 1)
@@ -346,4 +350,4 @@ def make_dit_trainer(
 
 
 def _compile_model(model: nn.Module, execution: ExecutionConfig) -> nn.Module:
-    return torch.compile(model) if execution.compile else model
+    return cast(nn.Module, torch.compile(model)) if execution.compile else model

@@ -34,7 +34,7 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
         return np.zeros(len(generated), bool)
     same = generated.category[:, None] == known.category[None]
     overlap = compute_iou3d_matrix(extract_boxes(generated), extract_boxes(known), same)
-    copies = (overlap > DUPLICATE_IOU3D[generated.category, None]).any(axis=1)
+    copies = np.any(overlap > DUPLICATE_IOU3D[generated.category, None], axis=1)
     overlap[overlap <= REGENERATED_IOU3D] = 0
     row, col = linear_sum_assignment(overlap, maximize=True)
     copies[row[overlap[row, col] > 0]] = True

@@ -212,7 +212,7 @@ def extend_scene(
         unknown = ~covered[here]
         known, offset_m = to_block_frame(canvas, window, block, level_m)
         latent = model.encode([extrapolate_ground(known, unknown)])
-        mask = make_latent_mask([unknown], latent.shape[1:], "both").to(latent.device)
+        mask = make_latent_mask([unknown], model.latent_shape, "both").to(latent.device)
         latent = model.inpaint_latents(
             InpaintCondition(latent, mask),
             [label],

@@ -20,7 +20,7 @@ from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation,
 Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a region
 
 
-def contains_points(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+def contains_points(corners_m: Sequence[Sequence[float]] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
 
     Raises ValueError for fewer than three corners or numbers that are not finite.
@@ -36,7 +36,7 @@ def contains_points(corners_m: Sequence[Sequence[float]], x_m: np.ndarray, y_m: 
     return inside
 
 
-def select_polygon(grid: Grid, corners_m: Sequence[Sequence[float]]) -> np.ndarray:
+def select_polygon(grid: Grid, corners_m: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
     return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
@@ -53,7 +53,7 @@ def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> n
     return along >= offset_m * length
 
 
-def select_around_objects(scene: Scene, primitives: Sequence[int], margin_m: float = 1.0) -> np.ndarray:
+def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, margin_m: float = 1.0) -> np.ndarray:
     """(rows, cols) pixels within the upright bounds of primitives, grown by a margin. IndexError for none of that number."""
     chosen = scene.select(np.asarray(primitives, int))
     region = np.zeros((scene.grid.rows, scene.grid.cols), bool)
@@ -70,7 +70,7 @@ def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
     rows, cols = region.shape
     if rows % size or cols % size:
         raise ValueError(f"a region of {rows} x {cols} pixels does not divide into {size} x {size} cells")
-    return region.reshape(size, rows // size, size, cols // size).any(axis=(1, 3))
+    return np.any(region.reshape(size, rows // size, size, cols // size), axis=(1, 3))
 
 
 def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:

@@ -237,7 +237,7 @@ class BlockComposer:
     def finish_block(self, condition: BlockCondition, latent: Tensor, generated: Scene) -> SceneBlock:
         """The new part of a decoded block, blended into the known part and without copies of its objects."""
         own = extract_new_part(generated, condition.known, condition.new_pixels)
-        seen = condition.known.occupied.any(axis=0)[~condition.new_pixels]
+        seen = np.any(condition.known.occupied, axis=0)[~condition.new_pixels]
         return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:

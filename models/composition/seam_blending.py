@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -94,13 +95,16 @@ def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
 
 def _find_bounding_window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
     """Bounding rectangle of a non-empty mask, with a margin in pixels."""
-    spans = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return tuple(slice(max(0, span[0] - margin), span[-1] + 1 + margin) for span in spans)
+    rows, cols = (
+        slice(max(0, span[0] - margin), span[-1] + 1 + margin)
+        for span in (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    )
+    return rows, cols
 
 
 def _find_nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Distance in pixels to the nearest pixel of a non-empty mask, and that pixel's (row, col)."""
-    distance, (row, col) = distance_transform_edt(~mask, return_indices=True)
+    distance, (row, col) = cast(tuple, distance_transform_edt(~mask, return_indices=True))
     return distance, (row, col)
 
 
@@ -108,9 +112,8 @@ def _compute_surface_difference(
     generated: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray
 ) -> np.ndarray:
     """Metres by which the known surface lies above the generated one where both have one class, with a falloff elsewhere."""
-    (known_m, known_class), (new_m, new_class) = (
-        [part[window] for part in scene.surface()] for scene in (known, generated)
-    )
+    known_m, known_class = (part[window] for part in known.surface())
+    new_m, new_class = (part[window] for part in generated.surface())
     alike = given & (known_class == new_class) & (known_class >= 0)
     if not alike.any():
         return np.zeros(given.shape, np.float32)
@@ -122,7 +125,8 @@ def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray
     """Largest height step from each pixel of a mask to those of its four neighbours that are in the mask, else 0."""
     largest = np.zeros(mask.shape, np.float32)
     for axis in (0, 1):
-        height, inside, out = (of.swapaxes(0, axis) for of in (height_m, mask, largest))
+        height, out = height_m.swapaxes(0, axis), largest.swapaxes(0, axis)
+        inside = mask.swapaxes(0, axis)
         step = np.where(inside[1:] & inside[:-1], np.abs(np.diff(height, axis=0)), 0)
         np.maximum(out[1:], step, out=out[1:])
         np.maximum(out[:-1], step, out=out[:-1])

@@ -34,7 +34,7 @@ class Boxes(NamedTuple):
     rotation: np.ndarray  # (n, 3, 3)
     size_m: np.ndarray  # (n, 3)
 
-    def take(self, index: np.ndarray) -> Boxes:
+    def take(self, index: np.ndarray | slice) -> Boxes:
         return Boxes(*(part[index] for part in self))
 
     @property
@@ -110,7 +110,8 @@ def find_overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]
         low_b, high_b = (b.center_m[:, axis] + sign * reach_b[:, axis] for sign in (-1, 1))
         overlap &= low_a[:, None] < high_b
         overlap &= low_b < high_a[:, None]
-    return np.nonzero(overlap)
+    index_a, index_b = np.nonzero(overlap)
+    return index_a, index_b
 
 
 def _compute_iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.ndarray) -> np.ndarray:

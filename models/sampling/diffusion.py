@@ -9,15 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from diffusers import SchedulerMixin
 
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
 SceneKey = int | tuple[int, ...]  # a scene's index, or several numbers that identify it
@@ -253,14 +250,14 @@ def pseudoinverse_guidance(
 @torch.no_grad()
 def sample_with_scheduler(
     model: Denoiser,
-    scheduler: SchedulerMixin,
+    scheduler: Any,
     noise: SceneNoise,
     label: Int[Tensor, " b"],
     on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
     """Sample clean latents with a scheduler of diffusers, such as DPM-Solver++ or DDIM, after its `set_timesteps`.
 
-    Schedulers that add noise must accept it as an argument, so that each scene keeps its own random numbers.
+    `scheduler` is a SchedulerMixin (diffusers is not imported here). Schedulers that add noise must accept it as an argument, so that each scene keeps its own random numbers.
     """
     latent = noise.draw() * scheduler.init_noise_sigma
     stochastic = str(scheduler.config.get("algorithm_type")).startswith("sde-")

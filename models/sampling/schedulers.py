@@ -6,10 +6,7 @@ DDPM, the paper's sampler, is `diffusion.sample` and needs the numbers of its co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from diffusers import SchedulerMixin
+from typing import Any, cast
 
 # The paper's noise schedule in the words of diffusers' DDPMScheduler.
 DDPM_CONFIG = {
@@ -63,15 +60,16 @@ class SchedulerConfig:
         class_name, options = SAMPLERS[name]
         return SchedulerConfig(class_name, self.config | options)
 
-    def build(self) -> SchedulerMixin:
-        """Import diffusers and build the scheduler.
+    def build(self) -> Any:
+        """Import diffusers and build the scheduler, a SchedulerMixin.
 
         Raises:
             ValueError: diffusers has no scheduler of this name.
         """
         import diffusers  # costs seconds; DDPM never gets here
+        from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
-        kind = getattr(diffusers, self.class_name, None)
-        if not (isinstance(kind, type) and issubclass(kind, diffusers.SchedulerMixin)):
+        kind: Any = getattr(diffusers, self.class_name, None)
+        if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
             raise ValueError(f"scheduler {self.class_name!r} is not one of diffusers'")
-        return kind.from_config(self.config)
+        return cast(Any, kind).from_config(self.config)

@@ -15,7 +15,7 @@ The paper leaves open: the ranges of the sizes, the network, batch size and lear
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from models.scene import make_yaw_rotation
 from models.training import OptimizerConfig
 from models.vae.config import ObjectConfig
 from models.vae.losses import KL_WEIGHT, MEDIUM, compute_kl_loss
-from models.vae.objects import CATEGORY_EMBEDDING, ObjectDecoder, ObjectEncoder
+from models.vae.objects import CATEGORY_EMBEDDING, ObjectDecoder, ObjectEncoder, OutputHeads
 from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
@@ -93,14 +93,16 @@ class OneObjectAutoencoder(nn.Module):
         self.encoder = ObjectEncoder((1,), LATENT_CHANNELS, GRID, NETWORK)
         self.decoder = ObjectDecoder((1,), LATENT_CHANNELS, GRID, NETWORK)
         self.encoder.project_in = nn.Linear(3 + entries + CATEGORY_EMBEDDING + 1, NETWORK.width)
-        self.decoder.heads[0].features[-1] = nn.Linear(NETWORK.head_hidden, entries)
+        heads = cast(OutputHeads, self.decoder.heads[0])
+        heads.features[-1] = nn.Linear(NETWORK.head_hidden, entries)
         with torch.no_grad():
             self.encoder.grid[LATENT_CHANNELS:] = INITIAL_LOGVAR
 
     def encode(self, code: Float[Tensor, "batch entries"]) -> Posterior:
         features = torch.cat([code.new_full((len(code), 3), 0.5), code], dim=1)  # the centre, normalised
         real = torch.ones(len(code), 1, dtype=torch.bool)
-        return Posterior(*self.encoder(features[:, None], real).chunk(2, dim=1))
+        mean, logvar = self.encoder(features[:, None], real).chunk(2, dim=1)
+        return Posterior(mean, logvar)
 
     def decode(self, latent: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch entries"]:
         return self.decoder(latent)[0][:, 0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -39,7 +41,8 @@ class GroundEncoder(nn.Module):
         if self.shortcut is None:
             return moments
         mean, logvar = moments.chunk(2, dim=1)
-        smooth = compute_smooth_maps(*maps.chunk(2, dim=1), self.shortcut.stride[0])
+        height, occupied = maps.chunk(2, dim=1)
+        smooth = compute_smooth_maps(height, occupied, self.shortcut.stride[0])
         return torch.cat([mean + self.shortcut(smooth), logvar], dim=1)
 
 
@@ -81,7 +84,8 @@ def init_from_data(
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count
     mean_logit = occupied.mean(dim=(0, 2, 3)).clamp(0.01, 0.99).logit()
     bias = torch.cat([mean_height, mean_logit]).repeat_interleave(decoder.shuffle.upscale_factor**2)
-    decoder.net.conv_out.bias.copy_(bias)
+    out_bias = cast(Tensor, decoder.net.conv_out.bias)
+    out_bias.copy_(bias)
     if encoder.shortcut is None or decoder.shortcut is None:
         return
     cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
@@ -101,16 +105,16 @@ def init_from_data(
         for logit in LOGITS_PER_PX
     }
     unit = torch.cat(
-        [heights, min(error, key=error.get) * compute_edge_reach_px(cell) * distances]
+        [heights, min(error, key=lambda logit: float(error[logit])) * compute_edge_reach_px(cell) * distances]
     )  # of the decoder's outputs
     encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
-    encoder.shortcut.bias.copy_(-mean @ encode)
+    cast(Tensor, encoder.shortcut.bias).copy_(-mean @ encode)
     decoder.shortcut.weight[:latent].copy_((decode * unit).reshape(latent, -1, cell, cell))
     decoder.shortcut.weight[latent:].zero_()
-    decoder.shortcut.bias.copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
+    cast(Tensor, decoder.shortcut.bias).copy_((mean * unit).reshape(-1, cell**2).mean(dim=1))
     encoder.net.conv_out.weight[:latent].zero_()
     decoder.net.conv_out.weight.zero_()
-    decoder.net.conv_out.bias.zero_()
+    out_bias.zero_()
 
 
 def compute_smooth_maps(

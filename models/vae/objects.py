@@ -6,6 +6,8 @@ Shapes: N slots over all categories, d the width, (h, w) the latent grid.
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -91,6 +93,8 @@ class ObjectEncoder(nn.Module):
     its place in the cell, shape and category through a small network of its own, past the transformer, whose norms
     blur numbers. Not in the paper.
     """
+
+    slot_category: Tensor
 
     def __init__(
         self,
@@ -207,13 +211,16 @@ class ObjectDecoder(nn.Module):
         x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d), DETR's zero targets
         for layer in self.layers:
             x = layer(x, self.queries, memory, memory_key)
-        groups = list(zip(self.heads, x.split(self.proposals, dim=1), strict=True))
+        groups = list(zip(self._list_heads(), x.split(self.proposals, dim=1), strict=True))
         features = torch.cat([head.features(group) for head, group in groups], dim=1).sigmoid()
         existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence
 
+    def _list_heads(self) -> list[OutputHeads]:
+        return [cast(OutputHeads, head) for head in self.heads]
+
     def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
         """Set the last biases: mean features per category, existence as often as `count` per scene."""
-        for head, mean, expected, offered in zip(self.heads, feature_logit, count, self.proposals, strict=True):
-            head.features[-1].bias.copy_(mean)
+        for head, mean, expected, offered in zip(self._list_heads(), feature_logit, count, self.proposals, strict=True):
+            cast(Tensor, head.features[-1].bias).copy_(mean)
             head.existence.bias.copy_((expected / offered).clamp(0.01, 0.99).logit())

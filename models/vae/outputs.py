@@ -54,6 +54,6 @@ class LayoutOutput:
         """One numpy layout per sample, probabilities instead of logits."""
         parts = (self.occupancy_logit.sigmoid(), self.height, self.features, self.existence_logit.sigmoid())
         category = np.repeat(np.arange(len(self.proposals)), self.proposals)
-        return [
-            DecodedLayout(*sample, category) for sample in zip(*(p.float().cpu().numpy() for p in parts), strict=True)
-        ]
+        occupancy, height, features, existence = (part.float().cpu().numpy() for part in parts)
+        samples = zip(occupancy, height, features, existence, strict=True)
+        return [DecodedLayout(*sample, category) for sample in samples]
