@@ -23,7 +23,7 @@ from jobs.support.cli import absolute, home, run, start_ray
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipelines.reporting.contact_sheet import Catalogue
+    from pipelines.reporting.scene_index import Catalogue
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,8 @@ def draw_scenes(config: OneScene) -> list[str]:
 
     from pipelines.io.mesh_export import scene_glb
     from pipelines.rendering.render import png
-    from pipelines.reporting.contact_sheet import Catalogue, scene_plate
+    from pipelines.reporting.contact_sheet import scene_plate
+    from pipelines.reporting.scene_index import Catalogue
     from pipelines.runtime import storage
 
     if config.count < 1:
@@ -171,7 +172,8 @@ def painted(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> list[list
 def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
     from pipelines.rendering.render import png
-    from pipelines.reporting.contact_sheet import Catalogue, View, captions, scene_sheet, sheet_title
+    from pipelines.reporting.contact_sheet import View, captions, scene_sheet, sheet_title
+    from pipelines.reporting.scene_index import Catalogue
     from pipelines.runtime import storage
 
     for name in ("count", "size"):
@@ -223,7 +225,7 @@ def write_gallery(config: Gallery) -> str:
     """Write the page and return its path."""
     from rich.progress import Progress
 
-    from pipelines.reporting.contact_sheet import Catalogue
+    from pipelines.reporting.scene_index import Catalogue
     from pipelines.reporting.gallery_page import gallery_html
     from pipelines.runtime import storage
 

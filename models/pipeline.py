@@ -22,7 +22,7 @@ from models.composition.generator import StepCallback
 from models.composition.inpaint import Contents, composite_scenes, grow_to_cells, make_latent_mask
 from models.composition.outpaint import BlockIndex, outpaint_scene
 from models.dit import DiT
-from models.labels import find_label_index
+from models.labels import find_label_index, split_label
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pretrained import INDEX_NAME, find_pipeline_path
@@ -254,13 +254,7 @@ class PrITTIPipeline:
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
         """An empty Scene with the id of scene `index` of a run and the requested labels."""
-        vegetation, vehicle = None, None
-        if self.dit.config.label == "vegetation":
-            vegetation = label
-        elif self.dit.config.label == "vehicle":
-            vehicle = label
-        elif self.dit.config.label == "joint":
-            vegetation, vehicle = label.split("-")
+        vegetation, vehicle = split_label(self.dit.config.label, label)
         return make_empty_scene(
             f"generated-{run}-{seed}-{index:07d}",
             f"generated-{run}",

@@ -38,6 +38,8 @@ VEHICLES = (CATEGORY_INDEX["vehicle_big"], CATEGORY_INDEX["vehicle_small"])
 # The paper's five, and Argoverse 2's crossings.
 GROUND_CLASSES = ("road", "sidewalk", "parking", "terrain", "ground", "crossing")
 KITTI_GROUND_CLASSES = GROUND_CLASSES[:5]
+ROAD_CLASSES = ("road", "crossing")
+DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 DENSITIES = ("low", "medium", "high")
 

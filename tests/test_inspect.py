@@ -22,16 +22,8 @@ from models.scene import CATEGORIES, ELLIPSOID, Grid
 from pipelines.io.mesh_export import cuboid_triangles, ellipsoid_triangles
 from pipelines.preprocess.sources.town.generator import town_drive
 from pipelines.rendering.render import bev_picture, picture_3d
-from pipelines.reporting.contact_sheet import (
-    RAMP,
-    Catalogue,
-    View,
-    best_columns,
-    footprints_m,
-    heights_picture,
-    paint,
-    scene_plate,
-)
+from pipelines.reporting.contact_sheet import RAMP, View, best_columns, footprints_m, heights_picture, paint, scene_plate
+from pipelines.reporting.scene_index import Catalogue
 from pipelines.reporting.dataset_charts import MAX_NAMED, count_bins, count_histogram, track_map
 from pipelines.reporting.dataset_report import dataset_html, read_facts
 from pipelines.runtime import storage

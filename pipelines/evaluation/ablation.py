@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import ray.data
@@ -18,7 +19,7 @@ from models.geometry.encodings import ENCODINGS
 from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
 from models.studies.orientation_study import THINGS, CenteredBoxes, StudyConfig, draw_boxes, train_autoencoder
 from pipelines.reporting.chart import Chart, draw_chart_svg
-from pipelines.reporting.dataset_report import CaptionedSvg, DrawingsSection, render_page_html
+from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
 from pipelines.runtime import storage
 
@@ -212,10 +213,21 @@ def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Seq
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs from the preset: entries of its architecture, options of its training (jobs/train_lvae.py)."""
+    """What differs from the preset: entries of its architecture, options of its training (jobs/train_lvae.py).
+
+    Entries of a branch are nested, as in `LayoutVAEConfig`: {"ground": {"channels": (16,)}}.
+    """
 
     architecture: Mapping[str, object] = field(default_factory=dict)
     options: Mapping[str, object] = field(default_factory=dict)
+
+
+def change_architecture(architecture: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
+    """Keyword arguments of `LayoutVAE` with a variant's changes; those of a branch change its dataclass."""
+    return dict(architecture) | {
+        name: replace(architecture[name], **value) if isinstance(value, Mapping) else value
+        for name, value in changes.items()
+    }
 
 
 BRANCHES = {
@@ -226,9 +238,9 @@ BRANCHES = {
 }
 # The paper's decoder between the same branches and latents. It does not bear the cells' learning rate.
 DECODERS = {
-    "cells": Variant({"decoder": "cells"}),
-    "DETR": Variant({"decoder": "detr"}, {"learning_rate": 5e-4}),
-    "DETR, no shortcuts": Variant({"decoder": "detr", "shortcut": False}, {"learning_rate": 5e-4}),
+    "cells": Variant({"objects": {"decoder": "cells"}}),
+    "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
+    "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
 # Of the ground branch alone; town has (32,) after folding by 8. Linear start: models/vae/ground.py.
 GROUND = {
@@ -236,14 +248,13 @@ GROUND = {
     for name, changes in {
         "as the preset": {},
         "without the linear start": {"shortcut": False},
-        "half as wide": {"channels": (16,)},
-        "one level more, folded by 4": {"channels": (32, 32), "fold": 4},
-        "an eighth of the paper's widths": {"channels": (8, 16, 32, 64), "fold": 1, "attention": True},
+        "half as wide": {"ground": {"channels": (16,)}},
+        "one level more, folded by 4": {"ground": {"channels": (32, 32), "pixel_unshuffle": 4}},
+        "an eighth of the paper's widths": {
+            "ground": {"channels": (8, 16, 32, 64), "pixel_unshuffle": 1, "attention": True}
+        },
         "the paper's networks": {
-            "channels": (64, 128, 256, 512),
-            "norm_groups": 32,
-            "fold": 1,
-            "attention": True,
+            "ground": {"channels": (64, 128, 256, 512), "norm_groups": 32, "pixel_unshuffle": 1, "attention": True},
             "shortcut": False,
         },
     }.items()

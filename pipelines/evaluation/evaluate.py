@@ -134,7 +134,9 @@ def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]
         for part, side in zip(shared, sides, strict=True)
     ]
     balls = [ray.put(part) for part in radii]
-    return judge_neighbours(k, ray.get([find_within_task.remote(*shared, *balls, rows) for rows in split_rows(len(real))]))
+    return judge_neighbours(
+        k, ray.get([find_within_task.remote(*shared, *balls, rows) for rows in split_rows(len(real))])
+    )
 
 
 def split_rows(count: int) -> list[range]:

@@ -23,6 +23,7 @@ from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import make_numbered_rows, map_actors, map_rows
 from pipelines.schema.dataset import Dataset
+from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
@@ -192,7 +193,13 @@ def compute_scene_features(
         tables = ("scenes", "primitives", "rasters")
         files = [storage.fingerprint_file(shard.path(table)) for shard, _ in parts for table in tables]
         judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
-    claim(directory, {"side": asdict(side), "files": files, "labels": judged_by} | make_options_record(looks))
+    guard_options(
+        storage.join_uri(directory, "described.json"),
+        {"side": asdict(side), "files": files, "labels": judged_by} | make_options_record(looks),
+        is_in_use=lambda: False,
+        discard=lambda: storage.delete_directory(directory),
+        describe=str,
+    )
     missing = [number for number in range(len(parts)) if not storage.exists(make_part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
@@ -234,12 +241,3 @@ def make_options_record(looks: FeatureConfig) -> dict:
         "version": VERSION,
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",
     }
-
-
-def claim(directory: str, options: dict) -> None:
-    """Empty a directory of parts unless they were made with the same options."""
-    record = storage.join_uri(directory, "described.json")
-    if storage.exists(record) and storage.read_json(record) == options:
-        return
-    storage.delete_directory(directory)
-    storage.write_json(options, record)

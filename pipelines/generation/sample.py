@@ -10,7 +10,7 @@ from itertools import chain
 import numpy as np
 import torch
 
-from models.labels import LABELS, require_labels
+from models.labels import LABELS, compose_label, require_labels
 from models.layout import LayoutSpec
 from models.pipeline import PrITTIPipeline
 from models.scene import Grid, Scene
@@ -103,14 +103,13 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
 
 
 def find_scene_label(scene: Scene, kind: str) -> str:
-    """The label a scene bears for a model conditioned on `kind`; ValueError if it bears none."""
-    names = {"vegetation": scene.vegetation_density, "vehicle": scene.vehicle_density, "none": LABELS["none"][0]}
-    names["joint"] = f"{scene.vegetation_density}-{scene.vehicle_density}"
-    if names[kind] not in LABELS[kind]:
+    """A scene's label for a model conditioned on `kind`. Raises ValueError if the scene has none."""
+    label = compose_label(kind, scene.vegetation_density, scene.vehicle_density)
+    if label not in LABELS[kind]:
         raise ValueError(
-            f"scene {scene.scene_id} bears no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
+            f"scene {scene.scene_id} has no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
         )
-    return names[kind]
+    return label
 
 
 class Sampler:

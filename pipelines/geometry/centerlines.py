@@ -15,8 +15,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.morphology import skeletonize
 
-from models.scene import Scene
-from pipelines.metrics.validity import ROAD_CLASSES
+from models.scene import ROAD_CLASSES, Scene
 
 CELL_M = 0.5  # of the mask that is thinned
 HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands left out

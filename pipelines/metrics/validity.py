@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
-from models.scene import CATEGORIES, CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
+from models.scene import CATEGORIES, CATEGORY_INDEX, DRIVABLE_CLASSES, ROAD_CLASSES, VEGETATION, VEHICLES, Scene
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
@@ -38,8 +38,6 @@ STANDING = tuple(
     for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole", "object")
 )
 BUILDING = CATEGORY_INDEX["construction_big"]
-ROAD_CLASSES = ("road", "crossing")
-DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 
 def find_slab_offset_m(surface: str) -> float:

@@ -24,6 +24,7 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import MAX_RETRIES, map_rows
 from pipelines.schema.dataset import DESCRIPTION, Statistics, compute_training_statistics, label_scenes
+from pipelines.schema.run_guard import compare_options
 from pipelines.schema.tables import SCHEMA_VERSION, Shard
 
 STAGING = ".staging"
@@ -175,7 +176,7 @@ def _refuse_other_options(root: str, options: dict) -> None:
     """Raises ValueError if `root` was made, or begun, with other options."""
     for path in (storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING, "options.json")):
         if storage.exists(path):
-            made = storage.read_json(path)
-            made = made["options"] if path.endswith(DESCRIPTION) else made
-            if made != options:
-                raise ValueError(f"{root} was made with {made}, asked for {options}; choose another --output")
+            recorded = storage.read_json(path)
+            recorded = recorded["options"] if path.endswith(DESCRIPTION) else recorded
+            if difference := compare_options(recorded, options):
+                raise ValueError(f"{root} was made with {difference}; choose another --output")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from itertools import islice
 
@@ -22,6 +22,7 @@ from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town import generator
 from pipelines.runtime import storage
+from pipelines.schema.dataset import merge_extremes
 from pipelines.schema.tables import MAX_HEIGHT_M, make_rejects_table, make_scene_tables
 
 BATCH_SCENES = 32
@@ -109,18 +110,6 @@ def compute_extremes(scenes: list[Scene]) -> Extremes:
         "z": np.concatenate([s.center_m[:, 2:] for s in scenes]),
     }
     return {name: [v.min(axis=0).tolist(), v.max(axis=0).tolist()] for name, v in values.items() if len(v)}
-
-
-def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
-    """The extremes of everything together."""
-    parts = list(parts)
-    return {
-        name: [
-            np.min([p[name][0] for p in parts if name in p], axis=0).tolist(),
-            np.max([p[name][1] for p in parts if name in p], axis=0).tolist(),
-        ]
-        for name in {name for p in parts for name in p}
-    }
 
 
 def join_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:

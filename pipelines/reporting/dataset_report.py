@@ -9,14 +9,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import NamedTuple
 
 import numpy as np
 
 from models.scene import CATEGORIES, DENSITIES, GROUND_CLASSES
 from pipelines.reporting.chart import format_number
-from pipelines.reporting.contact_sheet import Catalogue
 from pipelines.reporting.dataset_charts import (
     draw_count_histogram,
     draw_label_matrix,
@@ -25,7 +22,9 @@ from pipelines.reporting.dataset_charts import (
     draw_track_map,
     spell_name,
 )
-from pipelines.reporting.report import Figure, KeyFigures, Picture, Pictures, Section, Table, Text, render_report_html
+from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
+from pipelines.reporting.report import Figure, KeyFigures, Picture, Pictures, Section, Table, Text
+from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards
 
@@ -111,47 +110,6 @@ def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]
 
 
 # --------------------------------------------------------------------------------------------------------- page
-
-
-class CaptionedSvg(NamedTuple):
-    """An <svg> element, and words under it."""
-
-    svg: str
-    caption: str = ""
-
-
-@dataclass(frozen=True)
-class DrawingsSection:
-    """A section of drawings: as wide as the page, two side by side, or as many small ones as fit."""
-
-    title: str
-    drawings: Sequence[CaptionedSvg]
-    layout: str  # wide, pairs or small
-    note: str = ""
-
-
-def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
-    """`report_html` with drawings among the sections."""
-    plain = [
-        Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
-        for index, section in enumerate(sections)
-    ]
-    html = render_report_html(title, plain, subtitle)
-    for index, section in enumerate(sections):
-        if isinstance(section, DrawingsSection):
-            html = html.replace(f"<p>{_make_marker(index)}</p>", _render_drawings(section))
-    return html
-
-
-def _make_marker(index: int) -> str:
-    return f"[drawings of section {index}]"
-
-
-def _render_drawings(section: DrawingsSection) -> str:
-    kind = {"wide": "scroll", "pairs": "charts", "small": "pictures"}[section.layout]
-    captions = [f"<figcaption>{escape(d.caption)}</figcaption>" if d.caption else "" for d in section.drawings]
-    figures = [f"<figure>{d.svg}{caption}</figure>" for d, caption in zip(section.drawings, captions, strict=True)]
-    return f'<div class="{kind}">{"".join(figures)}</div>'
 
 
 def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Picture]] = ()) -> str:

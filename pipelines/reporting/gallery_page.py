@@ -19,9 +19,10 @@ import pyarrow as pa
 from models.scene import CATEGORIES, GROUND_CLASSES
 from pipelines.io.web_export import export_web_scene
 from pipelines.rendering.render import render_bev
-from pipelines.reporting.contact_sheet import CHUNK, Catalogue
+from pipelines.reporting.contact_sheet import CHUNK
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.report_style import STYLE
+from pipelines.reporting.scene_index import Catalogue
 from pipelines.schema.tables import Shard
 
 THUMBNAIL_PX = 256

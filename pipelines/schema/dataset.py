@@ -5,6 +5,7 @@ dataset.json is written last: where it is, everything else is.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,6 @@ import pyarrow as pa
 
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, GROUND_CLASSES, VEGETATION, VEHICLES, Grid
-from pipelines.preprocess.shard_writer import merge_extremes
 from pipelines.runtime import storage
 from pipelines.schema.density_labels import DensityThresholds, classify_density, compute_density_thresholds
 from pipelines.schema.tables import SCENES, Shard
@@ -121,3 +121,15 @@ class Dataset:
             )
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a dataset description ({error!r}); preprocess again") from error
+
+
+def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
+    """The extremes of everything together."""
+    parts = list(parts)
+    return {
+        name: [
+            np.min([p[name][0] for p in parts if name in p], axis=0).tolist(),
+            np.max([p[name][1] for p in parts if name in p], axis=0).tolist(),
+        ]
+        for name in {name for p in parts for name in p}
+    }

@@ -33,8 +33,8 @@ from pipelines.io.mesh_export import export_glb
 from pipelines.io.opendrive import export_opendrive
 from pipelines.io.web_export import export_web_scene
 from pipelines.rendering.render import render_bev
-from pipelines.reporting.contact_sheet import Catalogue
 from pipelines.reporting.report import encode_data_uri
+from pipelines.reporting.scene_index import Catalogue
 
 VISITORS, HISTORY, WAITING = 16, 50, 4
 MAX_BODY = 256 * 1024  # bytes of a request

@@ -21,7 +21,7 @@ import pyarrow as pa
 import ray
 
 from models.augment import Augmentation
-from models.labels import LABELS, find_label_index
+from models.labels import compose_label, find_label_index
 from models.layout import LayoutSpec
 from models.scene import Grid
 from models.tensors import encode_height, encode_layout, encode_primitives, resample_ground
@@ -211,14 +211,10 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
 
 
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
-    """(n,) int64: index into pipeline.LABELS[label] per row of a scenes table."""
-    names = {
-        "vegetation": scenes["vegetation_density"].to_pylist(),
-        "vehicle": scenes["vehicle_density"].to_pylist(),
-        "none": LABELS["none"] * len(scenes),
-    }
-    names["joint"] = [f"{a}-{b}" for a, b in zip(names["vegetation"], names["vehicle"], strict=True)]
-    return np.array([find_label_index(label, name) for name in names[label]], np.int64)
+    """(n,) int64: index into LABELS[label] per row of a scenes table."""
+    densities = zip(scenes["vegetation_density"].to_pylist(), scenes["vehicle_density"].to_pylist(), strict=True)
+    names = [compose_label(label, vegetation, vehicle) for vegetation, vehicle in densities]
+    return np.array([find_label_index(label, str(name)) for name in names], np.int64)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""A report page with SVG drawings among its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import NamedTuple
+
+from pipelines.reporting.report import Section, Text, render_report_html
+
+
+class CaptionedSvg(NamedTuple):
+    """An <svg> element, and words under it."""
+
+    svg: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class DrawingsSection:
+    """A section of drawings: as wide as the page, two side by side, or as many small ones as fit."""
+
+    title: str
+    drawings: Sequence[CaptionedSvg]
+    layout: str  # wide, pairs or small
+    note: str = ""
+
+
+def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
+    """`report_html` with drawings among the sections."""
+    plain = [
+        Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
+        for index, section in enumerate(sections)
+    ]
+    html = render_report_html(title, plain, subtitle)
+    for index, section in enumerate(sections):
+        if isinstance(section, DrawingsSection):
+            html = html.replace(f"<p>{_make_marker(index)}</p>", _render_drawings(section))
+    return html
+
+
+def _make_marker(index: int) -> str:
+    return f"[drawings of section {index}]"
+
+
+def _render_drawings(section: DrawingsSection) -> str:
+    kind = {"wide": "scroll", "pairs": "charts", "small": "pictures"}[section.layout]
+    captions = [f"<figcaption>{escape(d.caption)}</figcaption>" if d.caption else "" for d in section.drawings]
+    figures = [f"<figure>{d.svg}{caption}</figure>" for d, caption in zip(section.drawings, captions, strict=True)]
+    return f'<div class="{kind}">{"".join(figures)}</div>'

@@ -1,0 +1,117 @@
+"""Every scene of a dataset directory by its place in the tables, sorted and selected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from pipelines.schema.tables import SCENES, Shard, find_shards
+
+SORTS = {
+    "vegetation": "vegetation_volume_m3",
+    "vehicles": "vehicle_volume_m3",
+    "primitives": "num_primitives",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """Every scene of a dataset directory, or of one source or split of it: its row of the scenes table and its place."""
+
+    root: str
+    scenes: pa.Table  # n rows: the scenes table without world_from_imu, with source and split
+    shards: tuple[Shard, ...]
+    shard: np.ndarray  # (n,) index into shards
+    row: np.ndarray  # (n,) row in that shard
+
+    @classmethod
+    def read(cls, root: str, source: str | None = None, split: str | None = None) -> Catalogue:
+        """Raises ValueError if there is no such scene."""
+        shards = find_shards(root, "scenes", source, split)
+        columns = [name for name in SCENES.names if name != "world_from_imu"]
+        tables = []
+        for shard in shards:
+            table = shard.read("scenes", columns)
+            for name in ("source", "split"):
+                table = table.append_column(name, pa.array([getattr(shard, name)] * len(table), pa.string()))
+            tables.append(table)
+        lengths = [len(table) for table in tables]
+        if sum(lengths) == 0:
+            raise ValueError(f"{root}: its scenes tables are empty; run the job that wrote them again")
+        return cls(
+            root=root,
+            scenes=pa.concat_tables(tables),
+            shards=tuple(shards),
+            shard=np.repeat(np.arange(len(shards)), lengths),
+            row=np.concatenate([np.arange(n) for n in lengths]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def column(self, name: str) -> np.ndarray:
+        """(n,) a column: numbers with NaN for null, strings as objects."""
+        return self.scenes[name].to_numpy()
+
+    def find(self, scene_ids: Sequence[str]) -> np.ndarray:
+        """Indices of scenes by id. Raises ValueError for an id that is not there, with some that are."""
+        known = self.scenes["scene_id"].to_pylist()
+        index = {scene_id: k for k, scene_id in enumerate(known)}
+        for wanted in scene_ids:
+            if wanted not in index:
+                alike = [name for name in known if wanted in name][:3]
+                some = alike or [known[k] for k in self.spread(np.arange(len(known)), 3)]
+                raise ValueError(f"{self.root}: no scene {wanted!r} among {len(known)}; there are: {', '.join(some)}")
+        return np.array([index[wanted] for wanted in scene_ids], int)
+
+    @staticmethod
+    def spread(order: np.ndarray, count: int) -> np.ndarray:
+        """At most `count` entries of `order`, evenly spread."""
+        count = min(count, len(order))
+        return order[np.floor((np.arange(count) + 0.5) * len(order) / max(count, 1)).astype(int)]
+
+    def draw(self, count: int, seed: int) -> np.ndarray:
+        """Indices of at most `count` scenes at random, none twice."""
+        return np.random.default_rng(seed).permutation(len(self))[:count]
+
+    def sort_column(self, sort: str) -> str:
+        """The column that `sort` names. Raises ValueError if it names none."""
+        column = SORTS.get(sort, sort)
+        if column not in SCENES.names or not pa.types.is_primitive(SCENES.field(column).type):
+            raise ValueError(
+                f"--sort {sort}: expected drive, random, {', '.join(SORTS)} or a numeric column of the scenes table, "
+                "such as num_pole or road_area_m2"
+            )
+        return column
+
+    def choose(self, count: int, sort: str, pick: str = "spread", seed: int = 0) -> np.ndarray:
+        """Indices of at most `count` scenes in the order of `sort`.
+
+        `pick` is spread (evenly from least to most), lowest or highest; `sort` is random, drive (sequence and
+        frame) or what `sort_column` knows. Scenes without a value are left out.
+        """
+        if sort == "random":
+            return self.draw(count, seed)
+        if sort == "drive":
+            keys = [(name, "ascending") for name in ("source", "split", "sequence", "frame")]
+            order = pc.sort_indices(self.scenes, keys).to_numpy()
+        else:
+            values = self.column(self.sort_column(sort)).astype(float)
+            order = np.argsort(values, kind="stable")[: np.isfinite(values).sum()]
+            if len(order) == 0:
+                raise ValueError(f"--sort {sort}: no scene of {self.root} has a value there")
+        if pick == "spread":
+            return self.spread(order, count)
+        return order[:count] if pick == "lowest" else order[::-1][:count]
+
+    def chunks(self, indices: Sequence[int], size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
+        """The scenes at `indices`, at most `size` at a time from one shard: shard, rows in it, places in `indices`."""
+        for shard in np.unique(self.shard[indices]):
+            places = np.flatnonzero(self.shard[indices] == shard)
+            for start in range(0, len(places), size):
+                chosen = places[start : start + size]
+                yield self.shards[shard], self.row[indices[chosen]].tolist(), chosen.tolist()
