@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -22,15 +22,11 @@ from pipelines.generation.sample import (
 )
 from pipelines.io.mesh_export import export_glb
 from pipelines.metrics.reconstruction import sum_pairs
-from pipelines.rendering.render import render_outlined_bev
-from pipelines.reporting.report import Picture, Pictures, Table, render_report_html
+from pipelines.reporting.inpaint_report import InpaintExample, render_inpaint_html
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
-
-PICTURE_PX = 512
-PER_ROW = 4  # pictures of a scene: as given, and its first results
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,9 @@ def inpaint_one(
         request.repaint,
         request.guidance_scale,
     ):
-        drifts += [compute_drift(known, raw, step.region) for known, raw in zip(step.known, step.made, strict=True)]
+        drifts += [
+            compute_drift(known, raw, step.region) for known, raw in zip(step.known, step.generated, strict=True)
+        ]
     made = [
         replace(
             canvas,
@@ -175,16 +173,25 @@ def inpaint_scenes(
     pictures: int = 8,
     on_scene: Callable[[], None] | None = None,
 ) -> dict[str, float | None]:
-    """Make the selected scenes anew, write tables, GLB files and a page; returns the drift. Goes on where it stopped.
+    """Regenerate a region of the selected scenes; write tables, GLB files and a page. An interrupted run resumes.
 
-    Raises ValueError if the output holds a run made with other options, or for a region that a scene does not have.
+    Args:
+        request: The region, what to regenerate in it, and how.
+        selection: The scenes.
+        num_actors: Number of pipelines that work concurrently.
+        pictures: Maximum number of scenes on the page.
+        on_scene: Called after each scene.
+
+    Returns:
+        How far the decoders' output is off outside the region (`compute_drift_scores`).
+
+    Raises:
+        ValueError: The output holds a run made with other options, or a scene has no pixel in the region.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
-    request.where.region(
-        resample_to_model_resolution(first.scenes([row])[0], pipeline.spec)
-    )  # wrong everywhere is wrong here
+    request.where.region(resample_to_model_resolution(first.scenes([row])[0], pipeline.spec))  # fails early
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
     guard_generation_run(
@@ -194,31 +201,21 @@ def inpaint_scenes(
         input=asdict(selection),
         scenes=selection.files(),
     )
+
+    def list_examples() -> Iterator[InpaintExample]:
+        for number, (source, position) in enumerate(chosen[:pictures]):
+            given = resample_to_model_resolution(source.scenes([position])[0], pipeline.spec)
+            region = find_regenerated_pixels(pipeline, given, request.where)
+            yield InpaintExample(given, region, request.shard(number).scenes())
+
     drifts = []
     for row in map_actors(range(len(chosen)), Inpainter, (request, chosen), num_actors):
         drifts += row["drift"]
         if on_scene:
             on_scene()
     scores = compute_drift_scores(drifts)
-    shown = []
-    for number, (source, position) in enumerate(chosen[:pictures]):
-        given = resample_to_model_resolution(source.scenes([position])[0], pipeline.spec)
-        new = find_regenerated_pixels(pipeline, given, request.where)
-        made = request.shard(number).scenes()[: PER_ROW - 1]
-        shown.append(Picture(given.scene_id, render_outlined_bev(given, new, PICTURE_PX), "given"))
-        shown += [Picture(scene.scene_id, render_outlined_bev(scene, new, PICTURE_PX), "made anew") for scene in made]
-    columns = min(PER_ROW, 1 + request.variants)
-    note = f"Inside the red line {describe_contents(request.contents)} made anew; the rest is the given scene's."
-    how = (
-        "The latent outside the region is the given scene's, bit for bit, but decoders see all of it: the table says how "
-        "far their raw output is off there. The scenes above and in the tables take that part from the given scene."
+    storage.write_text(
+        render_inpaint_html(request.run, request.contents, request.variants, list_examples(), scores),
+        storage.join_uri(request.output, f"{request.run}.html"),
     )
-    table = Table("Drift outside the region", tuple(scores), [tuple(scores.values())], note=how)
-    html = render_report_html("Inpainting", [Pictures("Scenes", shown, columns, note), table], request.run)
-    page = storage.join_uri(request.output, f"{request.run}.html")
-    storage.write_text(html, page)
     return scores
-
-
-def describe_contents(contents: Contents) -> str:
-    return {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}[contents]

@@ -22,7 +22,7 @@ from pipelines.preprocess.sources import argoverse2, custom, kitti360
 from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town import generator
 from pipelines.runtime import storage
-from pipelines.schema.dataset import merge_extremes
+from pipelines.schema.dataset import Extremes, merge_extremes
 from pipelines.schema.tables import MAX_HEIGHT_M, make_rejects_table, make_scene_tables
 
 BATCH_SCENES = 32
@@ -97,9 +97,6 @@ class ShardCut:
     def _reject(self, part: ShardPart, frame: int | None, reason: str) -> None:
         name = f"{self.task.source}-{part.sequence}" + ("" if frame is None else f"-{frame:010d}")
         self.rejects.append({"scene_id": name, "sequence": part.sequence, "frame": frame, "reason": reason})
-
-
-Extremes = dict[str, list[list[float]]]  # name -> [lowest, highest], a number per entry
 
 
 def compute_extremes(scenes: list[Scene]) -> Extremes:

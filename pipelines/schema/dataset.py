@@ -18,6 +18,7 @@ from pipelines.schema.density_labels import DensityThresholds, classify_density,
 from pipelines.schema.tables import SCENES, Shard
 
 DESCRIPTION = "dataset.json"
+Extremes = dict[str, list[list[float]]]  # name -> [lowest, highest], a number per entry
 # What ground heights are: tops of slabs, 0.3 m above what objects stand on, or that surface itself.
 SURFACE = {"town": "top", "kitti360": "top", "av2": "surface", "own": "surface"}
 
