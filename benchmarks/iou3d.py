@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/unit"))
 
 import numpy as np
 from common import DENSE_SEEDS, interleaved, ratios, spread, where

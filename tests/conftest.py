@@ -4,11 +4,12 @@ import os
 from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 # Some virtual machines say that they have AMX and stop whoever uses it (oneDNN does, for bfloat16): illegal instruction.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
-WITH_SMOKE = {f"tests/test_{name}.py" for name in ("evaluate_job", "generation_jobs", "publish", "voxel_import")}
+WITH_SMOKE = {"test_evaluate_job", "test_generation_jobs", "test_publish", "test_voxel_import"}
 LONG = ("evaluate_job", "generation_jobs", "voxel_import", "faults", "jobs", "commands", "ablation", "ingest", "street")
 
 
@@ -27,7 +28,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             module = super()._split_scope(nodeid)
-            return "smoke" if module in WITH_SMOKE else module
+            return "smoke" if Path(module).stem in WITH_SMOKE else module
 
     return Scheduling(config, log)
 
@@ -35,7 +36,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data beside the checkout."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    beside = ROOT.parent / "shared" / "data"
     path = Path(os.environ.get("PRITTI_TEST_DATA") or beside)
     if not path.is_dir():
         pytest.skip(f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/")

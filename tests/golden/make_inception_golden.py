@@ -6,7 +6,7 @@ beside CPU torch), from the root of the repository:
 
     python3 -m venv /tmp/fidelity
     /tmp/fidelity/bin/pip install torch===2.13.0 torchvision==0.28.0 torch-fidelity==0.4.0 safetensors
-    PYTHONPATH=.:tests /tmp/fidelity/bin/python tests/golden/make_inception_golden.py
+    PYTHONPATH=. /tmp/fidelity/bin/python tests/golden/make_inception_golden.py
 """
 
 import json
