@@ -1,8 +1,10 @@
 """Helpers for several test modules: the repository's root, scenes, a tiny pipeline, a job as a process, an HTML parser."""
 
 import os
+import socket
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,12 +16,25 @@ from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline, Resampling, scheduler
 from models.presets import LVAE_PRESETS
-from models.scene import CATEGORIES, KITTI_GROUND_CLASSES, Grid, Scene, canonical_boxes, yaw_rotation
+from models.scene import (
+    CATEGORIES,
+    CATEGORY_INDEX,
+    KITTI_GROUND_CLASSES,
+    PER_PRIMITIVE,
+    Grid,
+    Scene,
+    canonical_boxes,
+    yaw_rotation,
+)
+from pipelines.schema.palette import CLASS_ID, EMPTY
 
 ROOT = Path(__file__).parents[1]  # of the repository
 LATENT_SHAPE = (4, 8, 8)
 VOID = {"meta", "img", "line", "polyline", "rect", "circle"}  # elements without a closing tag
 QUICK = Resampling(num_steps=6, jump_length=2, resamplings=2)
+SHARD_SIZES = (5, 3, 7, 4, 6)
+TOWN_SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}  # of the dataset that the fixture town_dataset writes
+REJECT_REASON = "heights <beyond> 327 m"
 
 
 def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) -> np.ndarray:
@@ -167,3 +182,51 @@ class Page(HTMLParser):
 
     def all(self, tag):
         return [attrs for name, attrs in self.elements if name == tag]
+
+
+def assert_same_primitives(got: Scene, want: Scene, but: tuple[str, ...] = ()) -> None:
+    for name in set(PER_PRIMITIVE) - set(but):
+        assert np.array_equal(getattr(got, name), getattr(want, name), equal_nan=name == "heading_rad"), name
+
+
+class SvgPage(Page):
+    """A page whose drawings have shapes with a title: only these tags stay open."""
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+
+def street_class_ids(rows: int = 44, cols: int = 60) -> np.ndarray:
+    """Sky above a road with a car."""
+    ids = np.full((rows, cols), EMPTY, np.uint8)
+    ids[rows // 2 :], ids[rows // 2 : rows // 2 + 8, 20:40] = CLASS_ID["road"], CLASS_ID["vehicle_small"]
+    return ids
+
+
+def save_npz(path, voxels: np.ndarray, name: str = "voxels") -> str:
+    np.savez(path, **{name: voxels})
+    return str(path)
+
+
+def studio_scene(number: int) -> Scene:
+    """Three cars on ground, on the model's grid."""
+    scene = random_scene(number, 3, grid=small_spec().grid, tilt_rad=0, vegetation_density="low")
+    center_m = np.array([[12, 0, 0.5], [30, 4, 0.5], [50, -6, 0.5]], np.float32)
+    size_m = np.tile(np.array([[4.2, 1.8, 1.5]], np.float32), (3, 1))
+    rotation = np.tile(np.eye(3, dtype=np.float32), (3, 1, 1))
+    occupied = np.ones_like(scene.occupied)
+    boxes = {
+        "center_m": center_m,
+        "size_m": size_m,
+        "rotation": rotation,
+        "category": np.full(3, CATEGORY_INDEX["vehicle_small"], np.int8),
+    }
+    return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=None, **boxes)
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]

@@ -4,18 +4,15 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
-from helpers import random_scene
+from helpers import assert_same_primitives, random_scene
 
 from models.geometry.iou3d import boxes_of, iou3d_matrix
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, PER_PRIMITIVE, Scene, canonical_boxes
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Scene, canonical_boxes
 from pipelines.editing import edit
 from pipelines.editing.edit import Select, edits_from_json, edits_to_json, replayed
 from pipelines.io.mesh_export import scene_triangles
 from pipelines.metrics.validity import SLAB_OFFSET_M, faults, scene_validity, validity_rates
-from pipelines.preprocess.sources.town.generator import town_drive
-from pipelines.schema.tables import Shard, read_scenes
 
 CAR = CATEGORY_INDEX["vehicle_small"]
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
@@ -30,17 +27,8 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def town_scenes() -> list[Scene]:
-    drive = town_drive(3)
-    return [drive.scene(k, split) for k, split in ((0, "train"), (20, "train"), (40, "test"), (60, "test"))]
-
-
-def corner_sets(scene: Scene) -> np.ndarray:
-    """(n, 8, 3) float64, each box's corners in a fixed order."""
-    corners = (SIGNS * scene.size_m[:, None].astype(float)) @ np.swapaxes(scene.rotation, 1, 2) + scene.center_m[
-        :, None
-    ]
-    return np.stack([box[np.lexsort(np.round(box, 3).T)] for box in corners])
+def town_scenes(town_drive_3) -> list[Scene]:
+    return [town_drive_3.scene(k, split) for k, split in ((0, "train"), (20, "train"), (40, "test"), (60, "test"))]
 
 
 def assert_canonical(scene: Scene) -> None:
@@ -48,11 +36,6 @@ def assert_canonical(scene: Scene) -> None:
     assert np.array_equal(size_m, scene.size_m)
     assert np.allclose(rotation, scene.rotation, atol=1e-6)
     assert np.allclose(np.linalg.det(scene.rotation.astype(float)), 1, atol=1e-5)
-
-
-def assert_same(got: Scene, want: Scene, but: tuple[str, ...] = ()) -> None:
-    for name in set(PER_PRIMITIVE) - set(but):
-        assert np.array_equal(getattr(got, name), getattr(want, name), equal_nan=name == "heading_rad"), name
 
 
 # ------------------------------------------------------------------------------------------------------ selection
@@ -112,13 +95,13 @@ def test_remove_and_duplicate(scene):
     cars = scene.category == CAR
     removed, (done,) = replayed(scene, [edit.Remove(Select(category=("vehicle_small",)))])
     assert done.primitive.tolist() == np.flatnonzero(cars).tolist() and cars.any() and set(done.change) == {"removed"}
-    assert_same(removed, scene.select(~cars))
+    assert_same_primitives(removed, scene.select(~cars))
     doubled, (done,) = replayed(scene, [edit.Duplicate(Select(category=("vehicle_small",)), by_m=(1, -2, 2))])
     assert done.primitive.tolist() == np.flatnonzero(cars).tolist() and set(done.change) == {"copied"}
     assert np.allclose(done.moved_m, 3, atol=1e-5)
-    assert_same(doubled.select(np.arange(60)), scene)
+    assert_same_primitives(doubled.select(np.arange(60)), scene)
     copies = doubled.select(np.arange(60, len(doubled)))
-    assert_same(copies, scene.select(cars), but=("center_m", "instance_id"))
+    assert_same_primitives(copies, scene.select(cars), but=("center_m", "instance_id"))
     assert np.array_equal(copies.center_m, scene.center_m[cars] + np.array([1, -2, 2], np.float32))
     assert (copies.instance_id == -1).all()
 
@@ -130,7 +113,7 @@ def test_translate_along_the_scene_and_along_each_ones_own_way(scene):
     assert np.allclose(done.moved_m, np.linalg.norm([1.5, -2, 0.25]), atol=1e-5)
     way_m = moved.center_m - scene.center_m
     assert np.abs(way_m[[3, 4, 8]] - [1.5, -2, 0.25]).max() < 1e-5 and not np.delete(way_m, [3, 4, 8], 0).any()
-    assert_same(moved, scene, but=("center_m",))
+    assert_same_primitives(moved, scene, but=("center_m",))
     driven, _ = replayed(scene, [edit.Translate(ALL, (2, 0, 0), "own")])
     way_m = (driven.center_m - scene.center_m) / 2
     length = scene.rotation[:, :, 0]
@@ -197,7 +180,7 @@ def test_relabel_changes_the_kind_too(scene):
     made, _ = replayed(scene, [edit.Relabel(Select(where="length_m > 4"), "vegetation_ellipsoid")])
     long = scene.size_m[:, 0] > 4
     assert (made.category[long] == ELLIPSOID).all() and (made.label[long] == "vegetation_ellipsoid").all()
-    assert_same(made, scene, but=("category", "label"))
+    assert_same_primitives(made, scene, but=("category", "label"))
     assert np.array_equal(made.category[~long], scene.category[~long])
     with pytest.raises(ValueError, match="'tree' is unknown"):
         replayed(scene, [edit.Relabel(ALL, "tree")])
@@ -277,11 +260,11 @@ def test_what_cannot_be_pushed_far_enough_shrinks_or_goes():
     assert len(mended) == 1 and mended.existence[0] == np.float32(0.9)
     assert done.primitive.tolist() == [1] and done.change.tolist() == ["removed"]
     kept, done = replayed(deep, [edit.Repair(ALL, drop=False)])
-    assert_same(kept, deep)
+    assert_same_primitives(kept, deep)
     far, _ = replayed(deep, [edit.Repair(ALL, push_m=1.5)])
     assert len(far) == 2 and overlap(far) < 0.05
     other, _ = replayed(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # who is not chosen stays
-    assert_same(other.select(np.array([1])), deep.select(np.array([1])))
+    assert_same_primitives(other.select(np.array([1])), deep.select(np.array([1])))
     assert overlap(other) < 0.05
     small = two_boxes(-0.8)
     shrunk, (done,) = replayed(small, [edit.Repair(ALL, push_m=0.2)])
@@ -327,7 +310,7 @@ def test_a_list_replays_to_the_last_bit_after_a_round_trip(scene):
     again = edits_from_json(json.loads(json.dumps(edits_to_json(LIST))))
     assert again == LIST and {e.name for e in LIST} == set(edit.EDITS)
     first, second = replayed(scene, LIST)[0], replayed(scene, again)[0]
-    assert_same(first, second)
+    assert_same_primitives(first, second)
     assert len(first) != len(scene) or not np.array_equal(first.center_m, scene.center_m)
 
 
@@ -349,64 +332,3 @@ def test_a_list_replays_to_the_last_bit_after_a_round_trip(scene):
 def test_a_wrong_list_is_refused(content, message):
     with pytest.raises(ValueError, match=message):
         edits_from_json(content)
-
-
-# ------------------------------------------------------------------------------------------------- a whole table
-
-
-@pytest.fixture(scope="module")
-def table(town_scenes, tmp_path_factory) -> str:
-    root = str(tmp_path_factory.mktemp("town"))
-    Shard(root, "town", "train", 0).write(town_scenes[:2])
-    Shard(root, "town", "test", 0).write(town_scenes[2:])
-    return root
-
-
-def test_edits_over_a_table(table, town_scenes, tmp_path, cluster):
-    from jobs.edit_scenes import Remove, Replay, edit_scenes
-
-    options = {"input": table, "output": str(tmp_path / "out"), "run": "bare"}
-    trees = Remove(category=("vegetation_ellipsoid", "vegetation_cuboid"), **options)
-    made = edit_scenes(trees)
-    edited = {scene.scene_id: scene for scene in read_scenes(options["output"], "edited-bare")}
-    assert (made.scenes, made.rejects, len(edited)) == (4, 0, 4)
-    gone = 0
-    for scene in town_scenes:
-        keep = ~np.isin(scene.category, [0, 1])
-        gone += (~keep).sum()
-        got = edited[scene.scene_id]
-        assert_same(got, scene.select(keep))
-        assert got.split == scene.split and np.array_equal(got.occupied, scene.occupied)
-    assert gone and made.table.rows == [(0, "remove", "removed", 4, gone, 0, 0, 0)]
-    assert "data:image/png" in (tmp_path / "out" / "bare.html").read_text()
-    rows = pq.read_table(str(tmp_path / "out" / "edits"), partitioning=None).to_pylist()
-    assert len(rows) == gone and {(row["edit"], row["change"]) for row in rows} == {("remove", "removed")}
-
-    part = next((tmp_path / "out" / "scenes" / "source=edited-bare" / "split=test").glob("*.parquet"))
-    written = part.stat().st_mtime_ns
-    assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # nothing is done twice
-    with pytest.raises(ValueError, match="holds a run 'bare' with other edits; choose another --run"):
-        edit_scenes(Remove(category=("pole",), **options))
-
-    record = str(tmp_path / "out" / "edited-bare.json")
-    again = edit_scenes(Replay(edits=record, **options | {"output": str(tmp_path / "again"), "pictures": 0}))
-    assert again.table.rows == made.table.rows
-    for scene in read_scenes(str(tmp_path / "again"), "edited-bare"):
-        assert_same(scene, edited[scene.scene_id])
-
-
-def test_a_scene_that_cannot_be_edited_is_rejected_and_the_rest_goes_on(table, town_scenes, tmp_path, cluster):
-    from jobs.edit_scenes import Remove, edit_scenes
-
-    last = max(len(scene) for scene in town_scenes) - 1
-    fits = sum(len(scene) > last for scene in town_scenes)
-    assert 0 < fits < len(town_scenes)
-    made = edit_scenes(Remove(primitives=(last,), input=table, output=str(tmp_path), pictures=0))
-    assert (made.scenes, made.rejects) == (fits, 4 - fits)
-    rejects = pq.read_table(str(tmp_path / "rejects"), partitioning=None).to_pylist()
-    assert {row["scene_id"] for row in rejects} == {s.scene_id for s in town_scenes if len(s) <= last}
-    assert all("primitives, from 0 on, not" in row["reason"] for row in rejects)
-    with pytest.raises(ValueError, match="none of the 4 scenes can be edited so; the first: edit 0"):
-        edit_scenes(Remove(primitives=(9999,), input=table, output=str(tmp_path), run="none"))
-    with pytest.raises(ValueError, match="nothing is changed: no primitive in 4 scene"):
-        edit_scenes(Remove(where="length_m > 900", input=table, output=str(tmp_path), run="nothing"))

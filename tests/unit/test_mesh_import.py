@@ -11,7 +11,6 @@ from helpers import random_rotations, random_scene
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, Grid, Scene, canonical_boxes
 from pipelines.io.mesh_export import scene_glb
 from pipelines.io.mesh_import import scene_from_glb
-from pipelines.preprocess.sources.town.generator import town_drive
 from pipelines.schema.palette import COLOR_HEX, rgb
 
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
@@ -20,9 +19,8 @@ CAR = CATEGORY_INDEX["vehicle_small"]
 
 
 @pytest.fixture(scope="module")
-def town_scenes() -> list[Scene]:
-    drive = town_drive(3)
-    return [drive.scene(k, "test") for k in (0, len(drive) // 2)]
+def town_scenes(town_drive_3) -> list[Scene]:
+    return [town_drive_3.scene(k, "test") for k in (0, len(town_drive_3) // 2)]
 
 
 def corners_m(scene: Scene) -> np.ndarray:

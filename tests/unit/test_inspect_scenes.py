@@ -1,7 +1,5 @@
 """What people look at shows what the tables hold."""
 
-import base64
-import io
 import re
 from collections import Counter
 from dataclasses import replace
@@ -11,78 +9,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import Page as PlainPage
-from helpers import random_scene
-from PIL import Image
+from helpers import REJECT_REASON, TOWN_SLOTS, SvgPage, random_scene
 from scipy.spatial import ConvexHull
 
-from jobs.inspect_scenes import OneScene, Report, Sheet, draw_scenes, draw_sheet, write_page
-from models.layout import LayoutSpec
+from jobs.inspect_scenes import OneScene, Report, draw_scenes, write_page
 from models.scene import CATEGORIES, ELLIPSOID, Grid
 from pipelines.io.mesh_export import cuboid_triangles, ellipsoid_triangles
-from pipelines.preprocess.sources.town.generator import town_drive
 from pipelines.rendering.render import bev_picture, picture_3d
 from pipelines.reporting.contact_sheet import (
     RAMP,
     Catalogue,
-    View,
     best_columns,
     footprints_m,
     heights_picture,
-    paint,
     scene_plate,
 )
 from pipelines.reporting.dataset_charts import MAX_NAMED, count_bins, count_histogram, track_map
 from pipelines.reporting.dataset_report import dataset_html, read_facts
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, rejects_table
-
-SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}
-REASON = "heights <beyond> 327 m"
-
-
-class Page(PlainPage):
-    """In drawings any shape may hold a title."""
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
+from pipelines.schema.tables import Shard
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory):
-    """A town dataset of 8 + 4 scenes in three shards, with rejects and readers' reports, written without Ray."""
-    root = str(tmp_path_factory.mktemp("inspect") / "town")
-    for seed, split, number, count in ((0, "train", 0, 5), (1, "train", 1, 3), (1_000_000, "test", 0, 4)):
-        drive = town_drive(seed)
-        poses = np.linspace(0, len(drive) - 1, count).astype(int)
-        densities = ("low", "medium", "high", "medium", "medium")
-        scenes = [
-            replace(drive.scene(int(pose), split), vegetation_density=label, vehicle_density="medium")
-            for pose, label in zip(poses, densities, strict=False)
-        ]
-        Shard(root, "town", split, number).write(scenes)
-    lost = [{"scene_id": f"town-00000-{k:010d}", "sequence": "00000", "frame": k, "reason": REASON} for k in (1, 2)]
-    storage.write_parquet(rejects_table(lost), Shard(root, "town", "train", 0).path("rejects"))
-    report = {"objects": 9, "boxes": 5, "dropped": {"bridge": 2}, "duplicates": 1}
-    defects = {"defects": [{"index": 7, "label": "car", "reason": "sheared flat"}]}
-    thresholds = {"count_p25": 10.0, "count_p75": 90.0, "volume_p25_m3": 100.0, "volume_p75_m3": 9000.0}
-    description = {
-        "source": "town",
-        "options": {"num_train": 8, "seed": 0},
-        "layout": LayoutSpec(categories=tuple(SLOTS), slots=tuple(SLOTS.values())).to_dict(),
-        "vegetation_thresholds": thresholds,
-        "vehicle_thresholds": thresholds,
-        "reports": {"00000": report | {"defects": []}, "00001": report | defects},
-    }
-    storage.write_json(description, f"{root}/dataset.json")
-    return root
-
-
-@pytest.fixture(scope="module")
-def facts(town):
-    return read_facts(town)
+def facts(town_dataset):
+    return read_facts(town_dataset)
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +50,8 @@ def generated(tmp_path_factory):
 # -------------------------------------------------------------------------------------------------- which scenes
 
 
-def test_scenes_are_found_by_id(town):
-    catalogue = Catalogue.read(town)
+def test_scenes_are_found_by_id(town_dataset):
+    catalogue = Catalogue.read(town_dataset)
     names = catalogue.column("scene_id")
     found = catalogue.find([names[7], names[0]])
     assert found.tolist() == [7, 0] and len(catalogue) == 12
@@ -110,8 +60,8 @@ def test_scenes_are_found_by_id(town):
     assert loaded[0].split == "train" and len(loaded[0]) == catalogue.column("num_primitives")[7]
 
 
-def test_an_unknown_id_is_refused_with_some_that_exist(town):
-    catalogue = Catalogue.read(town)
+def test_an_unknown_id_is_refused_with_some_that_exist(town_dataset):
+    catalogue = Catalogue.read(town_dataset)
     with pytest.raises(ValueError, match=r"no scene 'town-9' among 12; there are: ") as error:
         catalogue.find(["town-9"])
     named = str(error.value).split("there are: ")[1].split(", ")
@@ -122,8 +72,8 @@ def test_an_unknown_id_is_refused_with_some_that_exist(town):
 
 
 @pytest.mark.parametrize("sort, column", [("vegetation", "vegetation_volume_m3"), ("num_pole", "num_pole")])
-def test_scenes_are_chosen_in_order(town, sort, column):
-    catalogue = Catalogue.read(town)
+def test_scenes_are_chosen_in_order(town_dataset, sort, column):
+    catalogue = Catalogue.read(town_dataset)
     values = catalogue.column(column)
     ordered = np.sort(values)
     assert np.array_equal(values[catalogue.choose(99, sort)], ordered)
@@ -132,8 +82,8 @@ def test_scenes_are_chosen_in_order(town, sort, column):
     assert np.array_equal(values[catalogue.choose(4, sort)], ordered[[1, 4, 7, 10]])
 
 
-def test_scenes_are_chosen_along_the_drives_or_at_random(town):
-    catalogue = Catalogue.read(town)
+def test_scenes_are_chosen_along_the_drives_or_at_random(town_dataset):
+    catalogue = Catalogue.read(town_dataset)
     rows = list(zip(*(catalogue.column(n) for n in ("split", "sequence", "frame")), strict=True))
     assert [rows[k] for k in catalogue.choose(99, "drive")] == sorted(rows)
     drawn = catalogue.choose(5, "random", seed=1)
@@ -148,8 +98,8 @@ def test_scenes_are_chosen_along_the_drives_or_at_random(town):
 # ------------------------------------------------------------------------------------------------------ pictures
 
 
-def test_a_plate_holds_the_pictures_of_render(town):
-    (scene,) = islice((s for s in Shard(town, "town", "test", 0).scenes()), 1)
+def test_a_plate_holds_the_pictures_of_render(town_dataset):
+    (scene,) = islice((s for s in Shard(town_dataset, "town", "test", 0).scenes()), 1)
     plate, boxes = scene_plate(scene)
     assert set(boxes) == {"bev", "3d", "ground", "heights", "primitives"}
     bev, ground, oblique = boxes["bev"], boxes["ground"], boxes["3d"]
@@ -208,23 +158,6 @@ def test_a_sheet_is_about_five_to_four(count, aspect):
         assert 0.6 < columns * aspect / -(-count // columns) < 2.2
 
 
-def test_pictures_made_by_ray_are_those_of_render(cluster, town, tmp_path):
-    catalogue = Catalogue.read(town)
-    chosen = np.array([11, 0, 4, 6])
-    painted = paint(catalogue, chosen, (View("bev", 96), View("3d", 80)))
-    names = catalogue.column("scene_id")
-    scenes = {s.scene_id: s for shard in catalogue.shards for s in shard.scenes()}
-    for k, (above, oblique) in zip(chosen, painted, strict=True):
-        assert np.array_equal(above, bev_picture(scenes[names[k]], 96, supersample=2))
-        assert np.array_equal(oblique, picture_3d(scenes[names[k]], 80, 60))
-    config = Sheet(dataset=town, split="train", sort="vegetation", size=96, output=str(tmp_path / "sheet.png"))
-    sheet = np.asarray(Image.open(draw_sheet(config)))
-    order = Catalogue.read(town, split="train").choose(8, "vegetation")
-    picture = bev_picture(scenes[Catalogue.read(town, split="train").column("scene_id")[order[0]]], 96, supersample=2)
-    inside = np.lib.stride_tricks.sliding_window_view(sheet[:, :, 0], (94, 94))[:200, :60]
-    assert (inside == picture[1:-1, 1:-1, 0]).all(axis=(2, 3)).any()  # first on the sheet; a line frames it
-
-
 # ------------------------------------------------------------------------------------------------------ the page
 
 
@@ -243,26 +176,34 @@ def test_histograms_hold_every_scene_once(counts):
 
 def test_the_page_is_whole_and_fetches_nothing(facts):
     html = dataset_html(facts)
-    page = Page(html)
+    page = SvgPage(html)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
     assert not page.all("script") and not page.all("link")
     assert "[drawings of section" not in html
-    for text in ("12", "8 train, 4 test", REASON, "town-00000-0000000001", "bridge", "sheared flat", "beyond> 327 m"):
+    for text in (
+        "12",
+        "8 train, 4 test",
+        REJECT_REASON,
+        "town-00000-0000000001",
+        "bridge",
+        "sheared flat",
+        "beyond> 327 m",
+    ):
         assert text in page.text
 
 
-def test_the_page_says_what_the_tables_hold(facts, town):
+def test_the_page_says_what_the_tables_hold(facts, town_dataset):
     html = dataset_html(facts)
-    scenes = [s for shard in Catalogue.read(town).shards for s in shard.scenes()]
+    scenes = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes()]
     for k, name in enumerate(CATEGORIES):
         counts = np.array([s.counts()[k] for s in scenes])
         drawn = re.findall(rf'<svg[^>]*aria-label="scenes by number of {name.replace("_", " ")}".*?</svg>', html)
-        assert len(drawn) == (counts.any() or name in SLOTS)
+        assert len(drawn) == (counts.any() or name in TOWN_SLOTS)
         assert all(sum(histogram_titles(svg)) == len(scenes) for svg in drawn)
         if counts.any():
             sizes = np.concatenate([s.size_m[s.category == k] for s in scenes])
             assert np.array_equal(np.sort(facts.sizes_m[name], axis=0), np.sort(sizes, axis=0))
-    for name, slots in SLOTS.items():
+    for name, slots in TOWN_SLOTS.items():
         counts = [s.counts()[CATEGORIES.index(name)] for s in scenes if s.split == "train"]
         p95 = max(1, int(np.ceil(np.percentile(counts, 95))))
         svg = re.search(rf'aria-label="scenes by number of {name.replace("_", " ")}".*?</svg>', html).group()
@@ -271,9 +212,9 @@ def test_the_page_says_what_the_tables_hold(facts, town):
     assert total == sum(map(len, scenes)) == sum(map(len, facts.sizes_m.values()))
 
 
-def test_ground_shares_and_labels_add_up(facts, town):
+def test_ground_shares_and_labels_add_up(facts, town_dataset):
     html = dataset_html(facts)
-    low = [s for shard in Catalogue.read(town).shards for s in shard.scenes() if s.vegetation_density == "low"]
+    low = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes() if s.vegetation_density == "low"]
     share = np.mean([s.occupied[0].mean() for s in low])
     svg = re.search(r'aria-label="by vegetation density".*?</svg>', html).group()
     assert f">{100 * share:.1f} %<" in svg
@@ -318,24 +259,12 @@ def test_maps_of_many_sequences_fit_the_page(sequences):
 
 def test_a_generated_directory_has_a_page_without_dataset_json(generated, tmp_path):
     path = write_page(Report(dataset=generated, pictures=0, output=str(tmp_path / "page.html")))
-    page = Page(Path(path).read_text("utf-8"))
+    page = SvgPage(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
     for absent in ("p95", "slots", "Split map", "Label thresholds", "Rejected"):
         assert absent not in page.text
     cells = re.findall(r"<title>(\w+), (\w+): (\d+) scenes</title>", Path(path).read_text("utf-8"))
     assert ("low", "none", "4") in cells and len(cells) == 12
-
-
-def test_the_report_shows_scenes(cluster, town, tmp_path):
-    path = write_page(Report(dataset=town, source="town", split="test", pictures=2, output=str(tmp_path / "p.html")))
-    page = Page(Path(path).read_text("utf-8"))
-    images = page.all("img")
-    assert len(images) == 4 and all(image["src"].startswith("data:image/") for image in images)
-    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(images[2]["src"].split(",")[1]))).convert("RGB"))
-    catalogue = Catalogue.read(town, "town", "test")
-    k = catalogue.choose(2, "vegetation")[0]
-    want = bev_picture(Shard(town, "town", "test", 0).scenes([int(catalogue.row[k])])[0], 384, supersample=2)
-    assert shown.shape == want.shape and np.abs(shown.astype(int) - want).mean() < 4
 
 
 # -------------------------------------------------------------------------------------------------------- the job

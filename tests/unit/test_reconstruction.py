@@ -6,28 +6,22 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers import random_scene, small_spec
+from helpers import random_scene
 
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Scene
-from models.tensors import DecodedLayout, compact_layout, layout_batch
-from pipelines.evaluation.evaluate import flattened
+from models.tensors import DecodedLayout, compact_layout
 from pipelines.evaluation.reconstruction import (
-    Rebuilt,
     SceneRecord,
     chunks_of,
-    draw,
-    rebuild,
     reconstruction_scores,
     scene_record,
     table_bytes,
     voxel_grid,
 )
 from pipelines.metrics.intervals import Estimate
-from pipelines.reporting.reconstruction_report import reconstruction_html
 from pipelines.runtime import storage
 from pipelines.schema.scene_subset import Selection
-from pipelines.schema.tables import Shard
 
 LATENT = np.zeros((4, 8, 8), np.float32)
 SPEC = replace(
@@ -117,81 +111,21 @@ def test_a_scene_without_anything_is_scored(tmp_path):
 # ------------------------------------------------------------------------------------------------- the Ray graph
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    """Two shards of 7 and 4 scenes, and an LVAE that only knows their means."""
-    import torch
-
-    from models.lvae import LayoutVAE
-
-    root = tmp_path_factory.mktemp("rebuild")
-    scenes = [random_scene(k, n=25, split="test") for k in range(11)]
-    for number, part in enumerate((scenes[:7], scenes[7:])):
-        Shard(str(root), "town", "test", number).write(part)
-    torch.manual_seed(0)
-    spec = small_spec(pixels=64)
-    model = LayoutVAE(
-        spec.to_dict(), latent_channels=4, channels=(8, 16, 16), norm_groups=4, width=32, layers=1, heads=2,
-        hidden=32, head_hidden=32,
-    )  # fmt: skip
-    model.start_at(layout_batch(scenes, spec))
-    model.save_pretrained(root / "lvae")
-    return root
-
-
 def selection(root: Path) -> Selection:
     return Selection(str(root), "town", "test")
 
 
-def test_chunks_cover_a_selection_once(dataset):
-    chunks = chunks_of(selection(dataset), 3)
+def test_chunks_cover_a_selection_once(reconstruction_dataset):
+    chunks = chunks_of(selection(reconstruction_dataset), 3)
     assert [rows for _, rows in chunks] == [[0, 1, 2], [3, 4, 5], [6], [0, 1, 2], [3]]
     assert [shard.number for shard, _ in chunks] == [0, 0, 0, 1, 1]
 
 
-def test_bytes_of_tables_are_those_on_disk(dataset):
-    files = [p for p in dataset.rglob("*.parquet")]
-    assert table_bytes(chunks_of(selection(dataset), 3)) == pytest.approx(sum(p.stat().st_size for p in files) / 11)
-
-
-@pytest.fixture(scope="module")
-def rebuilt(dataset, cluster) -> Rebuilt:
-    return rebuild(selection(dataset), str(dataset / "lvae"))
-
-
-def test_scores_do_not_depend_on_chunks_and_workers(dataset, rebuilt):
-    done = []
-    again = rebuild(selection(dataset), str(dataset / "lvae"), 2, batch_size=3, on_scene=lambda: done.append(1))
-    assert len(done) == rebuilt.scores["scenes"] == len(rebuilt.scenes) == 11
-    first, second = flattened(rebuilt.scores), flattened(again.scores)
-    different = [name for name in first if first[name] != pytest.approx(second[name], rel=1e-3, abs=1e-6)]
-    assert first.keys() == second.keys() and not different
-
-
-def test_scenes_are_listed_best_first(dataset, rebuilt):
-    scenes = rebuilt.scenes
-    miou = scenes["voxel_miou"].to_pylist()
-    assert miou == sorted(miou, reverse=True)
-    ids = [shard.scenes(rows)[0].scene_id for shard, rows in rebuilt.places]
-    assert scenes["scene_id"].to_pylist() == ids and len(set(ids)) == 11
-    assert set(scenes["primitives"].to_pylist()) == {25}
-    assert min(scenes["ground_iou"].to_pylist()) >= 0 and max(scenes["found"].to_pylist()) <= 1
-
-
-def test_the_page_shows_truth_beside_reconstruction(dataset, rebuilt):
-    drawn = draw([rebuilt.places[0], rebuilt.places[-1]], str(dataset / "lvae"))
-    assert [row["scene_id"] for row in drawn] == rebuilt.scenes["scene_id"].take([0, 10]).to_pylist()
-    for row in drawn:
-        for view in ("above", "oblique"):
-            truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
-            differs = bool((truth != again).any())
-            assert truth.shape == again.shape == (480, 480, 3) and differs
-    html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:1], drawn[1:])
-    counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
-    assert counts == (8, 8, 0)  # self-contained
-    wanted = ("AP3D@50", "voxel mIoU", "Memory", "What the voxels leave out", "vegetation ellipsoid")
-    missing = [words for words in (*wanted, *(row["scene_id"] for row in drawn)) if words not in html]
-    assert not missing
+def test_bytes_of_tables_are_those_on_disk(reconstruction_dataset):
+    files = [p for p in reconstruction_dataset.rglob("*.parquet")]
+    assert table_bytes(chunks_of(selection(reconstruction_dataset), 3)) == pytest.approx(
+        sum(p.stat().st_size for p in files) / 11
+    )
 
 
 def test_one_mlflow_run_per_output_directory(tmp_path, monkeypatch):
