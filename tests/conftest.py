@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-# Some virtual machines say that they have AMX and stop whoever uses it (oneDNN does, for bfloat16): illegal instruction.
+# Some virtual machines report AMX but stop oneDNN, which uses it for bfloat16, with an illegal instruction.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 import numpy as np
@@ -65,9 +65,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data beside the checkout."""
-    beside = ROOT.parent / "shared" / "data"
-    path = Path(os.environ.get("PRITTI_TEST_DATA") or beside)
+    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data next to the repository."""
+    path = Path(os.environ.get("PRITTI_TEST_DATA") or ROOT.parent / "shared" / "data")
     if not path.is_dir():
         pytest.skip(f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/")
     return path
@@ -75,7 +74,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
-    """One small local Ray for all tests that need it, and a $PRITTI_HOME that is nobody's."""
+    """One small local Ray cluster for all tests, with an unused $PRITTI_HOME."""
     from jobs.support.cli import RAY_ENVIRONMENT
 
     settings = {
@@ -83,7 +82,7 @@ def cluster(tmp_path_factory):
         "RAY_AUTH_MODE": "disabled",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
-        "RAY_worker_niceness": "0",  # workers must not starve beside the tests of another process
+        "RAY_worker_niceness": "0",  # workers must not starve next to the tests of another process
         "DO_NOT_TRACK": "true",
     }
     os.environ.update(RAY_ENVIRONMENT | settings)
@@ -109,7 +108,7 @@ def cluster(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME of its own, in which the smoke presets have run once: data, models, latents."""
+    """A separate $PRITTI_HOME in which the smoke presets have run once: data, models, latents."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
     from jobs.train_dit import Config, train
@@ -120,7 +119,7 @@ def home(tmp_path_factory, cluster) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME for what comes after training: as `home`, but trained in this process, without Ray Train."""
+    """A $PRITTI_HOME for jobs after training: as `home`, but trained in this process, without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
     import torch
@@ -163,7 +162,7 @@ def layout_shards(tmp_path_factory) -> tuple[Shard, ...]:
 
 @pytest.fixture(scope="session")
 def town_dataset(tmp_path_factory) -> str:
-    """A town dataset of 8 + 4 scenes in three shards, with rejects and readers' reports, written without Ray."""
+    """A town dataset of 8 + 4 scenes in three shards, with rejects and reader reports, written without Ray."""
     root = str(tmp_path_factory.mktemp("inspect") / "town")
     for seed, split, number, count in ((0, "train", 0, 5), (1, "train", 1, 3), (1_000_000, "test", 0, 4)):
         drive = town_drive(seed)
@@ -195,7 +194,7 @@ def town_dataset(tmp_path_factory) -> str:
 
 @pytest.fixture(scope="session")
 def reconstruction_dataset(tmp_path_factory) -> Path:
-    """Two shards of 7 and 4 scenes, and an LVAE that only knows their means."""
+    """Two shards of 7 and 4 scenes, and an LVAE that predicts only their means."""
     import torch
 
     from models.lvae import LayoutVAE
@@ -265,7 +264,7 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
     controlnet = ControlNetModel(in_channels=4, conditioning_embedding_out_channels=(16, 32), **common)
     embedding = controlnet.controlnet_cond_embedding.conv_out
     for block in (*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block, embedding):
-        torch.nn.init.normal_(block.weight, std=0.5)  # zeros at first: the picture would not matter
+        torch.nn.init.normal_(block.weight, std=0.5)  # initially zero: the image would have no effect
     vae = AutoencoderKL(
         block_out_channels=(32, 64),
         down_block_types=("DownEncoderBlock2D",) * 2,

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 
-def test_a_reader_filters_opens_and_picks(gallery_page, gallery_scenes, browser):
+def test_gallery_page_filters_opens_and_picks(gallery_page, gallery_scenes, browser):
     browser.get(gallery_page.as_uri())
     assert browser.execute_script("return document.getElementById('count').textContent") == "3 of 3 scenes"
     fewest = min(len(scene) for scene in gallery_scenes)

@@ -13,7 +13,7 @@ from pipelines.io.mesh_import import scene_from_glb
 from pipelines.schema.tables import read_scenes
 
 
-def test_a_person_generates_moves_inpaints_undoes_and_downloads(studio_url, studio_files, browser, tmp_path):
+def test_studio_page_edits_inpaints_undoes_and_downloads(studio_url, studio_files, browser, tmp_path):
     browser.get(studio_url)
     browser.wait_for("document.body.dataset.ready === 'yes'")
     assert len(browser.find_elements("css selector", "#list button")) == 3

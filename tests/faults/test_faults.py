@@ -1,4 +1,4 @@
-"""Preprocessing survives: killed workers and drivers, full disks, files broken in two hundred ways."""
+"""Preprocessing tolerates killed workers and drivers, full disks and files damaged in two hundred ways."""
 
 import hashlib
 import io
@@ -50,7 +50,7 @@ TOWN_WORDS = ("jobs/preprocess_scenes.py", "town", "--num-train", "48", "--num-t
 
 
 def content(root: Path) -> dict[str, Any]:
-    """Everything below a directory by its path, tables row for row: a file too many is a difference."""
+    """All files of a directory by path, tables row by row, so that a surplus file is a difference."""
     files = {str(path.relative_to(root)): path for path in sorted(root.rglob("*")) if path.is_file()}
     return {
         name: pq.read_table(path, partitioning=None) if name.endswith(".parquet") else json.loads(path.read_text())
@@ -65,7 +65,7 @@ def assert_same(root: Path, undisturbed: Path) -> None:
 
 
 def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
-    """What is wrong with what a query over the tables finds at this moment."""
+    """Faults that a query over the tables would find at this moment."""
     wrong = []
     for path in [path for table in TABLES for path in (root / table).rglob("*.parquet")]:
         with suppress(FileNotFoundError):
@@ -83,7 +83,7 @@ def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
 
 @contextmanager
 def watched(root: Path) -> Iterator[None]:
-    """Asserts that at no moment half a shard is visible."""
+    """Asserts that a partial shard is never visible."""
     wrong, seen, stop = [], set(), threading.Event()
 
     def watch() -> None:
@@ -102,7 +102,7 @@ def watched(root: Path) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def town(cluster, tmp_path_factory) -> Path:
-    """A run that nothing disturbs."""
+    """The output of an undisturbed run."""
     root = tmp_path_factory.mktemp("undisturbed") / "town"
     preprocess(replace(TOWN, output=str(root)))
     assert len(list((root / "scenes").rglob("*.parquet"))) == 12
@@ -114,7 +114,7 @@ def town(cluster, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def shards(cluster, tmp_path_factory) -> tuple[list[Task], Path]:
-    """Eleven shards of one drive, which is read once by a task of its own; and a run that nothing disturbs."""
+    """Eleven shards of one drive, which a separate task reads once, and the output of an undisturbed run."""
     root = tmp_path_factory.mktemp("shards")
     write_kitti360(town_drive(7).at(np.arange(40, 84), CROP), root / "raw")
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -127,11 +127,11 @@ def shards(cluster, tmp_path_factory) -> tuple[list[Task], Path]:
 
 @contextmanager
 def killed_workers(quota: dict[str, int], seed: int) -> Iterator[list[str]]:
-    """SIGKILL to workers of this process's own Ray while they run these tasks, so many of each; who was hit."""
+    """Kills workers of this Ray while they run these tasks, up to a quota per task; yields the tasks."""
     rng, killed, stop = np.random.default_rng(seed), [], threading.Event()
 
     def kill() -> None:
-        # A wait is shorter than the slowed tasks, so that every kind is met.
+        # The wait is shorter than the slowed tasks, so that every kind of task is hit.
         while not stop.wait(rng.uniform(0.05, 0.4)) and len(killed) < sum(quota.values()):
             for process in rng.permutation(psutil.Process().children(recursive=True)):
                 with suppress(psutil.Error, IndexError):
@@ -157,11 +157,11 @@ def slowed(function: Callable, seconds: float) -> Callable:
         time.sleep(seconds)
         return result
 
-    slow.__qualname__ = function.__name__  # what Ray calls the task
+    slow.__qualname__ = function.__name__  # the name of the task in Ray
     return slow
 
 
-def test_workers_killed_at_any_time_change_nothing(shards, tmp_path, monkeypatch):
+def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatch):
     (tasks, undisturbed), quota = (
         shards,
         {"_drive_or_reason": 1, "Map(write)": 3, "training_statistics": 1, "Map(move)": 2},
@@ -179,8 +179,8 @@ def test_workers_killed_at_any_time_change_nothing(shards, tmp_path, monkeypatch
     assert_same(tmp_path, undisturbed)
 
 
-def test_workers_that_die_in_the_middle_of_a_file_change_nothing(shards, tmp_path, monkeypatch):
-    """Of a staged table, of a manifest, and of a table that is about to become visible: each time the first writer."""
+def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monkeypatch):
+    """The first writer of a staged table, of a manifest and of a table about to be published is killed."""
     (tasks, undisturbed), root, died = shards, tmp_path / "out", tmp_path / "died"
     died.mkdir()
     doomed = (
@@ -205,7 +205,7 @@ def test_workers_that_die_in_the_middle_of_a_file_change_nothing(shards, tmp_pat
                 whole(uri, die if uri.endswith(doomed) and not marker.exists() else write)
 
             def move(source: str, target: str) -> None:
-                time.sleep(0.1 * target.startswith(str(root)))  # a half shard would be seen
+                time.sleep(0.1 * target.startswith(str(root)))  # a partial shard would be visible
                 at_once(source, target)
 
             if not hasattr(storage, "armed"):
@@ -226,7 +226,7 @@ def test_workers_that_die_in_the_middle_of_a_file_change_nothing(shards, tmp_pat
 
 
 def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
-    """The job in a process of its own, SIGKILLed as soon as `when`; its Ray is gone on return."""
+    """Runs the job in a separate process and kills it as soon as `when` is true; its Ray has ended on return."""
     with log.open("w") as output:
         job = subprocess.Popen(
             [sys.executable, *TOWN_WORDS, str(root)],
@@ -240,7 +240,7 @@ def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             assert job.poll() is None, log.read_text()
             time.sleep(0.01)
     finally:
-        with suppress(psutil.NoSuchProcess):  # it ended by itself: the assertion says how
+        with suppress(psutil.NoSuchProcess):  # it ended by itself: the assertion reports how
             family = psutil.Process(job.pid).children(recursive=True)
             job.kill()
             job.wait()
@@ -251,7 +251,7 @@ def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             psutil.wait_procs(alive, timeout=5)
 
 
-def test_a_driver_killed_while_shards_are_staged_and_again_while_they_are_published_goes_on(town, tmp_path):
+def test_preprocess_resumes_after_driver_kills(town, tmp_path):
     root, log = tmp_path / "out", tmp_path / "log"
     staging = root / ".staging"
     with watched(root):
@@ -269,14 +269,14 @@ def test_a_driver_killed_while_shards_are_staged_and_again_while_they_are_publis
     assert_same(root, town)
 
 
-def test_a_driver_killed_before_it_tidies_up_leaves_nothing_in_the_end(town, tmp_path):
+def test_preprocess_removes_staging_of_killed_driver(town, tmp_path):
     shutil.copytree(town, tmp_path / "out")
     storage.write_json({}, str(tmp_path / "out/.staging/manifest/town-train-00000.json"))
     preprocess(replace(TOWN, output=str(tmp_path / "out")))
     assert_same(tmp_path / "out", town)
 
 
-def test_a_file_that_is_being_written_is_in_no_query(tmp_path):
+def test_write_whole_hides_unfinished_file_from_queries(tmp_path):
     table = pa.table({"value": [1]})
     storage.write_parquet(table, str(tmp_path / "part-00000.parquet"))
 
@@ -292,8 +292,8 @@ def test_a_file_that_is_being_written_is_in_no_query(tmp_path):
 # ------------------------------------------------------------------------------------------------------ full disks
 
 
-def test_a_full_disk_is_one_line_and_the_same_command_goes_on(town, tmp_path):
-    """A real one: a small tmpfs in a mount namespace of the job's own."""
+def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
+    """Uses a small tmpfs in a separate mount namespace."""
     full, left = tmp_path / "full", tmp_path / "left"
     full.mkdir()
     mount = 'mount -t tmpfs -o size=250k none "$0"'
@@ -315,7 +315,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_goes_on(town, tmp_path):
         pytest.xfail("a worker's traceback is still logged above that line")
 
 
-def test_a_write_that_fails_names_the_file_and_leaves_nothing(raw, tmp_path):
+def test_write_shard_names_failed_file_and_cleans_up(raw, tmp_path):
     (task,) = plan_kitti360(str(raw["kitti360"]), split=False)
     staging = tmp_path / "staging"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -334,8 +334,8 @@ def test_a_write_that_fails_names_the_file_and_leaves_nothing(raw, tmp_path):
 # ------------------------------------------------------------------------------------------------- unreadable drives
 
 
-def test_a_drive_without_poses_is_one_reject(cluster, raw, tmp_path):
-    """Its XML is there; poses.txt is not."""
+def test_preprocess_rejects_drive_without_poses(cluster, raw, tmp_path):
+    """Its XML exists; poses.txt is missing."""
     root = tmp_path / "raw"
     shutil.copytree(raw["kitti360"], root)
     (xml,) = root.glob("data_3d_bboxes/train_full/*.xml")
@@ -352,7 +352,7 @@ def test_a_drive_without_poses_is_one_reject(cluster, raw, tmp_path):
     assert [name for name in alone if name != "dataset.json" and alone[name] != made[name]] == []
 
 
-def test_poses_cut_off_anywhere_are_never_a_wrong_pose(raw, tmp_path):
+def test_read_poses_never_returns_truncated_pose(raw, tmp_path):
     root = tmp_path / "raw"
     shutil.copytree(raw["kitti360"], root)
     (path,) = root.glob("data_poses/*/poses.txt")
@@ -367,7 +367,7 @@ def test_poses_cut_off_anywhere_are_never_a_wrong_pose(raw, tmp_path):
         assert np.array_equal(got[1], world_from_imu[: len(got[1])])
 
 
-def test_poses_that_change_while_a_run_goes_on_are_noticed(raw, tmp_path):
+def test_write_shard_detects_poses_changed_during_run(raw, tmp_path):
     root, staging = tmp_path / "raw", str(tmp_path / "staging")
     shutil.copytree(raw["kitti360"], root)
     (path,) = root.glob("data_poses/*/poses.txt")
@@ -380,8 +380,8 @@ def test_poses_that_change_while_a_run_goes_on_are_noticed(raw, tmp_path):
     assert write_shard(task, staging, CROP)["unreadable"]
 
 
-def test_a_staged_shard_that_was_planned_otherwise_is_cut_anew(raw, tmp_path):
-    """The poses were repaired, or a drive was added, between an interrupted run and the next."""
+def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
+    """The poses are repaired, or a drive is added, between an interrupted run and the next."""
     root, staging = tmp_path / "raw", str(tmp_path / "staging")
     shutil.copytree(raw["kitti360"], root)
     (path,) = root.glob("data_poses/*/poses.txt")
@@ -485,7 +485,7 @@ def outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, t
 
 
 def check_reason(reason: str, path: Path) -> None:
-    """One line that names the file, or the one beside it that it contradicts."""
+    """Asserts that the reason is one line that names the file or the file that it contradicts."""
     assert any(file.name in reason for file in path.parent.iterdir()), reason
     assert "\n" not in reason and len(reason) < 700, reason
     reason.encode()  # goes into a table
@@ -649,7 +649,7 @@ def touched_by_poses(whole: bytes, broken: bytes) -> Touches:
 
 # ---------------------------------------------------------------------------------------------- Argoverse 2's files
 
-AV2_LOGS = ("broken", "beside")  # two logs of one shard: whatever befalls one leaves the other alone
+AV2_LOGS = ("broken", "beside")  # two logs of one shard: faults of one do not affect the other
 SWEEPS = 315969904359876000 + 100_000_000 * np.arange(3)
 
 
@@ -1021,7 +1021,7 @@ def raw(tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_broken_file_is_refused_by_name_or_costs_only_what_is_broken(raw, tmp_path, name):
+def test_write_shard_rejects_or_contains_damaged_file(raw, tmp_path, name):
     chosen, chunk = FORMATS[name], list(FORMATS).index(name)
     source, root = chosen.source.split()[0], tmp_path / "raw"
     shutil.copytree(raw[chosen.source], root)

@@ -1,6 +1,7 @@
-"""What the golden numbers of torch-fidelity are numbers of: weights, pictures and features made by formula.
+"""Inputs of the golden results of torch-fidelity: weights, images and features computed by formula.
 
-Integers and uniform random numbers only, no logarithm and no matrix product: the same bits on every machine.
+They use only integers and uniform random numbers, no logarithm and no matrix product, so that every machine computes
+the same bits.
 """
 
 import hashlib
@@ -35,7 +36,7 @@ def random_state_dict(shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarr
 
 
 def picture(k: int) -> np.ndarray:
-    """The k-th picture, uint8 (height, width, 3): curved stripes, their slopes another in each channel."""
+    """The k-th picture, uint8 (height, width, 3): curved stripes with a different slope in each channel."""
     height, width, stripe, halvings, offset = PICTURES[k]
     row, column, channel = np.ogrid[:height, :width, :3]
     waves = (row * row * (k + 3) + row * column * (channel + 1) * 5 + column * (k + 1) * 77) // stripe % 256

@@ -21,7 +21,7 @@ from pipelines.evaluation.ablation import (
 
 @pytest.fixture(scope="module")
 def empty_home(cluster, tmp_path_factory):
-    """A $PRITTI_HOME with nothing in it: the encoding study needs no data, the smoke preset makes its own."""
+    """An empty $PRITTI_HOME: the encoding study needs no data, and the smoke preset creates its own."""
     with pytest.MonkeyPatch.context() as patch:
         path = tmp_path_factory.mktemp("ablation")
         patch.setenv("PRITTI_HOME", str(path))
@@ -29,7 +29,7 @@ def empty_home(cluster, tmp_path_factory):
         yield path
 
 
-def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, capsys):
+def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
     from jobs.ablate_lvae import Encoding, compare_encodings
 
     config = Encoding((64, 128), any_sizes=(64,), moving_sizes=(32,), seeds=1, epochs=1, test=300, noisy=20)
@@ -56,7 +56,7 @@ def test_the_encoding_study_writes_its_table_and_figure_and_resumes(empty_home, 
         compare_encodings(Encoding(sizes=(64,), seeds=1, epochs=2, test=300))
 
 
-def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
+def test_variant_differs_from_preset_only_in_its_switch(empty_home):
     from jobs.ablate_lvae import Augmentation, Branches, Decoders, prepare_variant
     from jobs.support.trainer import as_tensors
     from pipelines.training.data_loader import read_samples
@@ -80,7 +80,7 @@ def test_variants_train_as_the_preset_does_but_for_their_switch(empty_home):
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
 
 
-def test_branches_are_trained_seed_by_seed_and_none_twice(empty_home, monkeypatch, capsys):
+def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys):
     import jobs.ablate_lvae as job
 
     trained = []

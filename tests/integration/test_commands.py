@@ -1,4 +1,4 @@
-"""Jobs as a user starts them: `--help`, and mistakes."""
+"""Jobs on the command line: `--help` and error messages."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ JOBS = sorted(p.name for p in (ROOT / "jobs").glob("*.py") if os.access(p, os.X_
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test_help_explains(job):
+def test_job_help_describes_job(job):
     done = command(f"jobs/{job}", "--help")
     assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
 
@@ -33,7 +33,7 @@ MISTAKES = {
 
 @pytest.fixture(scope="module")
 def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
-    """What the commands print; two at a time, as each takes seconds to start."""
+    """The completed commands; two run concurrently, as each takes seconds to start."""
     empty = str(tmp_path_factory.mktemp("empty"))
     with ThreadPoolExecutor(2) as pool:
         done = pool.map(lambda words: command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
@@ -41,7 +41,7 @@ def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
 
 
 @pytest.mark.parametrize("words", MISTAKES, ids=" ".join)
-def test_a_mistake_is_one_clear_line(mistakes, words):
+def test_job_reports_mistake_in_one_line(mistakes, words):
     done = mistakes[words]
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

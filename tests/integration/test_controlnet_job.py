@@ -5,7 +5,7 @@ from helpers import street_class_ids
 from PIL import Image
 
 
-def test_a_drive_is_painted_and_goes_on(controlnet_weights, tmp_path, cluster):
+def test_paint_job_paints_drive_and_resumes(controlnet_weights, tmp_path, cluster):
     from jobs.paint_streets import Config, paint
 
     drive = tmp_path / "streets" / "drive" / "scene-1"

@@ -8,7 +8,7 @@ from pipelines.training import data_loader
 from pipelines.training.data_loader import LayoutReader, Stream, batches, read_samples
 
 
-def test_batches_are_read_ahead_and_come_in_order(layout_shards, cluster, monkeypatch):
+def test_batches_are_prefetched_in_order(layout_shards, cluster, monkeypatch):
     monkeypatch.setattr(data_loader, "SAMPLES_PER_TASK", 8)  # two steps a task
     reader, stream = LayoutReader(small_spec(32)), Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     got = list(batches(stream, reader, start_step=3, stop_step=14, rank=1, world=2))

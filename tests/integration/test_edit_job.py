@@ -25,7 +25,7 @@ def table(town_scenes, tmp_path_factory) -> str:
     return root
 
 
-def test_edits_over_a_table(table, town_scenes, tmp_path, cluster):
+def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster):
     from jobs.edit_scenes import Remove, Replay, edit_scenes
 
     options = {"input": table, "output": str(tmp_path / "out"), "run": "bare"}
@@ -47,7 +47,7 @@ def test_edits_over_a_table(table, town_scenes, tmp_path, cluster):
 
     part = next((tmp_path / "out" / "scenes" / "source=edited-bare" / "split=test").glob("*.parquet"))
     written = part.stat().st_mtime_ns
-    assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # nothing is done twice
+    assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # a second run does no work
     with pytest.raises(ValueError, match="holds a run 'bare' with other edits; choose another --run"):
         edit_scenes(Remove(category=("pole",), **options))
 
@@ -58,7 +58,7 @@ def test_edits_over_a_table(table, town_scenes, tmp_path, cluster):
         assert_same_primitives(scene, edited[scene.scene_id])
 
 
-def test_a_scene_that_cannot_be_edited_is_rejected_and_the_rest_goes_on(table, town_scenes, tmp_path, cluster):
+def test_edit_job_rejects_bad_scene_and_edits_the_rest(table, town_scenes, tmp_path, cluster):
     from jobs.edit_scenes import Remove, edit_scenes
 
     last = max(len(scene) for scene in town_scenes) - 1

@@ -1,4 +1,4 @@
-"""jobs/evaluate_scenes.py with Inception weights (random ones) and with pictures instead of tables."""
+"""jobs/evaluate_scenes.py with random Inception weights and with images instead of tables."""
 
 import json
 from contextlib import suppress
@@ -18,7 +18,7 @@ from pipelines.rendering.render import bev_picture
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import Selection
 
-SAMPLES = 5  # of a network that takes a second per picture
+SAMPLES = 5  # the network takes a second per image
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def weights(tmp_path_factory) -> str:
     return str(path)
 
 
-def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
-    """Real training scenes against real test scenes: once as tables, once as ADM's .npz of their pictures."""
+def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_path):
+    """Scores real training scenes against real test scenes, as tables and as ADM's .npz of their images."""
     data = str(smoke / "datasets/smoke")
     test = chosen_scenes(Selection(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([bev_picture(scene)]) for scene in test), SAMPLES)
@@ -43,7 +43,9 @@ def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
     ]
     assert as_tables["scenes"] == as_pictures["scenes"] == {"real": SAMPLES, "generated": SAMPLES}
     for name in ("fid", "sfid", "kid", "inception_score", "precision_k1", "recall_k3", "density_k3", "coverage_k1"):
-        assert as_pictures[name]["value"] == pytest.approx(as_tables[name]["value"], rel=1e-5), name  # batches round
+        assert as_pictures[name]["value"] == pytest.approx(as_tables[name]["value"], rel=1e-5), (
+            name
+        )  # batches round differently
         assert as_tables[name]["low"] <= as_tables[name]["high"]
     assert as_tables["fid"]["value"] > 0 and as_tables["inception_score"]["value"] >= 1
     assert "validity" in as_tables and "validity" not in as_pictures
@@ -54,7 +56,7 @@ def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
         assert "no score of theirs compares with published ones" in page and page.count("<img") > 10
 
 
-def test_pictures_of_another_size_are_refused(smoke, tmp_path):
+def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
     write_npz(str(tmp_path / "small.npz"), [np.zeros((4, 64, 64, 3), np.uint8)], 4)
     with pytest.raises(ValueError, match=r"real pictures are \[256, 256\] pixels, generated ones \[64, 64\]"):
         evaluate(
@@ -62,8 +64,8 @@ def test_pictures_of_another_size_are_refused(smoke, tmp_path):
         )
 
 
-def test_a_killed_worker_changes_nothing(smoke, tmp_path):
-    """Its process is killed as soon as the first part is written."""
+def test_describe_is_unchanged_by_worker_kill(smoke, tmp_path):
+    """The worker is killed as soon as the first part is written."""
     import psutil
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
@@ -88,7 +90,7 @@ def scores_of(real: np.ndarray, generated: np.ndarray) -> dict:
     return compare(*sides)
 
 
-def test_degenerate_features_get_the_right_number_or_a_clear_error(cluster):
+def test_compare_handles_degenerate_features(cluster):
     rng = np.random.default_rng(0)
     some, constant = rng.normal(size=(20, 6)), np.ones((20, 6))
     same = scores_of(constant, constant)
@@ -118,7 +120,7 @@ def test_degenerate_features_get_the_right_number_or_a_clear_error(cluster):
         ({"generated": "nowhere.npz"}, "nowhere.npz: no such file"),
     ],
 )
-def test_wrong_options_are_named(smoke, tmp_path, options, message):
+def test_evaluate_rejects_wrong_options(smoke, tmp_path, options, message):
     data = str(smoke / "datasets/smoke")
     with pytest.raises(ValueError, match=message):
         evaluate(Config(**({"real": data, "generated": data, "output": str(tmp_path)} | options)))

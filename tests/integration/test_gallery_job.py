@@ -9,7 +9,7 @@ from pipelines.io.web_export import web_scene
 from pipelines.schema.tables import read_scenes
 
 
-def test_the_page_holds_all_it_shows(gallery_page, gallery_scenes):
+def test_gallery_page_holds_all_its_data(gallery_page, gallery_scenes):
     text = gallery_page.read_text()
     assert "Three &lt;scenes&gt;" in text
     assert not re.search(r'(src|href)="(?!data:)', text) and "http" not in re.sub(r"http://www.w3.org\S*", "", text)

@@ -1,4 +1,4 @@
-"""The jobs that generate, on a real Ray with the smoke presets: resume, actors, killed processes, scores."""
+"""Generation jobs on Ray with the smoke presets: resuming, numbers of actors, killed processes, scores."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -22,7 +22,7 @@ def samples(smoke) -> Path:
     return output
 
 
-def test_scenes_do_not_depend_on_actors_or_batch(smoke, samples, tmp_path):
+def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path):
     from jobs.sample_scenes import Config, sample
     from models.tensors import EXISTENCE_THRESHOLD
 
@@ -38,7 +38,7 @@ def test_scenes_do_not_depend_on_actors_or_batch(smoke, samples, tmp_path):
         assert (one.occupied == other.occupied).mean() > 0.999
 
 
-def test_sampling_goes_on_where_it_stopped(smoke, samples):
+def test_sample_resumes_where_it_stopped(smoke, samples):
     from jobs.sample_scenes import Config, sample
 
     shards = find_shards(str(samples))
@@ -58,7 +58,7 @@ def test_sampling_goes_on_where_it_stopped(smoke, samples):
         sample(replace(config, run="x", labels=("dense",)))
 
 
-def test_the_job_asks_for_repair(smoke, tmp_path, monkeypatch):
+def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
     from jobs.sample_scenes import Config, sample
 
     asked = []
@@ -68,7 +68,7 @@ def test_the_job_asks_for_repair(smoke, tmp_path, monkeypatch):
     assert [request.repair for request in asked] == [False, True]
 
 
-def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
+def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
     from jobs.sweep_samplers import Config, sweep_samplers
 
     config = Config(
@@ -86,14 +86,14 @@ def test_samplers_are_scored_side_by_side_and_go_on(smoke, tmp_path):
     assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
     assert (tmp_path / "samplers.html").read_text().count("<img") == 4
     assert "<svg" in (tmp_path / "samplers-layout_frechet.svg").read_text()
-    assert sweep_samplers(config) == rows  # nothing is made again, nor timed
+    assert sweep_samplers(config) == rows  # nothing is sampled or timed again
     found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
     assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
     with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
         sweep_samplers(replace(config, samplers=("euler",)))
 
 
-def test_the_glb_has_a_named_node_per_primitive(samples):
+def test_sample_glb_has_named_node_per_primitive(samples):
     scene = next(read_scenes(str(samples)))
     path = samples / "glb/samples" / f"{scene.scene_id}.glb"
     nodes = set(trimesh.load(path).graph.nodes)
@@ -101,7 +101,7 @@ def test_the_glb_has_a_named_node_per_primitive(samples):
         assert sum(node.startswith(category) for node in nodes) == (scene.label == category).sum()
 
 
-def test_outpainting_and_evaluation(smoke, samples, tmp_path):
+def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     from jobs.evaluate_scenes import Config, evaluate
     from jobs.evaluate_seams import Config as SeamsConfig
     from jobs.evaluate_seams import evaluate_seams
@@ -173,7 +173,7 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
     assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
 
 
-def test_a_killed_sampler_loses_and_doubles_nothing(smoke, samples, tmp_path):
+def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
     import psutil
 
     from models.labels import LABELS
@@ -196,7 +196,7 @@ def test_a_killed_sampler_loses_and_doubles_nothing(smoke, samples, tmp_path):
     assert all(np.array_equal(a.occupied, b.occupied) for a, b in zip(again, before, strict=True))
 
 
-def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(smoke, samples, tmp_path):
+def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
     import psutil
 
     from jobs.outpaint_scenes import Config, last_blocks
@@ -252,7 +252,7 @@ def test_a_street_is_the_same_with_any_number_of_actors_and_after_a_kill(smoke, 
             last_blocks(wrong)
 
 
-def test_inpainting_writes_variants_and_goes_on(smoke, samples, tmp_path):
+def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
     from jobs.inpaint_scenes import Config, inpaint
 
     config = Config(
@@ -288,7 +288,7 @@ def test_inpainting_writes_variants_and_goes_on(smoke, samples, tmp_path):
         inpaint(config)
 
 
-def test_a_guided_run_keeps_the_scaling_of_the_models_noise(smoke, tmp_path):
+def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
     from models.pipeline import Resampling
     from pipelines.generation.outpaint import OutpaintRequest
     from pipelines.generation.sample import claim_run, load_pipeline
@@ -300,14 +300,14 @@ def test_a_guided_run_keeps_the_scaling_of_the_models_noise(smoke, tmp_path):
         pipeline.register_to_config(noise_scaling=1.0)
         claim_run(request, pipeline, [str(smoke)])
         pipeline.register_to_config(noise_scaling=1.01)
-        if run == "paper":  # which scales nothing
+        if run == "paper":  # does not scale the noise
             claim_run(request, pipeline, [str(smoke)])
     with pytest.raises(ValueError, match=r"holds a run 'guided' with noise_scaling=1.0, asked for 1.01"):
         claim_run(request, pipeline, [str(smoke)])
 
 
-def test_real_against_real_is_near_perfect(smoke, tmp_path):
-    """The training scenes scored against themselves: the evaluator's own floor."""
+def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
+    """Training scenes scored against themselves give the noise floor of the evaluator."""
     from pipelines.evaluation.evaluate import compare
     from pipelines.evaluation.features import Looks, describe
     from pipelines.schema.dataset import Dataset
@@ -323,8 +323,8 @@ def test_real_against_real_is_near_perfect(smoke, tmp_path):
     assert all(found["between"].value == 0 for found in scores["distance"].values())
 
 
-def test_a_description_goes_on_where_it_stopped(smoke, tmp_path, monkeypatch):
-    """Parts that are there are kept, missing ones made again; other options or other scenes begin anew."""
+def test_describe_resumes_where_it_stopped(smoke, tmp_path, monkeypatch):
+    """Existing parts are kept, missing ones recomputed; other options or scenes start again."""
     from pipelines.evaluation import features as module
     from pipelines.schema.dataset import Dataset
     from pipelines.schema.scene_subset import Selection

@@ -18,7 +18,7 @@ from pipelines.reporting.contact_sheet import (
 from pipelines.schema.tables import Shard
 
 
-def test_pictures_made_by_ray_are_those_of_render(cluster, town_dataset, tmp_path):
+def test_paint_tasks_equal_direct_rendering(cluster, town_dataset, tmp_path):
     catalogue = Catalogue.read(town_dataset)
     chosen = np.array([11, 0, 4, 6])
     painted = paint(catalogue, chosen, (View("bev", 96), View("3d", 80)))
@@ -34,10 +34,10 @@ def test_pictures_made_by_ray_are_those_of_render(cluster, town_dataset, tmp_pat
         scenes[Catalogue.read(town_dataset, split="train").column("scene_id")[order[0]]], 96, supersample=2
     )
     inside = np.lib.stride_tricks.sliding_window_view(sheet[:, :, 0], (94, 94))[:200, :60]
-    assert (inside == picture[1:-1, 1:-1, 0]).all(axis=(2, 3)).any()  # first on the sheet; a line frames it
+    assert (inside == picture[1:-1, 1:-1, 0]).all(axis=(2, 3)).any()  # first on the sheet, framed by a line
 
 
-def test_the_report_shows_scenes(cluster, town_dataset, tmp_path):
+def test_report_job_shows_scenes(cluster, town_dataset, tmp_path):
     path = write_page(
         Report(dataset=town_dataset, source="town", split="test", pictures=2, output=str(tmp_path / "p.html"))
     )

@@ -1,4 +1,4 @@
-"""Raw drives -> tables on a real Ray: real excerpts, the town's own files, faults, resume."""
+"""Preprocessing of raw drives to tables on Ray: real excerpts, town files, broken input, resuming."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def town(cluster, tmp_path_factory) -> Path:
     return root
 
 
-def test_every_shard_is_aligned_and_labelled_from_the_training_split(town):
+def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     for shard in find_shards(str(town)):
         ids = [shard.read(name, ["scene_id"])["scene_id"].to_pylist() for name in ("scenes", "rasters")]
         assert ids[0] == ids[1]
@@ -63,7 +63,7 @@ def test_every_shard_is_aligned_and_labelled_from_the_training_split(town):
     assert not (town / ".staging").exists()
 
 
-def test_tables_hold_what_the_drive_says(town):
+def test_preprocess_tables_equal_drive(town):
     (seed,) = table(town, "select min(sequence) from TABLE where split = 'train'")[0]
     drive = town_drive(int(seed))
     stored = {s.frame: s for s in read_scenes(str(town), "town", "train") if s.sequence == seed}
@@ -75,7 +75,7 @@ def test_tables_hold_what_the_drive_says(town):
         assert np.array_equal(stored[scene.frame].occupied, scene.occupied)
 
 
-def test_a_finished_directory_is_left_alone_and_other_options_are_refused(town):
+def test_preprocess_keeps_finished_run_and_rejects_other_options(town):
     stamp = (town / "dataset.json").stat().st_mtime_ns
     again = ingest.ingest(plan_town(24, 8, 0), str(town), {"source": "town"})
     assert again.already_complete and (town / "dataset.json").stat().st_mtime_ns == stamp
@@ -83,7 +83,7 @@ def test_a_finished_directory_is_left_alone_and_other_options_are_refused(town):
         ingest.ingest(plan_town(8, 8, 0), str(town), {"source": "town", "num_train": 8})
 
 
-def test_an_interrupted_run_goes_on_and_ends_the_same(cluster, town, tmp_path):
+def test_preprocess_resumes_interrupted_run_to_same_tables(cluster, town, tmp_path):
     tasks, root = plan_town(24, 8, 0), str(tmp_path)
     staging = storage.join(root, ingest.STAGING)
     storage.write_json({"source": "town"}, storage.join(staging, "options.json"))
@@ -105,7 +105,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(cluster, town, tmp_path):
     assert json.loads((town / "dataset.json").read_text()) == json.loads((tmp_path / "dataset.json").read_text())
 
 
-def test_the_real_kitti360_excerpt_goes_through(cluster, real_data, tmp_path):
+def test_preprocess_reads_real_kitti360_excerpt(cluster, real_data, tmp_path):
     result = ingest.ingest(plan_kitti360(str(real_data / "kitti360")), str(tmp_path), {"source": "kitti360"})
     assert sum(result.scenes.values()) + sum(result.rejects.values()) == 500 and result.duplicates == 133
     assert set(result.scenes) == {"train", "test", "unused"}
@@ -121,7 +121,7 @@ def test_the_real_kitti360_excerpt_goes_through(cluster, real_data, tmp_path):
     assert ellipsoids == [("vegetation_ellipsoid",)]
 
 
-def test_the_real_argoverse2_logs_go_through(cluster, real_data, tmp_path):
+def test_preprocess_reads_real_argoverse2_logs(cluster, real_data, tmp_path):
     result = ingest.ingest(plan_argoverse2(str(real_data / "av2")), str(tmp_path), {"source": "av2"})
     assert set(result.scenes) == {"train", "test"} and min(result.scenes.values()) > 150
     dataset = Dataset.open(str(tmp_path))
@@ -132,7 +132,7 @@ def test_the_real_argoverse2_logs_go_through(cluster, real_data, tmp_path):
     assert road > 300 and crossing > 0 and sidewalk is None
 
 
-def test_a_town_written_as_kitti360_reads_to_the_same_tables(cluster, tmp_path):
+def test_preprocess_reads_town_in_kitti360_format_equally(cluster, tmp_path):
     drive = town_drive(7)
     write_kitti360(drive, tmp_path / "raw")
     result = ingest.ingest(
@@ -147,7 +147,7 @@ def test_a_town_written_as_kitti360_reads_to_the_same_tables(cluster, tmp_path):
         assert (got.occupied == want.occupied).mean() > 0.9999
 
 
-def test_a_broken_drive_stops_the_run_but_loses_nothing(cluster, real_data, tmp_path):
+def test_preprocess_stops_at_broken_drive_and_keeps_finished(cluster, real_data, tmp_path):
     raw = tmp_path / "av2"
     shutil.copytree(real_data / "av2", raw)
     log = next((raw / "val").iterdir())
@@ -168,7 +168,7 @@ def test_a_broken_drive_stops_the_run_but_loses_nothing(cluster, real_data, tmp_
     assert ingest.ingest(plan_argoverse2(str(raw)), out, {"source": "av2"}).scenes["test"] > 150
 
 
-def test_a_bad_scene_is_rejected_and_the_rest_goes_on(cluster, tmp_path, monkeypatch):
+def test_preprocess_rejects_bad_scene_and_keeps_others(cluster, tmp_path, monkeypatch):
     task = plan_town(24, 8, 0)[0]
     real = Drive.scene
 
@@ -183,7 +183,7 @@ def test_a_bad_scene_is_rejected_and_the_rest_goes_on(cluster, tmp_path, monkeyp
     assert [r["reason"] for r in cuts.rejects] == ["no ground here"] and cuts.rejects[0]["frame"] is not None
 
 
-def test_an_empty_training_split_is_refused(cluster, tmp_path):
+def test_preprocess_rejects_empty_training_split(cluster, tmp_path):
     with pytest.raises(ValueError, match="nothing to preprocess"):
         ingest.ingest([], str(tmp_path), {})
     only_test = [task for task in plan_town(24, 8, 0) if task.split == "test"]

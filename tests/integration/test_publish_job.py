@@ -1,4 +1,4 @@
-"""A model becomes an entry of the zoo: only with its own evaluation and training, and found again by every name."""
+"""Publishing a model: it requires an evaluation and training records, and the model is found by every name."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from models.pretrained import CHECKSUMS, checksums
 
 @pytest.fixture(scope="module")
 def evaluated(smoke) -> Path:
-    """Scores of the smoke model's own scenes and reconstructions."""
+    """Scores of scenes and reconstructions of the smoke model."""
     from jobs import evaluate_scenes, sample_scenes
 
     sample_scenes.sample(
@@ -26,7 +26,7 @@ def evaluated(smoke) -> Path:
     return smoke / "evaluations/judged"
 
 
-def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
+def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     from jobs.publish_model import Config, publish
     from jobs.support.options import pipeline_directory
     from pipelines.generation.sample import load_pipeline
@@ -42,7 +42,7 @@ def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
         assert path.is_dir() or b"/tmp/" not in path.read_bytes()
     for picture in ("samples.png", "failures.png"):
         assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
-    pipeline = load_pipeline(output)  # which samples as it was judged
+    pipeline = load_pipeline(output)  # samples with the evaluated settings
     assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
     trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
     for name in ("tiny", reference, run_id):
@@ -60,7 +60,7 @@ def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
     assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
 
 
-def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_path):
+def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path):
     from jobs.publish_model import Config, publish
 
     with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
@@ -91,7 +91,7 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
     assert not (smoke / "zoo/none").exists()
 
 
-def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monkeypatch, tmp_path):
+def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatch, tmp_path):
     from jobs.publish_model import Config, publish
 
     first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
@@ -103,13 +103,13 @@ def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monke
     with pytest.raises(ValueError, match="made these weights"):
         publish(config)
     (tmp_path / "zoo").mkdir()
-    first.rename(tmp_path / "zoo/first")  # an entry whose MLflow is not at hand: its training.json tells
+    first.rename(tmp_path / "zoo/first")  # without access to MLflow, training.json of the entry is used
     publish(config)
     cards = [tmp_path / place / "README.md" for place in ("zoo/first", "second")]
     assert cards[0].read_text() == cards[1].read_text()
 
 
-def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_path):
+def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     import torch
 
     from jobs.publish_model import history
@@ -140,14 +140,14 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_
     assert told[1].options["start_from"] == told[0].weights == weights_digest(first)
     first.save_pretrained(more / "dit")
     sampling = load_pipeline(complete(str(more))).config
-    assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # as where it began
+    assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights
     with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
         prepare(Config(preset="smoke", name="other", start_from="town"))
 
 
-def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
+def test_pipeline_directory_rejects_unknown_model(smoke, tmp_path):
     from jobs.support.options import pipeline_directory
 
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):

@@ -25,7 +25,7 @@ def rebuilt(reconstruction_dataset, cluster) -> Rebuilt:
     return rebuild(selection(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
 
 
-def test_scores_do_not_depend_on_chunks_and_workers(reconstruction_dataset, rebuilt):
+def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, rebuilt):
     done = []
     again = rebuild(
         selection(reconstruction_dataset),
@@ -40,7 +40,7 @@ def test_scores_do_not_depend_on_chunks_and_workers(reconstruction_dataset, rebu
     assert first.keys() == second.keys() and not different
 
 
-def test_scenes_are_listed_best_first(reconstruction_dataset, rebuilt):
+def test_reconstruction_lists_best_scene_first(reconstruction_dataset, rebuilt):
     scenes = rebuilt.scenes
     miou = scenes["voxel_miou"].to_pylist()
     assert miou == sorted(miou, reverse=True)
@@ -50,7 +50,7 @@ def test_scenes_are_listed_best_first(reconstruction_dataset, rebuilt):
     assert min(scenes["ground_iou"].to_pylist()) >= 0 and max(scenes["found"].to_pylist()) <= 1
 
 
-def test_the_page_shows_truth_beside_reconstruction(reconstruction_dataset, rebuilt):
+def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_dataset, rebuilt):
     drawn = draw([rebuilt.places[0], rebuilt.places[-1]], str(reconstruction_dataset / "lvae"))
     assert [row["scene_id"] for row in drawn] == rebuilt.scenes["scene_id"].take([0, 10]).to_pylist()
     for row in drawn:

@@ -5,7 +5,7 @@ import numpy as np
 from pipelines.evaluation.reference_sweep import references, sweep, sweep_charts, sweep_html
 
 
-def test_a_row_per_reference_and_k(cluster):
+def test_reference_sweep_has_row_per_reference_and_k(cluster):
     rng = np.random.default_rng(1)
     real, generated = rng.normal(size=(300, 8)), rng.normal(size=(300, 8))
     xy, labels = rng.uniform(0, 1000, (300, 2)), rng.choice(["low", "high"], 300)

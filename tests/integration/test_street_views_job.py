@@ -24,7 +24,7 @@ def town_scenes() -> list[Scene]:
 # ---------------------------------------------------------------------------------------------------------- jobs
 
 
-def test_streets_and_exports_of_a_table(town_scenes, tmp_path, cluster):
+def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
     from jobs.export_scenes import Config as ExportConfig
     from jobs.export_scenes import export
     from jobs.render_streets import Config, render

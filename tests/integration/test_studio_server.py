@@ -28,7 +28,7 @@ def post(session: requests.Session, address: str, path: str, body: dict) -> requ
     return session.post(f"{address}api/{path}", json=body, headers=POST)
 
 
-def test_visitors_have_scenes_of_their_own_and_every_step_back(studio_url):
+def test_studio_keeps_scene_and_history_per_visitor(studio_url):
     one, other = visitor(studio_url), visitor(studio_url)
     state = post(one, studio_url, "open", {"scene_id": "given-1"}).json()
     assert state["scene"]["scene_id"] == "given-1" and len(state["scene"]["primitives"]) == 3
@@ -44,7 +44,7 @@ def test_visitors_have_scenes_of_their_own_and_every_step_back(studio_url):
     assert one.get(f"{studio_url}api/scenes?text=given-2").json()["total"] == 1
 
 
-def test_long_work_says_how_far_it_is_and_can_be_cancelled(studio_url):
+def test_studio_reports_progress_and_cancels(studio_url):
     session = visitor(studio_url)
     state = post(session, studio_url, "generate", {"label": "high", "seed": 3, "steps": 5, "sampler": "ddpm"}).json()
     assert state["work"]["total"] == 5
@@ -84,14 +84,14 @@ def test_long_work_says_how_far_it_is_and_can_be_cancelled(studio_url):
         ("edit", {"edits": [{"edit": "remove", "x": "y" * 300_000}]}, 413, "too large"),
     ],
 )
-def test_what_cannot_be_done_is_said(studio_url, path, body, status, said):
+def test_studio_rejects_invalid_requests(studio_url, path, body, status, said):
     session = visitor(studio_url)
     post(session, studio_url, "open", {"scene_id": "given-0"})
     answer = post(session, studio_url, path, body)
     assert answer.status_code == status and said in answer.text
 
 
-def test_other_pages_and_other_names_get_nothing(studio_url):
+def test_studio_rejects_foreign_pages_and_hosts(studio_url):
     session = visitor(studio_url)
     assert session.post(f"{studio_url}api/undo", json={}).status_code == 403  # no page elsewhere can set our header
     assert requests.get(studio_url, headers={"host": "rebound.example"}).status_code == 421
@@ -100,7 +100,7 @@ def test_other_pages_and_other_names_get_nothing(studio_url):
     assert "default-src 'self'" in policy
 
 
-def test_a_taken_port_and_a_missing_model_are_said_at_once(studio_files, tmp_path):
+def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
     from jobs.serve_studio import Config, serve
 
     with socket.socket() as listener:

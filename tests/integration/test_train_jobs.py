@@ -1,4 +1,4 @@
-"""The jobs, on a real Ray with the smoke presets: the chain, resume, two workers, bad input."""
+"""Training jobs on Ray with the smoke presets: the chain of jobs, resuming, two workers, bad input."""
 
 import json
 import os
@@ -19,7 +19,7 @@ def weights(directory: Path) -> dict:
     return load_file(directory / "diffusion_pytorch_model.safetensors")
 
 
-def test_a_smoke_preset_makes_its_own_inputs(home):
+def test_train_dit_creates_inputs_of_smoke_preset(home):
     assert (home / "datasets/smoke/dataset.json").exists()
     rows = duckdb.sql(
         f"select split, count(*), count(distinct vegetation_density) from '{home}/datasets/smoke/scenes/**/*.parquet' group by 1"
@@ -31,7 +31,7 @@ def test_a_smoke_preset_makes_its_own_inputs(home):
     assert not list(home.rglob("*.pkl")) and not list(home.rglob("*.pt"))
 
 
-def test_latents_are_aligned_and_what_the_lvae_says(home):
+def test_encode_latents_match_lvae_and_scene_order(home):
     from models.tensors import layout_batch
     from pipelines.training.latents import load_lvae
 
@@ -44,7 +44,7 @@ def test_latents_are_aligned_and_what_the_lvae_says(home):
     assert got.dtype == np.float16 and np.allclose(got, want, atol=2e-3 * np.abs(want).max())
 
 
-def test_mlflow_has_parameters_losses_pictures_and_the_model(home):
+def test_train_logs_run_and_model_to_mlflow(home):
     from jobs.support.tracking import client
 
     api = client(f"sqlite:///{home}/mlflow.db")
@@ -57,7 +57,7 @@ def test_mlflow_has_parameters_losses_pictures_and_the_model(home):
         assert "model" in artifacts and artifacts & {"reconstruction", "samples"}
 
 
-def test_running_a_finished_job_again_changes_nothing(home):
+def test_train_lvae_leaves_finished_run_unchanged(home):
     from jobs.train_lvae import Config, train
 
     before = weights(home / "models/lvae-smoke")
@@ -68,8 +68,8 @@ def test_running_a_finished_job_again_changes_nothing(home):
         train(Config(preset="smoke", learning_rate=0.5))
 
 
-def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
-    """A worker dies by SIGKILL in the middle; Ray Train starts another from the last checkpoint."""
+def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
+    """A worker is killed during training; Ray Train starts another from the last checkpoint."""
     from jobs.support.trainer import fit
     from jobs.train_lvae import Config, prepare
 
@@ -87,12 +87,12 @@ def test_a_killed_worker_resumes_to_the_same_weights(home, tmp_path):
             return {}, {}
 
     output = fit(replace(run, validate=DieOnce(), reader=first), 1, str(home / "models/lvae-killed"))
-    assert seen.read_text().split() == ["3", "6", "6", "8"]  # dies at 6, goes on from the checkpoint at 3
+    assert seen.read_text().split() == ["3", "6", "6", "8"]  # killed at step 6, resumes from the checkpoint at step 3
     whole, resumed = weights(home / "models/lvae-smoke"), weights(Path(output))
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
-def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_run(home, tmp_path, monkeypatch):
+def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
     import jobs.support.trainer
     from jobs.support.trainer import fit
     from jobs.train_dit import Config, prepare, train
@@ -115,7 +115,7 @@ def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_
     with pytest.raises(Exception, match="stopped"):
         fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
     fit(replace(run, validate=note), 2, str(home / "models/two"))
-    assert seen.read_text().split() == ["4", "6", "8"]  # from the checkpoint at 2, not from the start
+    assert seen.read_text().split() == ["4", "6", "8"]  # from the checkpoint at step 2, not from the start
     one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two")
     for name in one:
         assert np.allclose(one[name], two[name], atol=1e-4), name
@@ -126,7 +126,7 @@ def test_two_workers_on_two_cores_learn_what_one_does_and_resume_after_a_failed_
         train(Config(preset="smoke", name="dit-odd", workers=2, batch_size=7))
 
 
-def test_two_workers_train_the_lvae(home):
+def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.train_lvae import Config, train
 
     output = train(Config(preset="smoke", name="lvae-two", workers=2))
@@ -135,7 +135,7 @@ def test_two_workers_train_the_lvae(home):
     assert distance < 1e-2, distance
 
 
-def test_an_object_decoder_is_trained_anew_under_a_trained_transformer(home):
+def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
     from jobs.train_lvae import Config, train
 
     kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
@@ -157,7 +157,7 @@ def test_an_object_decoder_is_trained_anew_under_a_trained_transformer(home):
         )
 
 
-def test_an_lvae_of_another_dataset_is_refused(home, tmp_path):
+def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
     from jobs.encode_latents import Config, encode
     from jobs.preprocess_scenes import Town, main
 
@@ -167,7 +167,7 @@ def test_an_lvae_of_another_dataset_is_refused(home, tmp_path):
     assert not (tmp_path / "latents").exists()
 
 
-def test_a_truncated_shard_is_named(home, tmp_path):
+def test_train_lvae_names_truncated_shard(home, tmp_path):
     from jobs.train_lvae import Config, train
 
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
@@ -178,8 +178,8 @@ def test_a_truncated_shard_is_named(home, tmp_path):
         train(Config(preset="smoke", dataset=str(tmp_path / "data"), name="lvae-truncated"))
 
 
-def test_a_fault_in_a_worker_reaches_the_user_as_one_line(home, tmp_path):
-    """A truncated shard found by an actor of another process: no traceback, exit code 2."""
+def test_encode_reports_worker_error_in_one_line(home, tmp_path):
+    """An actor in another process finds a truncated shard: no traceback, exit code 2."""
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
     (tmp_path / "data/latents.json").unlink()
     path = Path(find_shards(str(tmp_path / "data"))[-1].path("rasters"))

@@ -25,7 +25,7 @@ def town_scenes(town_drive_3) -> list:
 # ------------------------------------------------------------------------------------------------ jobs/import_scenes
 
 
-def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_scenes):
+def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scenes):
     from jobs.import_scenes import Config, import_scenes
 
     meshes, output = tmp_path / "meshes", tmp_path / "out"
@@ -52,7 +52,7 @@ def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_s
 
     kept = Path(find_shards(str(output))[0].path("scenes"))
     stamp = kept.stat().st_mtime_ns
-    (meshes / "night/4.glb").write_bytes(good)  # repaired: the same command reads it, and nothing else
+    (meshes / "night/4.glb").write_bytes(good)  # repaired: the same command reads only this file
     assert import_scenes(config)[1]["rejects"] == 0
     assert len(list(read_scenes(str(output)))) == 6 and not list((output / "rejects").rglob("*.parquet"))
     assert kept.stat().st_mtime_ns == stamp
@@ -61,7 +61,7 @@ def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_s
         import_scenes(config)
 
 
-def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
+def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
     from jobs.evaluate_scenes import evaluate
     from jobs.import_scenes import Config, import_scenes
@@ -74,11 +74,11 @@ def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
     scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores"), actors=1))
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
-    assert generation["random_frechet"]["value"] < 1e-4  # the very same pictures
+    assert generation["random_frechet"]["value"] < 1e-4  # identical images
     assert all(found["between"]["value"] < 1e-9 for found in generation["count_distance"].values())
 
 
-def test_voxels_become_pictures(cluster, tmp_path, town_scenes):
+def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
     from jobs.import_scenes import Config, import_scenes
 
     for k, scene in enumerate(town_scenes[:3]):
@@ -102,7 +102,7 @@ def test_voxels_become_pictures(cluster, tmp_path, town_scenes):
     assert json.loads((tmp_path / "out/imported-peer.json").read_text()) == made
 
 
-def test_an_import_of_nothing_is_an_error(cluster, tmp_path):
+def test_import_rejects_input_without_scenes(cluster, tmp_path):
     from jobs.import_scenes import Config, import_scenes
 
     (tmp_path / "a.glb").write_bytes(b"x")
@@ -124,7 +124,7 @@ def test_an_import_of_nothing_is_an_error(cluster, tmp_path):
 
 @pytest.fixture(scope="module")
 def voxel_files(tmp_path_factory, town_scenes):
-    """Truths, and reconstructions with a tenth of the voxels of each scene emptied and some classes changed."""
+    """Truths, and reconstructions with a tenth of the voxels emptied and some classes changed."""
     root, rng, voxels = tmp_path_factory.mktemp("voxels"), np.random.default_rng(0), []
     for k, scene in enumerate(town_scenes[:4]):
         truth = voxelise(scene, VoxelGrid())
@@ -139,7 +139,7 @@ def voxel_files(tmp_path_factory, town_scenes):
     return root, voxels
 
 
-def test_voxel_scores_are_those_of_all_scenes_together(cluster, tmp_path, voxel_files):
+def test_evaluate_voxels_pools_counts_over_scenes(cluster, tmp_path, voxel_files):
     from jobs.evaluate_voxels import Config, evaluate
 
     root, voxels = voxel_files
@@ -170,7 +170,7 @@ def test_voxel_scores_are_those_of_all_scenes_together(cluster, tmp_path, voxel_
         assert np.isclose(iou, confusion[1:, 1:].sum() / filled)
 
 
-def test_the_truth_may_be_a_dataset_and_a_perfect_reconstruction_scores_1(cluster, tmp_path, town_scenes):
+def test_evaluate_voxels_scores_perfect_reconstruction_as_1(cluster, tmp_path, town_scenes):
     from jobs.evaluate_voxels import Config, evaluate
 
     for split, part in (("test", town_scenes[:3]), ("train", town_scenes[3:4])):
@@ -189,7 +189,7 @@ def test_the_truth_may_be_a_dataset_and_a_perfect_reconstruction_scores_1(cluste
     assert partial["scenes"] == 3 and partial["left_out"] == {"truths": 1, "reconstructions": 0}
 
 
-def test_a_broken_reconstruction_and_names_without_counterpart_are_named(cluster, tmp_path, voxel_files):
+def test_evaluate_voxels_names_broken_and_unmatched_files(cluster, tmp_path, voxel_files):
     from jobs.evaluate_voxels import Config, evaluate
 
     root, _ = voxel_files

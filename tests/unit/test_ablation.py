@@ -1,4 +1,4 @@
-"""The ablations: encodings of a box, the small autoencoder, the switches of the layout VAE, the job."""
+"""Ablations: box encodings, the small autoencoder and the switches of the layout VAE."""
 
 import itertools
 import re
@@ -36,7 +36,7 @@ CUBE_SYMMETRIES = [
     np.diag(signs)[:, list(order)]
     for order in itertools.permutations(range(3))
     for signs in itertools.product((-1.0, 1.0), repeat=3)
-]  # 48 with the mirror images: a box is its own
+]  # 48 with the mirror images, which leave a box unchanged
 
 
 def corners(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
@@ -46,13 +46,13 @@ def corners(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 
 
 def box_distance(a: tuple, b: tuple) -> np.ndarray:
-    """(...) Hausdorff distance of the corner sets: 0 exactly for two descriptions of one box."""
+    """(...) Hausdorff distance of the corner sets: exactly 0 for two descriptions of one box."""
     gaps = np.linalg.norm(corners(*a)[..., :, None, :] - corners(*b)[..., None, :, :], axis=-1)
     return np.maximum(gaps.min(axis=-1).max(axis=-1), gaps.min(axis=-2).max(axis=-1))
 
 
 def any_boxes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes turned any way: a third with three extents, a third with two equal, a third cubes."""
+    """Boxes with random rotations: a third with three extents, a third with two equal extents, a third cubes."""
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.3, 5.0, (n, 3))
     size[n // 3 :, 1] = size[n // 3 :, 0]
@@ -64,9 +64,9 @@ def any_boxes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ENCODINGS)
-def test_decoding_gives_the_same_corners(name):
+def test_encoding_round_trip_keeps_corners(name):
     rotation, size = any_boxes(3000)
-    if name == "cholesky":  # cannot where extents are equal
+    if name == "cholesky":  # ambiguous where extents are equal
         rotation, size = rotation[:1000], size[:1000]
     code = ENCODINGS[name].encode(rotation, size)
     assert code.shape == (len(size), ENCODINGS[name].entries)
@@ -77,7 +77,7 @@ def test_decoding_gives_the_same_corners(name):
     assert np.allclose(batched[0].reshape(6, 3, 3), decoded[0][:6])
 
 
-def test_any_description_of_a_box_has_one_code_but_for_quaternions():
+def test_encoding_is_unique_per_box_except_quaternion():
     rotation, size = any_boxes(60)
     codes = {
         name: np.stack([e.encode(rotation @ s, size @ np.abs(s)) for s in CUBE_SYMMETRIES if np.linalg.det(s) > 0])
@@ -88,27 +88,27 @@ def test_any_description_of_a_box_has_one_code_but_for_quaternions():
     assert np.ptp(codes["quaternion"], axis=0).max() > 1
 
 
-def test_only_octahedral_codes_tell_all_boxes_apart_and_change_as_boxes_do():
-    """Lipschitz both ways: metres that corners move by, against the change of the code, for pairs near and far."""
+def test_encoding_is_bi_lipschitz_only_if_octahedral():
+    """Bounds the ratio of corner displacement in metres to code change from both sides, for near and far pairs."""
     rng = np.random.default_rng(1)
     rotation, size = any_boxes(6000)
     step = 10 ** rng.uniform(-4, 0, (6000, 1))
     turn = Rotation.from_rotvec(step * rng.standard_normal((6000, 3))).as_matrix()
     grown = np.maximum(size + rng.integers(0, 2, (6000, 1)) * step * rng.standard_normal((6000, 3)), 0.3)
-    other = canonical_boxes(turn @ rotation, grown)  # described as a dataset would
+    other = canonical_boxes(turn @ rotation, grown)  # canonical boxes, as in a dataset
     distance = box_distance((rotation, size), other) / size.max(axis=1)
     ratio = {
         name: np.linalg.norm(e.encode(*other) - e.encode(*canonical_boxes(rotation, size)), axis=1) / distance
         for name, e in ENCODINGS.items()
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
-    assert ratio["cholesky"].min() < 1e-6  # a cube that turned
-    assert ratio["quaternion"].max() > 1000  # length and width, or -pi/2 and pi/2, changed places
+    assert ratio["cholesky"].min() < 1e-6  # a rotated cube
+    assert ratio["quaternion"].max() > 1000  # length and width, or -pi/2 and pi/2, are swapped
 
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
-def test_codes_are_smooth_where_length_and_width_change_places(name):
-    """A path that turns by 180 degrees, tilts and passes through l = w: it closes, and finer steps are smaller steps."""
+def test_encoding_is_continuous_where_length_equals_width(name):
+    """A closed path turns by 180 degrees, tilts and passes through l = w; finer steps give smaller code changes."""
     largest = []
     for count in (501, 5001):
         t = np.linspace(0, 1, count)
@@ -125,7 +125,7 @@ def test_codes_are_smooth_where_length_and_width_change_places(name):
     assert jumps.max() > 0.5
 
 
-def test_harmonics_are_degree_four_and_turn_with_yaw():
+def test_harmonics_are_degree_four_and_equivariant_to_yaw():
     basis = harmonics()
     flat = basis.reshape(9, 81)
     assert np.allclose(flat @ flat.T, np.eye(9))
@@ -135,13 +135,13 @@ def test_harmonics_are_degree_four_and_turn_with_yaw():
     code = ENCODINGS["octahedral"].encode(yaw_rotation(yaw), np.ones((50, 3)))[:, 6:]
     turning = np.stack([np.cos(4 * yaw), np.sin(4 * yaw)], axis=1) / np.sqrt(2)
     assert np.allclose(code[:, :2], turning) and np.allclose(code[:, 2:], code[0, 2:])
-    assert np.isfinite(nearest_frame(np.zeros((1, 9)))).all()  # a network may say anything
+    assert np.isfinite(nearest_frame(np.zeros((1, 9)))).all()  # a network may predict any values
 
 
 # ----------------------------------------------------------------------------------------------------- lost yaw
 
 
-def test_a_square_of_arbitrary_yaw_keeps_what_the_closed_form_says():
+def test_cholesky_error_of_square_equals_closed_form():
     turn = np.linspace(0, np.pi / 2, 2001)
     size = np.broadcast_to([2.0, 2.0, 1.5], (len(turn), 3))
     still = CentredBoxes(np.broadcast_to(np.eye(3), (len(turn), 3, 3)), size)
@@ -150,7 +150,7 @@ def test_a_square_of_arbitrary_yaw_keeps_what_the_closed_form_says():
     assert abs(np.trapezoid(iou, turn) / (np.pi / 2) - LOST_YAW_IOU3D) < 1e-6
 
 
-def test_cholesky_loses_the_yaw_of_squares_and_octahedral_keeps_it():
+def test_cholesky_loses_yaw_of_squares_and_octahedral_keeps_it():
     def lost(encoding, share):
         return yaw_loss({"encoding": encoding, "width_share": share, "noise": 1e-3}, 400)["iou3d_lost_with_yaw"]
 
@@ -162,7 +162,7 @@ def test_cholesky_loses_the_yaw_of_squares_and_octahedral_keeps_it():
 # -------------------------------------------------------------------------------------------------- autoencoder
 
 
-def test_bodies_are_equal_and_small():
+def test_autoencoder_bodies_are_equal_and_small():
     torch.manual_seed(0)
     ends = ("encoder.project_in.", "decoder.heads.0.features.4.")
     bodies = []
@@ -173,10 +173,10 @@ def test_bodies_are_equal_and_small():
         bodies.append({n: p for n, p in model.state_dict().items() if not n.startswith(ends)})
     for body in bodies[1:]:
         assert body.keys() == bodies[0].keys()
-        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # from the same start, too
+        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # with the same initial weights
 
 
-def test_training_sets_are_nested_and_seeds_differ():
+def test_trial_training_sets_are_nested_and_differ_by_seed():
     large, small = (training_boxes(Trial("vehicle", "cholesky", n, 3)) for n in (10_000, 1200))
     assert all((a[:1200] == b).all() for a, b in zip(large, small, strict=True))
     other = training_boxes(Trial("vehicle", "cholesky", 1200, 4))
@@ -189,7 +189,7 @@ def test_training_sets_are_nested_and_seeds_differ():
 
 
 @pytest.mark.parametrize("name", ENCODINGS)
-def test_a_tiny_trial_learns(name):
+def test_trial_learns_with_tiny_settings(name):
     torch.set_num_threads(1)
     boxes, truth = draw_boxes(THINGS["vehicle"], 128, 0), draw_boxes(THINGS["vehicle"], 200, 1)
     iou = []
@@ -198,7 +198,7 @@ def test_a_tiny_trial_learns(name):
         rebuilt, _ = fitted.rebuild(truth)
         iou.append(iou3d(truth, rebuilt).mean())
     assert fitted.kept.sum() == {"cholesky": 4, "quaternion": 5, "octahedral": 6}[name]
-    assert np.allclose(np.abs(rebuilt.rotation[:, 2]).max(axis=1), 1)  # what was left out stays upright
+    assert np.allclose(np.abs(rebuilt.rotation[:, 2]).max(axis=1), 1)  # an omitted angle stays zero
     assert iou[1] > iou[0] + 0.05
 
 
@@ -209,7 +209,7 @@ def test_a_tiny_trial_learns(name):
 @pytest.mark.parametrize(
     ("switch", "channels"), [({"split_latent": False}, 32), ({"branches": "ground"}, 16), ({"branches": "objects"}, 16)]
 )
-def test_switches_of_the_layout_vae(decoder, switch, channels):
+def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
     spec, scenes = small_spec(), [random_scene(i) for i in range(6)]
     torch.manual_seed(0)
     options = LVAE_PRESETS["smoke"].architecture() | {"decoder": decoder, "shortcut": True, "latent_channels": 16}
@@ -240,7 +240,7 @@ def test_switches_of_the_layout_vae(decoder, switch, channels):
         assert (latent.grad[:, :16] != 0).any() and (latent.grad[:, 16:] != 0).any()
 
 
-def test_a_config_from_before_the_switches_is_the_full_model():
+def test_layout_vae_config_without_switches_is_full_model():
     old = {"layout": small_spec().to_dict()} | LVAE_PRESETS["smoke"].architecture()
     lvae = LayoutVAE.from_config(old)
     assert lvae.config.split_latent and lvae.config.branches == "both" and lvae.latent_shape == (8, 8, 8)
@@ -248,7 +248,7 @@ def test_a_config_from_before_the_switches_is_the_full_model():
         LayoutVAE.from_config(old | {"branches": "sky"})
 
 
-def test_the_ground_study_goes_from_the_papers_networks_down_with_equal_latents():
+def test_ground_study_shrinks_networks_at_equal_latents():
     row = LVAE_PRESETS["town"].architecture()
     models = {name: LayoutVAE(layout=LayoutSpec().to_dict(), **row | v.architecture) for name, v in GROUND.items()}
     assert {model.latent_shape for model in models.values()} == {(32, 32, 32)}
@@ -259,14 +259,14 @@ def test_the_ground_study_goes_from_the_papers_networks_down_with_equal_latents(
     assert max(sizes, key=sizes.get) == "the paper's networks"
 
 
-def test_variants_have_names_that_files_and_mlflow_take():
+def test_variant_names_are_valid_for_files_and_mlflow():
     from jobs.ablate_lvae import slug
 
     names = [slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
     assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 12
 
 
-def test_a_study_without_trials_gives_its_directory_up(tmp_path):
+def test_study_without_trials_releases_its_directory(tmp_path):
     from jobs.ablate_lvae import claim
 
     claim(str(tmp_path), {"dataset": "/nowhere"})

@@ -1,4 +1,4 @@
-"""Imports point one way: jobs -> pipelines -> models; models runs without Ray."""
+"""Imports point one way: jobs -> pipelines -> models. models runs without Ray."""
 
 import ast
 import subprocess
@@ -26,15 +26,15 @@ def imported(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_imports_point_one_way(package):
+def test_architecture_imports_point_one_way(package):
     files = list((ROOT / package).rglob("*.py"))
     assert len(files) > 5
     wrong = {str(p.relative_to(ROOT)): imported(p) & FORBIDDEN[package] for p in files}
     assert not {name: found for name, found in wrong.items() if found}
 
 
-def test_data_jobs_import_no_torch():
-    """A second or two of every process that preprocesses."""
+def test_ingest_imports_no_torch():
+    """Importing torch would cost every preprocessing process one to two seconds."""
     code = "import sys, pipelines.preprocess.ingest; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
@@ -51,7 +51,7 @@ def test_models_import_without_ray_or_pyarrow():
     assert done.stdout.strip() == "PrITTIPipeline", done.stderr
 
 
-def test_no_pickle_and_no_unsafe_load():
+def test_architecture_has_no_pickle_or_unsafe_load():
     """Nothing unpickles: safetensors, JSON and Parquet only."""
     for path in [p for folder in ("models", "pipelines", "jobs") for p in (ROOT / folder).rglob("*.py")]:
         text = path.read_text()

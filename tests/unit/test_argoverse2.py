@@ -1,4 +1,4 @@
-"""The Argoverse 2 reader: physics of two real logs, frames on a written one, and broken files."""
+"""The Argoverse 2 reader: physical checks on two real logs, frames on a synthetic log, and broken files."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ def quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def pose_table() -> pa.Table:
-    """The ego drives 1 m per sweep straight ahead; some poses lie between the sweeps."""
+    """The ego vehicle drives 1 m per sweep straight ahead; some poses lie between the sweeps."""
     time = np.sort(np.concatenate([SWEEPS, SWEEPS + 50_000_000]))
     ahead = np.array([np.cos(YAW), np.sin(YAW), 0.0])
     at = ORIGIN + ((time - SWEEPS[0]) / 1e8).round(1)[:, None] * ahead
@@ -58,7 +58,7 @@ def points(*xy: tuple[float, float]) -> list[dict]:
 
 
 def map_json() -> dict:
-    """All is road 40 m around the origin; a crossing of 3 x 10 m whose edges run against each other."""
+    """Road up to 40 m around the origin, and a crossing of 3 x 10 m with edges of opposite direction."""
     return {
         "drivable_areas": {"1": {"id": 1, "area_boundary": points((-40, -40), (40, -40), (40, 40), (-40, 40))}},
         "lane_segments": {},
@@ -94,7 +94,7 @@ def root(tmp_path) -> Path:
 # ----------------------------------------------------------------------------------------------------- frames
 
 
-def test_boxes_stand_in_the_city_where_the_ego_saw_them(root):
+def test_argoverse2_places_boxes_in_city_frame(root):
     drive = read_drive(root, "train", LOG)
     assert drive.source == "av2" and drive.sequence == LOG and len(drive) == 3
     assert drive.label.tolist() == ["REGULAR_VEHICLE"] * 2 + ["CONSTRUCTION_CONE"] * 2
@@ -105,7 +105,7 @@ def test_boxes_stand_in_the_city_where_the_ego_saw_them(root):
     assert drive.size_m[0].tolist() == [4.5, 2.0, 1.6]
 
 
-def test_each_sweep_is_a_scene_of_its_own_boxes_in_the_ego_frame(root):
+def test_argoverse2_scene_has_boxes_of_its_sweep_in_ego_frame(root):
     drive = read_drive(root, "train", LOG)
     assert drive.frame.tolist() == SWEEPS.tolist()
     scenes = [drive.scene(k) for k in range(3)]
@@ -115,21 +115,21 @@ def test_each_sweep_is_a_scene_of_its_own_boxes_in_the_ego_frame(root):
     assert scenes[2].scene_id == f"av2-{LOG}-{SWEEPS[2]}"
 
 
-def test_a_log_without_other_boxes_is_a_drive_without_boxes(root):
+def test_argoverse2_reads_log_with_only_ego_box(root):
     ego_only = annotation_table(ROWS[-1:])
     pyarrow.feather.write_feather(ego_only, root / "train" / LOG / "annotations.feather")
     drive = read_drive(root, "train", LOG)
     assert len(drive) == 1 and len(drive.scene(0)) == 0
 
 
-def test_ids_are_the_same_on_every_machine(root):
+def test_argoverse2_ids_are_deterministic(root):
     drive = read_drive(root, "train", LOG)
     expected = int.from_bytes(hashlib.blake2b(b"car", digest_size=8).digest(), "big") >> 1
     assert drive.instance_id[0] == drive.instance_id[1] == expected
     assert drive.instance_id[2] == drive.instance_id[3] != expected
 
 
-def test_ground_lies_on_the_height_raster(root):
+def test_argoverse2_ground_lies_on_height_raster(root):
     drive = read_drive(root, "train", LOG)
     scene = drive.scene(0)
     assert scene.ground_classes == ("road", "crossing")
@@ -144,7 +144,7 @@ def test_ground_lies_on_the_height_raster(root):
             assert abs(scene.height_m[0, row, col] - expected) < 0.01
 
 
-def test_every_category_of_the_taxonomy_has_a_group(root):
+def test_argoverse2_groups_every_category_of_taxonomy(root):
     assert len(CATEGORY_OF) == 30
     folder = root / "train" / LOG
     rows = [(f"t{k}", label, 0, 20.0, k - 15.0, 0, 0, 1, 1, 1) for k, label in enumerate(sorted(CATEGORY_OF))]
@@ -171,7 +171,7 @@ def real(real_data, request):
 
 
 def surface_at(drive, points_m: np.ndarray) -> np.ndarray:
-    """Height raster below world points, NaN where unknown."""
+    """Heights of the raster at world points, NaN where unknown."""
     ground = drive.ground
     col, row = (points_m[:, :2] @ ground.raster_from_world[:2, :2].T + ground.raster_from_world[:2, 2]).astype(int).T
     rows, cols = ground.raster_m.shape
@@ -179,12 +179,12 @@ def surface_at(drive, points_m: np.ndarray) -> np.ndarray:
     return np.where(inside, ground.raster_m[row.clip(0, rows - 1), col.clip(0, cols - 1)], np.nan)
 
 
-def test_the_real_ego_origin_rides_a_wheel_radius_above_the_raster(real):
+def test_argoverse2_real_ego_origin_is_wheel_radius_above_ground(real):
     position = real.world_from_imu[:, :, 3]
     assert abs(np.nanmedian(position[:, 2] - surface_at(real, position)) - 0.31) < 0.05
 
 
-def test_real_cars_stand_on_the_raster(real):
+def test_argoverse2_real_cars_stand_on_ground(real):
     cars = real.category == CATEGORIES.index("vehicle_small")
     bottom = real.center_m[cars, 2] - real.size_m[cars, 2] / 2
     above = bottom - surface_at(real, real.center_m[cars])
@@ -192,15 +192,15 @@ def test_real_cars_stand_on_the_raster(real):
     assert abs(np.nanmedian(above)) < 0.05 and np.nanpercentile(np.abs(above), 90) < 0.2
 
 
-def test_real_bollards_do_not_move(real):
-    """Seen from a moving car, they stay put only if every sweep's pose is applied the right way."""
+def test_argoverse2_real_bollards_do_not_move(real):
+    """Seen from a moving car, they are static only if the pose of every sweep is applied correctly."""
     bollards = real.label == "BOLLARD"
     for track in np.unique(real.instance_id[bollards]):
         places = real.center_m[real.instance_id == track]
         assert np.linalg.norm(places - places.mean(axis=0), axis=1).max() < 0.25
 
 
-def test_real_cars_drive_where_they_head(real):
+def test_argoverse2_real_cars_move_along_their_heading(real):
     agreement = []
     for track in np.unique(real.instance_id[real.label == "REGULAR_VEHICLE"]):
         rows = np.flatnonzero(real.instance_id == track)
@@ -211,7 +211,7 @@ def test_real_cars_drive_where_they_head(real):
     assert len(agreement) >= 3 and np.median(agreement) > 0.9
 
 
-def test_real_scenes_have_road_below_the_car_and_no_ego_box(real):
+def test_argoverse2_real_scene_has_road_below_ego_and_no_ego_box(real):
     assert "EGO_VEHICLE" not in set(real.label)
     for k in range(0, len(real), 39):
         scene = real.scene(k)
@@ -259,7 +259,7 @@ BROKEN_ANNOTATIONS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_ANNOTATIONS)
-def test_broken_annotations_are_one_clear_error(root, name):
+def test_argoverse2_names_broken_annotations(root, name):
     breaks, reason = BROKEN_ANNOTATIONS[name]
     pyarrow.feather.write_feather(breaks(annotation_table()), root / "train" / LOG / "annotations.feather")
     assert_refused(root, reason, LOG)
@@ -276,7 +276,7 @@ BROKEN_POSES = {
 
 
 @pytest.mark.parametrize("name", BROKEN_POSES)
-def test_broken_poses_are_one_clear_error(root, name):
+def test_argoverse2_names_broken_poses(root, name):
     breaks, reason = BROKEN_POSES[name]
     pyarrow.feather.write_feather(breaks(pose_table()), root / "train" / LOG / "city_SE3_egovehicle.feather")
     assert_refused(root, reason, "city_SE3_egovehicle.feather")
@@ -313,7 +313,7 @@ BROKEN_MAPS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_MAPS)
-def test_a_broken_map_is_one_clear_error(root, name):
+def test_argoverse2_names_broken_map(root, name):
     content, reason = BROKEN_MAPS[name]
     path = root / "train" / LOG / "map" / f"log_map_archive_{LOG}____PIT_city_1.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -331,7 +331,7 @@ BROKEN_SIM2 = {
 
 
 @pytest.mark.parametrize("name", BROKEN_SIM2)
-def test_a_broken_sim2_is_one_clear_error(root, name):
+def test_argoverse2_names_broken_sim2(root, name):
     path = root / "train" / LOG / "map" / f"{LOG}___img_Sim2_city.json"
     path.write_text(edited(sim2_json(), **BROKEN_SIM2[name]))
     assert_refused(root, "download the log again", path.name)
@@ -348,7 +348,7 @@ BROKEN_HEIGHTS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_HEIGHTS)
-def test_a_broken_height_raster_is_one_clear_error(root, name):
+def test_argoverse2_names_broken_height_raster(root, name):
     path = root / "train" / LOG / "map" / f"{LOG}_ground_height_surface____PIT.npy"
     np.save(path, BROKEN_HEIGHTS[name], allow_pickle=True)
     assert_refused(root, "download the log again", path.name)
@@ -356,19 +356,19 @@ def test_a_broken_height_raster_is_one_clear_error(root, name):
 
 @pytest.mark.parametrize("size", [0, 5, 60, 1000])
 @pytest.mark.parametrize("pattern", ["*.feather", "map/*.npy", "map/log_map*.json"])
-def test_truncated_files_are_one_clear_error(root, pattern, size):
+def test_argoverse2_names_truncated_file(root, pattern, size):
     path = sorted((root / "train" / LOG).glob(pattern))[0]
     path.write_bytes(path.read_bytes()[:size] if size < path.stat().st_size else path.read_bytes()[:-7])
     assert_refused(root, "broken", path.name)
 
 
-def test_a_header_that_is_cut_open_is_one_clear_error(root):
+def test_argoverse2_names_truncated_npy_header(root):
     path = root / "train" / LOG / "map" / f"{LOG}_ground_height_surface____PIT.npy"
     path.write_bytes(path.read_bytes().replace(b"), }", b"(((("))
     assert_refused(root, "broken npy", path.name)
 
 
-def test_a_header_that_promises_terabytes_asks_for_no_memory(root):
+def test_argoverse2_allocates_nothing_for_oversized_npy_header(root):
     path = root / "train" / LOG / "map" / f"{LOG}_ground_height_surface____PIT.npy"
     good = path.read_bytes()
     promise = good.replace(b"(667, 667), }          ", b"(9999999, 9999999), }  ")
@@ -381,13 +381,13 @@ def test_a_header_that_promises_terabytes_asks_for_no_memory(root):
     "pattern",
     ["annotations.feather", "city_SE3_egovehicle.feather", "map/*.npy", "map/*Sim2*", "map/log_map*", "map"],
 )
-def test_missing_files_are_named(root, pattern):
+def test_argoverse2_names_missing_file(root, pattern):
     (path,) = (root / "train" / LOG).glob(pattern)
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     assert_refused(root, "download the log again", LOG)
 
 
-def test_logs_are_those_with_annotations(root, tmp_path):
+def test_argoverse2_lists_logs_with_annotations(root, tmp_path):
     (tmp_path / "val" / "b").mkdir(parents=True)
     (tmp_path / "val" / "a").mkdir()
     (tmp_path / "test" / "c").mkdir(parents=True)
@@ -400,7 +400,7 @@ def test_logs_are_those_with_annotations(root, tmp_path):
         logs(tmp_path / "test")
 
 
-def test_random_mutations_never_end_in_another_exception(root):
+def test_argoverse2_raises_only_named_errors_for_mutated_files(root):
     rng = np.random.default_rng(0)
     paths = sorted(p for p in (root / "train" / LOG).rglob("*") if p.is_file())
     refused = 0

@@ -1,4 +1,4 @@
-"""Augmented scenes are what a mirror, or a moved vehicle, would see."""
+"""Augmented scenes equal the scene seen in a mirror or from a moved vehicle."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from models.scene import Grid
 from pipelines.preprocess.sources.town.generator import town_drive
 
 
-def test_a_mirror_twice_is_none_and_once_reflects_every_box():
+def test_mirror_reflects_boxes_and_is_an_involution():
     scene = random_scene(0, n=50)
     seen = mirrored(scene)
     back = mirrored(seen)
@@ -31,7 +31,7 @@ def test_a_mirror_twice_is_none_and_once_reflects_every_box():
         mirrored(scene.moved(0.0, 4.0))
 
 
-def test_a_moved_vehicle_sees_what_a_drive_says_from_there():
+def test_moved_scene_equals_scene_of_drive_at_that_pose():
     drive = town_drive(5)
     dx, dy, turn = 1.5, -0.75, 0.04
     scene = drive.scene(40)
@@ -53,7 +53,7 @@ def test_a_moved_vehicle_sees_what_a_drive_says_from_there():
     assert np.abs(want.height_m - seen.height_m)[both].max() < 0.05
 
 
-def test_the_draw_depends_on_seed_and_place_only():
+def test_augmentation_depends_only_on_seed_and_position():
     scene = random_scene(1, n=20)
     augment = Augmentation(flip=True, move_m=1.0, turn_rad=0.04, seed=3)
     again = Augmentation(flip=True, move_m=1.0, turn_rad=0.04, seed=3)

@@ -1,4 +1,4 @@
-"""The ControlNet step with tiny random controlnet_weights: real diffusers pipelines, saved and loaded as a user's would be."""
+"""The ControlNet step: a real diffusers pipeline with small random weights, saved and loaded."""
 
 from pathlib import Path
 
@@ -27,13 +27,13 @@ def request(controlnet_weights: tuple[str, str], **changes) -> PhotoRequest:
     )
 
 
-def test_control_images_are_in_the_palette_with_a_sky():
+def test_control_image_uses_palette_and_sky():
     image = control_image(street_class_ids())
     assert image.dtype == np.uint8 and image[0, 0].tolist() == list(SKY)
     assert image[-1, 0].tolist() == CLASS_COLORS[CLASS_ID["road"]].tolist()
 
 
-def test_a_painting_depends_on_picture_prompt_and_seed(controlnet_weights):
+def test_painter_depends_on_image_prompt_and_seed(controlnet_weights):
     painter = Painter(request(controlnet_weights))
     first = painter.paint(street_class_ids())
     assert first.shape == (44, 60, 3) and first.dtype == np.uint8 and first.std() > 1  # 44 is no multiple of 8
@@ -43,7 +43,7 @@ def test_a_painting_depends_on_picture_prompt_and_seed(controlnet_weights):
         assert not np.array_equal(first, Painter(request(controlnet_weights, **other)).paint(street_class_ids())), other
 
 
-def test_missing_weights_are_said_clearly(controlnet_weights, tmp_path):
+def test_painter_names_missing_weights(controlnet_weights, tmp_path):
     from jobs.paint_streets import Config, paint
 
     with pytest.raises(ValueError, match="--diffusion is missing"):

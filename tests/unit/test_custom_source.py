@@ -1,4 +1,4 @@
-"""Own drives: what is written is what stands in the scene, ground held against shapely, every mistake named."""
+"""Custom drives: scenes equal the written tables, ground equals shapely, and errors name every mistake."""
 
 import hashlib
 import json
@@ -23,13 +23,13 @@ from pipelines.preprocess.sources.town.generator import town_drive
 from pipelines.schema.tables import Shard, read_scenes
 
 DOCUMENT = ROOT / "docs/own_drives.md"
-ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # a place in UTM
+ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # a position in UTM
 YAW = 0.7
 Tables = dict[str, list[dict]]
 
 
 def ahead(x: float, y: float, z: float = 0.0) -> np.ndarray:
-    """World point of a point in the first pose's ego frame."""
+    """Returns the world point of a point in the ego frame of the first pose."""
     return Pose(ORIGIN, YAW).to_world([x, y, z])
 
 
@@ -67,7 +67,7 @@ def street() -> Tables:
 
 
 def write(tables: Tables, root: Path, name: str = "street", parquet: bool = False) -> Path:
-    """ROOT/NAME with each table as JSON or as Parquet; returns ROOT."""
+    """Writes each table of ROOT/NAME as JSON or as Parquet; returns ROOT."""
     folder = root / name
     folder.mkdir(parents=True, exist_ok=True)
     for table, rows in tables.items():
@@ -97,14 +97,14 @@ def assert_same_drive(a: Drive, b: Drive, tolerance: float = 0.0):
 # ------------------------------------------------------------------------------------------------- ways to write
 
 
-def test_json_and_parquet_are_the_same_drive(tmp_path):
+def test_custom_source_reads_json_and_parquet_equally(tmp_path):
     a, b = written(street(), tmp_path / "a"), written(street(), tmp_path / "b", parquet=True)
     assert_same_drive(a, b)
     assert a.source == "own" and a.sequence == "street" and len(a) == 2 and len(a.category) == 7
 
 
-def test_a_data_frame_with_gaps_and_an_index_is_the_same_drive(tmp_path):
-    """pandas turns integers beside a gap into floats, and writes the index of a filtered frame."""
+def test_custom_source_reads_pandas_frame_with_gaps_and_index(tmp_path):
+    """pandas converts integers next to a gap to floats and writes the index of a filtered frame."""
     a = written(street(), tmp_path / "a")
     folder = write(street(), tmp_path / "b", parquet=True) / "street"
     rows = street()["boxes"]
@@ -115,7 +115,7 @@ def test_a_data_frame_with_gaps_and_an_index_is_the_same_drive(tmp_path):
     assert_same_drive(a, read_drive(tmp_path / "b", "street"))
 
 
-def test_yaw_quaternion_and_matrix_are_the_same_orientation(tmp_path):
+def test_custom_source_reads_yaw_quaternion_and_matrix_equally(tmp_path):
     tables = street()
     a = written(tables, tmp_path / "a")
     for row in [*tables["boxes"], *tables["poses"]]:
@@ -130,7 +130,7 @@ def test_yaw_quaternion_and_matrix_are_the_same_orientation(tmp_path):
     assert_same_drive(a, written(tables, tmp_path / "d", parquet=True), 1e-12)
 
 
-def test_an_outline_means_the_same_either_way_round_and_closed_or_not(tmp_path):
+def test_custom_source_ignores_winding_and_closure_of_outline(tmp_path):
     shape = outline((5, -4), (40, -4), (40, 4), (20, 0), (5, 4))
     rasters = []
     for k, points in enumerate([shape, shape[::-1], [*shape, shape[0]], [*shape[2:], *shape[:2]], [shape[0], *shape]]):
@@ -141,7 +141,7 @@ def test_an_outline_means_the_same_either_way_round_and_closed_or_not(tmp_path):
         assert np.array_equal(scene.height_m, rasters[0].height_m)
 
 
-def test_a_drive_may_have_no_boxes_or_no_ground(tmp_path):
+def test_custom_source_reads_drive_without_boxes_or_ground(tmp_path):
     empty = written(street() | {"boxes": []}, tmp_path / "a")
     assert len(empty.category) == 0 and len(empty.scene(0)) == 0 and empty.scene(0).occupied.any()
     bare = read_drive(write(street() | {"polygons": []}, tmp_path / "b"), "street", ("road", "terrain"))
@@ -156,7 +156,7 @@ def test_a_drive_may_have_no_boxes_or_no_ground(tmp_path):
 # ------------------------------------------------------------------------------------------------ scene content
 
 
-def test_boxes_stand_in_the_scene_where_they_were_written(tmp_path):
+def test_custom_source_places_boxes_in_scene(tmp_path):
     drive = written(street(), tmp_path)
     scene = drive.scene(0)
     assert scene.scene_id == "own-street-0000000010"
@@ -177,7 +177,7 @@ def test_boxes_stand_in_the_scene_where_they_were_written(tmp_path):
     assert scene.instance_id.tolist() == [7, -1, -1, -1, 8]
 
 
-def test_a_moving_box_is_in_the_scene_of_its_frame_only(tmp_path):
+def test_custom_source_places_moving_box_in_its_frame_only(tmp_path):
     drive = written(street(), tmp_path)
     moving = [scene.center_m[scene.instance_id == 8] for scene in (drive.scene(0), drive.scene(1))]
     assert np.allclose(moving, [[[25, 0, 0.5]], [[26, 0, 0.5]]], atol=1e-5)
@@ -186,7 +186,7 @@ def test_a_moving_box_is_in_the_scene_of_its_frame_only(tmp_path):
     assert drive.timestamp.tolist() == [STATIC] * 4 + [10, 20, 20]
 
 
-def test_a_box_keeps_its_lean_and_a_standing_one_has_no_heading(tmp_path):
+def test_custom_source_keeps_lean_and_drops_upright_heading(tmp_path):
     turn = Rotation.from_euler("ZY", [[YAW + 0.4, 0.3], [YAW, np.pi / 2]])
     tables = street()
     tables["boxes"] = [
@@ -197,10 +197,10 @@ def test_a_box_keeps_its_lean_and_a_standing_one_has_no_heading(tmp_path):
     drive = written(tables, tmp_path)
     assert np.allclose(drive.rotation, turn.as_matrix(), atol=1e-12)
     assert np.allclose(drive.heading_rad, [YAW + 0.4, np.nan], equal_nan=True)
-    assert np.allclose(drive.scene(0).size_m[1], [2.0, 1.5, 4.0])  # standing on its tail
+    assert np.allclose(drive.scene(0).size_m[1], [2.0, 1.5, 4.0])  # upright, length along z
 
 
-def test_frames_may_be_nanoseconds(tmp_path):
+def test_custom_source_accepts_nanosecond_frames(tmp_path):
     tables, start = street(), 1_532_402_927_612_460_001
     for row in [*tables["boxes"], *tables["poses"]]:
         row |= {"frame": start + row["frame"]} if "frame" in row else {}
@@ -210,7 +210,7 @@ def test_frames_may_be_nanoseconds(tmp_path):
         assert drive.scene(1).scene_id == f"own-street-{start + 20}" and len(drive.scene(1)) == 6
 
 
-def test_text_ids_are_the_same_on_every_machine(tmp_path):
+def test_custom_source_text_ids_are_deterministic(tmp_path):
     tables = street()
     for row in tables["boxes"]:
         row["instance_id"] = "ab12"
@@ -229,7 +229,7 @@ def pixels(pose: Pose, grid: Grid) -> np.ndarray:
 
 
 def star(rng: np.random.Generator, points: int) -> list[tuple[float, float]]:
-    """A simple polygon, mostly far from convex, in and out of the crop."""
+    """A simple, mostly non-convex polygon, partly outside the crop."""
     angle = (np.arange(points) + rng.uniform(0, 0.9, points)) * 2 * np.pi / points
     radius = rng.uniform(3, 40, points)
     x, y = rng.uniform([5, -25], [60, 25])
@@ -258,7 +258,7 @@ SPIRAL = [
 
 
 @pytest.mark.parametrize("shape", ["comb", "spiral", *range(8)])
-def test_ground_covers_the_pixel_centres_inside_its_outline(tmp_path, shape):
+def test_custom_source_ground_covers_pixel_centers_in_outline(tmp_path, shape):
     rng = np.random.default_rng([3, shape if isinstance(shape, int) else 99])
     xy = {"comb": COMB, "spiral": SPIRAL}.get(shape) or star(rng, int(rng.integers(3, 40)))
     points = np.array(outline(*xy))
@@ -279,8 +279,8 @@ def test_ground_covers_the_pixel_centres_inside_its_outline(tmp_path, shape):
     assert np.abs(height[0] - plane)[occupied[0]].max() < 1e-4
 
 
-def test_abutting_polygons_leave_no_gap_and_meet_in_height(tmp_path):
-    """A 50 m square cut by zigzags into strips, of hilly ground."""
+def test_custom_source_abutting_polygons_leave_no_gap(tmp_path):
+    """A 50 m square of hilly ground, cut by zigzag lines into strips."""
     rng = np.random.default_rng(5)
     along = np.linspace(5, 55, 12)
     cuts = [np.full(12, -25.0), *[y + rng.uniform(-3, 3, 12) for y in (-15, -5, 5, 15)], np.full(12, 25.0)]
@@ -300,15 +300,15 @@ def test_abutting_polygons_leave_no_gap_and_meet_in_height(tmp_path):
         for t in drive.ground.triangles_m.tolist()
         for e in zip(map(tuple, t), map(tuple, t[1:] + t[:1]), strict=True)
     }
-    for line in lines:  # the surface of either side goes straight from point to point of their common line
+    for line in lines:  # both surfaces are linear between the points of their common line
         assert all(tuple(sorted((tuple(a), tuple(b)))) in edges for a, b in zip(line[:-1], line[1:], strict=True))
     seam = occupied[0][:, :-1] & occupied[1][:, 1:]
     step = np.abs(height[0][:, :-1] - height[1][:, 1:])[seam]
     assert seam.sum() > 100 and np.median(step) < 0.1
 
 
-def test_points_along_a_straight_edge_keep_their_height(tmp_path):
-    """A crest across a straight road of three points a side."""
+def test_custom_source_keeps_height_of_points_on_edge(tmp_path):
+    """A crest across a straight road with three points on each side."""
     side = [(10, 4, 0), (30, 4, 2), (50, 4, 0)]
     points = [ahead(x, y, z).tolist() for x, y, z in [*side, *[(x, -y, z) for x, y, z in side[::-1]]]]
     drive = written(street() | {"polygons": [{"class": "road", "outline": points}]}, tmp_path)
@@ -317,8 +317,8 @@ def test_points_along_a_straight_edge_keep_their_height(tmp_path):
     assert occupied[0].sum() == 160 * 32 and np.abs(height[0] - expected)[occupied[0]].max() < 1e-4
 
 
-def test_a_polygon_larger_than_the_crop_fills_it(tmp_path):
-    """None of its points lies in the crop, nor do most of another's."""
+def test_custom_source_polygon_larger_than_crop_fills_it(tmp_path):
+    """None of its points lies in the crop; of a second polygon, only a few do."""
     huge = [[*(ORIGIN[:2] + 2000 * np.array(d)), 113.0] for d in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     polygons = [{"class": "terrain", "outline": huge}, street()["polygons"][0]]
     drive = written(street() | {"polygons": polygons}, tmp_path)
@@ -328,7 +328,7 @@ def test_a_polygon_larger_than_the_crop_fills_it(tmp_path):
     assert scene.ground_area_m2()[0] == 64 * 8
 
 
-def test_where_a_class_lies_twice_its_upper_surface_counts(tmp_path):
+def test_custom_source_uses_upper_surface_of_class(tmp_path):
     bridge = {"class": "road", "outline": outline((20, -20), (30, -20), (30, 20), (20, 20), z=5.0)}
     scene = written(street() | {"polygons": [street()["polygons"][0], bridge]}, tmp_path).scene(0)
     on = (Grid().x_m() > 20) & (Grid().x_m() < 30)
@@ -336,7 +336,7 @@ def test_where_a_class_lies_twice_its_upper_surface_counts(tmp_path):
     assert np.allclose(scene.height_m[0, ~on, 128], -1.0, atol=1e-4)
 
 
-def test_a_drive_at_some_poses_has_the_same_scenes(tmp_path):
+def test_custom_source_drive_at_some_poses_has_same_scenes(tmp_path):
     tables = street()
     tables["poses"] = [{"frame": k, "yaw_rad": YAW + 0.1 * k} | place(ahead(15 * k, 0)) for k in range(8)]
     for row in tables["boxes"]:
@@ -353,7 +353,7 @@ def test_a_drive_at_some_poses_has_the_same_scenes(tmp_path):
 
 
 def exported(drive: Drive) -> Tables:
-    """A town in this format: quaternions, matrices turned to y left and z up, slab tops as polygons."""
+    """A town in the custom format: quaternions, matrices with y left and z up, slab tops as polygons."""
     quaternion = Rotation.from_matrix(drive.rotation).as_quat(scalar_first=True)
     columns = {
         "category": [CATEGORIES[c] for c in drive.category],
@@ -381,7 +381,7 @@ def exported(drive: Drive) -> Tables:
     }
 
 
-def test_a_town_written_in_this_format_has_the_same_scenes(tmp_path):
+def test_custom_source_round_trips_town(tmp_path):
     town = town_drive(3)
     mine = written(exported(town), tmp_path, parquet=True)
     assert len(mine) == len(town) and (town.timestamp != STATIC).sum() > 10
@@ -394,7 +394,7 @@ def test_a_town_written_in_this_format_has_the_same_scenes(tmp_path):
             assert np.allclose(getattr(a, name), getattr(b, name), atol=1e-4), name
         assert np.array_equal(np.isnan(a.heading_rad), np.isnan(b.heading_rad))
         turned = (a.heading_rad - b.heading_rad + np.pi) % (2 * np.pi) - np.pi
-        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # the town's boxes lean with the slope
+        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # boxes of the town lean with the slope
         assert np.isclose(a.world_yaw_rad, b.world_yaw_rad) and np.allclose(a.world_xyz_m, b.world_xyz_m)
         seen_moving += int(np.isin(town.timestamp, town.frame[k]).sum())
         common = [a.ground_classes.index(name) for name in b.ground_classes]
@@ -413,7 +413,7 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory) -> dict:
-    """What the document's Python leaves behind, run from top to bottom in an empty folder."""
+    """The folder that the document's Python code writes, run from top to bottom."""
     folder = tmp_path_factory.mktemp("example")
     names = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:
@@ -423,7 +423,7 @@ def example(tmp_path_factory) -> dict:
     return names
 
 
-def test_the_documents_example_makes_a_street(example, capsys):
+def test_custom_source_document_example_writes_street(example, capsys):
     root = example["folder"] / "my_drives"
     assert drives(root) == ["first_street"] and read_splits(root) is None
     assert ground_classes(root) == ("road", "sidewalk", "terrain")
@@ -439,7 +439,7 @@ def test_the_documents_example_makes_a_street(example, capsys):
     assert (example["folder"] / "first_scene.png").stat().st_size > 500
 
 
-def test_the_documents_query_runs_on_its_scenes(example):
+def test_custom_source_document_query_runs(example):
     drive = read_drive(example["folder"] / "my_drives", "first_street")
     tables = example["folder"] / "my_scenes"
     Shard(str(tables), "own", "train", 0).write([drive.scene(k, "train") for k in range(3)])
@@ -450,7 +450,7 @@ def test_the_documents_query_runs_on_its_scenes(example):
     assert found["construction_big"][1] == pytest.approx(14)
 
 
-def test_the_documents_turn_into_the_world_is_right(example):
+def test_custom_source_document_world_transform_is_right(example):
     seen = {"x_m": 20.0, "y_m": -6.0, "z_m": 0.5, "yaw_rad": 3.0}
     pose = {"frame": 4, "yaw_rad": YAW} | place(ORIGIN)
     there = example["to_world"](seen, pose)
@@ -459,7 +459,7 @@ def test_the_documents_turn_into_the_world_is_right(example):
     assert -np.pi <= there["yaw_rad"] < np.pi
 
 
-def test_the_document_names_every_column_category_and_class():
+def test_custom_source_document_names_all_columns_and_classes():
     text = DOCUMENT.read_text()
     tables = {title: body for title, body in re.findall(r"## (boxes|polygons|poses)\n(.*?)(?=\n## )", text, re.DOTALL)}
     known = {"boxes": custom.BOX_COLUMNS, "polygons": custom.POLYGON_COLUMNS, "poses": custom.POSE_COLUMNS}
@@ -474,11 +474,11 @@ def test_the_document_names_every_column_category_and_class():
 # ---------------------------------------------------------------------------------------------------- the root
 
 
-def test_ground_classes_are_those_of_all_drives(tmp_path):
+def test_custom_source_ground_classes_cover_all_drives(tmp_path):
     write(street(), tmp_path, "a")
     crossing = [{"class": "crossing", "outline": outline((5, -4), (9, -4), (9, 4))}]
     write(street() | {"polygons": crossing}, tmp_path, "b")
-    (tmp_path / "c").mkdir()  # broken: left for read_drive
+    (tmp_path / "c").mkdir()  # broken: read_drive reports it
     (tmp_path / ".cache").mkdir()
     assert drives(tmp_path) == ["a", "b", "c"]
     assert ground_classes(tmp_path) == ("road", "sidewalk", "crossing")
@@ -492,7 +492,7 @@ def test_ground_classes_are_those_of_all_drives(tmp_path):
         ground_classes(write({"polygons": []}, tmp_path / ".bare"))
 
 
-def test_splits_are_as_given(tmp_path):
+def test_custom_source_splits_are_as_given(tmp_path):
     for name in ("a", "b"):
         write(street(), tmp_path, name)
     assert read_splits(tmp_path) is None
@@ -512,7 +512,7 @@ BROKEN_SPLITS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_SPLITS)
-def test_broken_splits_are_one_clear_error(tmp_path, name):
+def test_custom_source_names_broken_splits(tmp_path, name):
     text, reason = BROKEN_SPLITS[name]
     write(street(), tmp_path, "a")
     (tmp_path / "splits.json").write_text(text)
@@ -521,7 +521,7 @@ def test_broken_splits_are_one_clear_error(tmp_path, name):
     assert "splits.json" in str(error.value)
 
 
-def test_a_root_without_drives_says_where_they_belong(tmp_path):
+def test_custom_source_error_states_where_drives_belong(tmp_path):
     with pytest.raises(ValueError, match="no folder here; --input must name the folder of all drives"):
         drives(tmp_path)
     write(street(), tmp_path, "my street")
@@ -535,7 +535,7 @@ def test_a_root_without_drives_says_where_they_belong(tmp_path):
 
 
 def changed(table: str, row: int, **values):
-    """The street with some values of one row replaced; a value of ... takes the key away."""
+    """The street with some values of one row replaced; a value of ... removes the key."""
 
     def change(tables: Tables) -> None:
         tables[table][row] |= values
@@ -563,7 +563,7 @@ def corner(x: float, y: float, z: float = -1.0) -> list[float]:
 
 LEVEL = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 115]
 NAN, INF = float("nan"), float("inf")
-# name -> (what is done to the street, the file that the error names, what it says)
+# name -> (change of the street, file that the error names, message)
 MISTAKES = {
     "category": (changed("boxes", 2, category="tree"), "boxes", "category of row 2 is 'tree', expected one of vegetation_cuboid, "),
     "category null": (changed("boxes", 2, category=None), "boxes", "category of row 2 is null, expected a text"),
@@ -677,7 +677,7 @@ def assert_refused(root: Path, file: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_one_clear_error(tmp_path, name):
+def test_custom_source_names_mistake(tmp_path, name):
     change, file, reason = MISTAKES[name]
     tables = street()
     change(tables)
@@ -685,7 +685,7 @@ def test_a_mistake_is_one_clear_error(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", BROKEN_MATRICES)
-def test_a_broken_matrix_is_one_clear_error(tmp_path, name):
+def test_custom_source_names_broken_matrix(tmp_path, name):
     values, reason = BROKEN_MATRICES[name]
     assert_refused(write(street() | {"poses": matrix_of(values)}, tmp_path), "poses.json", reason)
 
@@ -704,7 +704,7 @@ BROKEN_FILES = {
 
 
 @pytest.mark.parametrize("name", BROKEN_FILES)
-def test_a_broken_file_is_one_clear_error(tmp_path, name):
+def test_custom_source_names_broken_file(tmp_path, name):
     file, content, reason = BROKEN_FILES[name]
     write(street(), tmp_path)
     (tmp_path / "street" / "boxes.json").unlink()
@@ -713,7 +713,7 @@ def test_a_broken_file_is_one_clear_error(tmp_path, name):
 
 
 @pytest.mark.parametrize("table", ["boxes", "polygons", "poses"])
-def test_a_missing_table_and_one_too_many_are_named(tmp_path, table):
+def test_custom_source_names_missing_and_surplus_table(tmp_path, table):
     folder = write(street(), tmp_path) / "street"
     write({table: street()[table]}, tmp_path, parquet=True)
     assert_refused(tmp_path, f"{table}.parquet", f"{table}.json lies beside it; keep one of the two")
@@ -733,7 +733,7 @@ BROKEN_COLUMNS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_COLUMNS)
-def test_a_parquet_column_of_another_kind_is_one_clear_error(tmp_path, name):
+def test_custom_source_names_parquet_column_of_wrong_type(tmp_path, name):
     columns, reason = BROKEN_COLUMNS[name]
     root = write(street(), tmp_path, parquet=True)
     path = root / "street" / "boxes.parquet"
@@ -744,14 +744,14 @@ def test_a_parquet_column_of_another_kind_is_one_clear_error(tmp_path, name):
     assert_refused(root, "boxes.parquet", reason)
 
 
-def test_a_column_that_is_there_twice_is_refused(tmp_path):
+def test_custom_source_rejects_duplicate_column(tmp_path):
     path = write(street(), tmp_path, parquet=True) / "street" / "boxes.parquet"
     table = pq.read_table(path)
     pq.write_table(table.append_column("x_m", table["y_m"]), path)
     assert_refused(tmp_path, "boxes.parquet", "column 'x_m' is there twice")
 
 
-def test_numbers_of_any_width_and_coded_texts_are_read(tmp_path):
+def test_custom_source_reads_any_number_width_and_dictionaries(tmp_path):
     a = written(street(), tmp_path / "a")
     path = write(street(), tmp_path / "b", parquet=True) / "street" / "boxes.parquet"
     table = pq.read_table(path)
@@ -768,7 +768,7 @@ def test_numbers_of_any_width_and_coded_texts_are_read(tmp_path):
     assert_same_drive(a, read_drive(tmp_path / "b", "street"), 1e-6)
 
 
-def test_random_mutations_never_end_in_another_exception(tmp_path):
+def test_custom_source_raises_only_named_errors_for_mutations(tmp_path):
     rng = np.random.default_rng(0)
     folder = write(street(), tmp_path, parquet=True) / "street"
     paths, refused = sorted(folder.iterdir()), 0
@@ -790,7 +790,7 @@ def test_random_mutations_never_end_in_another_exception(tmp_path):
     assert refused > 50
 
 
-def test_poses_alone_are_read_without_the_rest(tmp_path):
+def test_custom_source_reads_poses_alone(tmp_path):
     write({"poses": street()["poses"]}, tmp_path)
     frame, world_from_ego = read_poses(tmp_path, "street")
     assert frame.tolist() == [10, 20] and np.allclose(world_from_ego[0, :, 3], ORIGIN)

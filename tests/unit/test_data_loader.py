@@ -1,4 +1,4 @@
-"""The stream of training samples: every scene once an epoch, the same whoever reads it; layouts are the tables'."""
+"""The stream of training samples: each scene once per epoch, independent of the number of workers."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from models.training import NotFinite
 from pipelines.training.data_loader import LayoutReader, Stream, read_samples
 
 
-def test_every_scene_comes_once_an_epoch_in_another_order(layout_shards):
+def test_stream_visits_scenes_once_per_epoch_in_new_order(layout_shards):
     stream = Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     epochs = [list(zip(*stream.positions(25 * e, 25), strict=True)) for e in range(3)]
     everything = {(k, row) for k, count in enumerate(SHARD_SIZES) for row in range(count)}
@@ -20,7 +20,7 @@ def test_every_scene_comes_once_an_epoch_in_another_order(layout_shards):
     assert stream.positions(20, 10)[0].tolist() == [k for k, _ in (epochs[0] + epochs[1])[20:30]]
 
 
-def test_samples_are_the_layouts_of_the_stored_scenes(layout_shards):
+def test_read_samples_equals_layouts_of_stored_scenes(layout_shards):
     spec, stream = small_spec(32), Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     got = read_samples(stream, LayoutReader(spec), first=2, count=3, batch=4, rank=0, world=1)
     for k, (shard, row) in enumerate(zip(*stream.positions(8, 12), strict=True)):
@@ -30,7 +30,7 @@ def test_samples_are_the_layouts_of_the_stored_scenes(layout_shards):
 
 
 @pytest.mark.parametrize("augment", [None, Augmentation(flip=True, move_m=1.0, turn_rad=0.05, seed=1)])
-def test_two_workers_read_what_one_would(layout_shards, augment):
+def test_read_samples_of_two_workers_equals_one(layout_shards, augment):
     reader, stream = LayoutReader(small_spec(32), augment), Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     one = read_samples(stream, reader, 5, 4, 4, 0, 1)
     two = [read_samples(stream, reader, 5, 4, 4, rank, 2) for rank in range(2)]
@@ -39,7 +39,7 @@ def test_two_workers_read_what_one_would(layout_shards, augment):
         assert np.array_equal(together.reshape(value.shape), value), name
 
 
-def test_a_broken_loss_names_its_scenes(layout_shards):
+def test_nonfinite_loss_names_its_scenes(layout_shards):
     stream = Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     shard, row = stream.positions(8, 4)
     ids = [layout_shards[shard[k]].scenes([int(row[k])])[0].scene_id for k in (1, 3)]

@@ -1,4 +1,4 @@
-"""Schedule, sampler and RePaint against diffusers and against themselves."""
+"""Schedule, samplers, RePaint and the trainer, compared with diffusers and torch."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def random_dit(seed: int = 0, **options) -> DiT:
 
 
 @pytest.mark.parametrize("steps", [1000, 250, 50, 7])
-def test_every_step_is_diffusers_ddpm(steps):
+def test_ddpm_step_equals_diffusers(steps):
     reference, walk = scheduler(), Walk(Diffusion(), steps)
     reference.set_timesteps(steps)
     assert reference.timesteps.tolist() == walk.timesteps[::-1].tolist()
@@ -37,7 +37,7 @@ def test_every_step_is_diffusers_ddpm(steps):
 
 
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
-def test_every_step_of_less_noise_is_diffusers_ddim(eta):
+def test_ddim_step_equals_diffusers(eta):
     reference, walk = DDIMScheduler.from_config(scheduler().config), Walk(Diffusion(), 50, eta)
     reference.set_timesteps(50)
     latent, predicted, noise = torch.randn(3, 2, *LATENT_SHAPE)
@@ -47,7 +47,7 @@ def test_every_step_of_less_noise_is_diffusers_ddim(eta):
         assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
 
 
-def test_forward_noise_is_diffusers():
+def test_add_noise_equals_diffusers():
     clean, noise, t = torch.randn(3, *LATENT_SHAPE), torch.randn(3, *LATENT_SHAPE), torch.tensor([0, 500, 999])
     want = scheduler().add_noise(clean, noise, t)
     assert torch.allclose(Diffusion().add_noise(clean, noise, t), want, atol=1e-5)
@@ -57,7 +57,7 @@ def test_forward_noise_is_diffusers():
     assert walk.to_state(clean, noise, -1) is clean
 
 
-def test_noising_in_two_steps_has_the_variance_of_one():
+def test_add_noise_in_two_steps_has_variance_of_one():
     walk = Walk(Diffusion(), 250)
     for low, high in ((0, 10), (100, 110), (239, 249)):
         ratio = walk.alpha_bar[high] / walk.alpha_bar[low]
@@ -66,15 +66,15 @@ def test_noising_in_two_steps_has_the_variance_of_one():
     assert torch.isclose(walk.up(one, zero, 3, 9) ** 2 + walk.up(zero, one, 3, 9) ** 2, one)
 
 
-def test_of_the_true_velocity_the_true_noise_is_made():
-    """diffusers' velocity, put through the shares of a DiT that predicts velocities."""
+def test_velocity_converts_to_epsilon():
+    """Converts the velocity of diffusers with the weights of a DiT that predicts velocities."""
     clean, noise, t = torch.randn(4, *LATENT_SHAPE), torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999])
     latent, velocity = scheduler().add_noise(clean, noise, t), scheduler().get_velocity(clean, noise, t)
     of_latent, of_velocity = random_dit(prediction="velocity").noise_shares[t][:, :, None, None, None].unbind(1)
     assert torch.allclose(of_latent * latent + of_velocity * velocity, noise, atol=1e-5)
 
 
-def test_a_dit_of_velocities_is_one_of_noise_with_shares_around_it():
+def test_velocity_dit_equals_weighted_epsilon_dit():
     noise_dit, velocity_dit = random_dit(), random_dit(prediction="velocity")
     latent, t, label = torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999]), torch.tensor([0, 1, 2, 3])
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar[t]).float()[:, None, None, None]
@@ -83,7 +83,7 @@ def test_a_dit_of_velocities_is_one_of_noise_with_shares_around_it():
     assert torch.allclose(velocity_dit(latent, t, label), expected, atol=1e-6)
     assert torch.allclose(velocity_dit.prepared(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5)
     assert (noise_dit.loss_weight(t) == 1).all()
-    other = torch.randn(4, *LATENT_SHAPE)  # the error of any answer in noise, weighted, is its error in velocity
+    other = torch.randn(4, *LATENT_SHAPE)  # the weighted error in epsilon is the error in velocity
     wrong = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * other
     weighted = velocity_dit.loss_weight(t) * ((wrong - expected) ** 2).mean((1, 2, 3))
     assert torch.allclose(weighted, ((other - velocity) ** 2).mean((1, 2, 3)), rtol=1e-3)
@@ -91,7 +91,7 @@ def test_a_dit_of_velocities_is_one_of_noise_with_shares_around_it():
         DiT(prediction="x0")
 
 
-def test_a_scene_depends_on_its_seed_and_index_only():
+def test_sample_depends_only_on_seed_and_index():
     dit, walk = random_dit(), Walk(Diffusion(), 20)
     labels = torch.arange(8) % 3
     together = sample(dit, walk, SceneNoise(5, range(8), LATENT_SHAPE, "cpu"), labels)
@@ -102,7 +102,7 @@ def test_a_scene_depends_on_its_seed_and_index_only():
     assert (together[0] - together[1]).abs().mean() > 0.1
 
 
-def test_guidance_at_scale_one_costs_nothing():
+def test_guidance_at_scale_one_adds_no_evaluation():
     calls = []
 
     def model(latent, timestep, label):
@@ -116,8 +116,8 @@ def test_guidance_at_scale_one_costs_nothing():
     assert torch.allclose(doubled, latent * (3 + 4 * (label[:, None, None, None] - 3.0)), atol=1e-5)
 
 
-def test_repaint_jumps_are_the_originals():
-    """diffusers' schedule, itself the authors' code: the sequence of timesteps, up and down."""
+def test_repaint_timesteps_equal_diffusers():
+    """The sequence of timesteps equals that of diffusers, which uses the code of RePaint's authors."""
     reference = RePaintScheduler(num_train_timesteps=250)
     for jump, resamplings in ((10, 10), (5, 3), (10, 1), (1, 2)):
         reference.set_timesteps(250, jump_length=jump, jump_n_sample=resamplings)
@@ -132,7 +132,7 @@ def test_repaint_jumps_are_the_originals():
         repaint_transitions(10, 0)
 
 
-def test_the_known_part_comes_back_bit_for_bit():
+def test_repaint_returns_known_part_exactly():
     dit, walk = random_dit(), Walk(Diffusion(), 20)
     clean = torch.randn(2, *LATENT_SHAPE)
     mask = torch.zeros(2, *LATENT_SHAPE)
@@ -145,7 +145,7 @@ def test_the_known_part_comes_back_bit_for_bit():
     assert (out[:, :, :4] - clean[:, :, :4]).abs().mean() > 0.1
 
 
-def test_the_known_part_is_noised_to_the_state_just_reached():
+def test_repaint_noises_known_part_to_reached_state():
     walk, seen = Walk(Diffusion(), 50), []
 
     def model(latent, timestep, label):
@@ -167,7 +167,7 @@ def test_the_known_part_is_noised_to_the_state_just_reached():
         assert np.isclose(std, (1 - Diffusion().alpha_bar[t]) ** 0.5, rtol=0.05)
 
 
-def test_bad_step_counts_are_named():
+def test_sampler_rejects_invalid_step_counts():
     with pytest.raises(ValueError, match="num_steps is 0, expected 1 to 1000"):
         Walk(Diffusion(), 0)
     with pytest.raises(ValueError, match="600: 1 apart, they would begin at 599 of 1000; expected 500 or 1000"):
@@ -198,7 +198,7 @@ def test_dit_overfits_one_batch(prediction):
     assert np.mean([float(loss["noise_error"]) for loss in losses[-50:]]) < 0.35
 
 
-def test_training_resumes_exactly(tmp_path):
+def test_trainer_resumes_exactly(tmp_path):
     batch = dit_batch()
     straight = new_trainer()
     curve = [float(straight.step(batch, range(8))["loss"]) for _ in range(8)]
@@ -218,7 +218,7 @@ def test_training_resumes_exactly(tmp_path):
         new_trainer(learning_rate=0.1).load(tmp_path)
 
 
-def test_half_batches_draw_what_the_whole_batch_draws():
+def test_trainer_half_batches_have_losses_of_whole_batch():
     """Two workers of 4 see the losses that one worker of 8 sees."""
     batch = dit_batch()
     whole = float(new_trainer().step(batch, range(8))["loss"])
@@ -230,7 +230,7 @@ def test_half_batches_draw_what_the_whole_batch_draws():
 
 
 @pytest.mark.parametrize("parts", [2, 3, 8])
-def test_accumulated_parts_make_the_whole_step(parts):
+def test_trainer_accumulated_parts_equal_whole_step(parts):
     batch = dit_batch()
     whole, cut = new_trainer(), new_trainer(execution=Execution(accumulate=parts))
     for _ in range(3):
@@ -241,7 +241,7 @@ def test_accumulated_parts_make_the_whole_step(parts):
         assert torch.allclose(value, cut.model.state_dict()[name], atol=2e-5), name
 
 
-def test_bf16_and_compile_compute_the_same_loss():
+def test_trainer_bf16_and_compile_compute_same_loss():
     batch = dit_batch()
     plain = float(new_trainer().step(batch, range(8))["loss"])
     half = new_trainer(execution=Execution(precision="bf16"))
@@ -251,21 +251,23 @@ def test_bf16_and_compile_compute_the_same_loss():
         Execution(precision="fp16")
 
 
-def test_a_loss_that_is_not_finite_stops_before_anything_changes():
+def test_trainer_stops_at_nonfinite_loss_before_update():
     trainer, batch, asked = new_trainer(), dit_batch(), []
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
     trainer.wrapped = lambda *inputs: asked.append(1) or trainer.model(*inputs)
     batch["mean"][3] = float("nan")
     with pytest.raises(NotFinite, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
         trainer.step(batch, range(8, 16))
-    assert caught.value.positions == [11] and len(asked) == 1  # who is to blame is no step: other workers take none
+    assert (
+        caught.value.positions == [11] and len(asked) == 1
+    )  # the search for the sample is no step: other workers take none
     batch["mean"][:] = float("nan")
     with pytest.raises(NotFinite, match="of every sample: the weights are broken"):
         trainer.step(batch, range(8))
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 
 
-def test_labels_are_dropped_for_a_tenth_of_the_samples_and_whole_samples_only():
+def test_trainer_drops_labels_of_a_tenth_of_samples():
     trainer, labels = new_trainer(), []
     real = trainer.wrapped.forward
 
@@ -282,7 +284,7 @@ def test_labels_are_dropped_for_a_tenth_of_the_samples_and_whole_samples_only():
 
 
 def test_learning_rate_is_one_cycle_without_warm_up():
-    """torch's cosine annealing from 1e-4 to 1e-5: what OneCycleLR does when there is no warm-up."""
+    """Equals torch's cosine annealing from 1e-4 to 1e-5: OneCycleLR without warm-up."""
     settings = Optimisation(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
     rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
     assert (
@@ -299,8 +301,8 @@ def test_learning_rate_is_one_cycle_without_warm_up():
         reference.step()
 
 
-def test_guidance_by_what_is_known_follows_a_line_that_pasting_loses():
-    """Data on the line z_1 = z_0, with its exact denoiser: what is made must meet what is known."""
+def test_pseudoinverse_guidance_follows_line_that_repaint_loses():
+    """Data on the line z_1 = z_0 with its exact denoiser: generated values must match the known ones."""
     walk, covariance = Walk(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
 
     def denoise(latent, timestep, label):

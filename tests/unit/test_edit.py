@@ -1,4 +1,4 @@
-"""Edits: exact on the parameters, the same on every replay, and over a whole table."""
+"""Edits are exact in the parameters and deterministic on replay."""
 
 import json
 from dataclasses import replace
@@ -41,7 +41,7 @@ def assert_canonical(scene: Scene) -> None:
 # ------------------------------------------------------------------------------------------------------ selection
 
 
-def test_a_selection_fits_all_that_it_names(scene):
+def test_selection_matches_all_its_conditions(scene):
     x, y = scene.center_m[:, :2].T
     square = (10.0, -20.0, 50.0, -20.0, 50.0, 15.0, 10.0, 15.0)
     inside = (x > 10) & (x < 50) & (y > -20) & (y < 15)
@@ -76,14 +76,14 @@ def test_a_selection_fits_all_that_it_names(scene):
         (Select(where="x_m > (select count(*) from read_csv('/etc/passwd'))"), "where .*disabled"),
     ],
 )
-def test_a_wrong_selection_is_refused(scene, select, message):
+def test_selection_rejects_wrong_values(scene, select, message):
     with pytest.raises(ValueError, match=message):
         select.check()
     with pytest.raises(ValueError, match=message):
         select.chosen(scene)
 
 
-def test_primitives_that_a_scene_does_not_have(scene):
+def test_selection_rejects_missing_primitives(scene):
     with pytest.raises(ValueError, match=r"edit 1 \(remove\): scene test-0005 has 60 primitives, from 0 on, not 60"):
         replayed(scene, [edit.Snap(ALL), edit.Remove(Select(primitives=(60,)))])
 
@@ -91,7 +91,7 @@ def test_primitives_that_a_scene_does_not_have(scene):
 # ---------------------------------------------------------------------------------------------------------- edits
 
 
-def test_remove_and_duplicate(scene):
+def test_edit_removes_and_duplicates_primitives(scene):
     cars = scene.category == CAR
     removed, (done,) = replayed(scene, [edit.Remove(Select(category=("vehicle_small",)))])
     assert done.primitive.tolist() == np.flatnonzero(cars).tolist() and cars.any() and set(done.change) == {"removed"}
@@ -106,7 +106,7 @@ def test_remove_and_duplicate(scene):
     assert (copies.instance_id == -1).all()
 
 
-def test_translate_along_the_scene_and_along_each_ones_own_way(scene):
+def test_translate_moves_along_scene_or_own_axes(scene):
     some = Select(primitives=(3, 4, 8))
     moved, (done,) = replayed(scene, [edit.Translate(some, (1.5, -2, 0.25))])
     assert done.primitive.tolist() == [3, 4, 8] and set(done.change) == {"changed"}
@@ -120,7 +120,7 @@ def test_translate_along_the_scene_and_along_each_ones_own_way(scene):
     heading = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1)
     known = ~np.isnan(scene.heading_rad)
     assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # along the length
-    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # ahead, where ahead is known
+    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # along the heading, where it is known
     assert np.abs(way_m - length)[~known].max() < 1e-4
 
 
@@ -140,7 +140,7 @@ def test_rotate_turns_every_corner(scene, about_m, by_deg):
     off = turned.heading_rad[known] - scene.heading_rad[known] - angle
     assert np.abs(np.sin(off / 2)).max() < 1e-5 and np.abs(turned.heading_rad[known]).max() <= np.pi
     assert np.isnan(turned.heading_rad[~known]).all()
-    if by_deg == 30:  # about an upright axis: of a tilted box too, at least one axis turns by less
+    if by_deg == 30:  # about the vertical axis; at least one axis of a tilted box turns by less
         assert (done.turned_rad <= np.deg2rad(30.01)).all() and (done.turned_rad > np.deg2rad(25)).all()
 
 
@@ -148,13 +148,13 @@ def corners(scene: Scene) -> np.ndarray:
     return (SIGNS * scene.size_m[:, None].astype(float)) @ np.swapaxes(scene.rotation, 1, 2) + scene.center_m[:, None]
 
 
-def test_resized_is_the_largest_change_of_an_extent(scene):
+def test_resized_is_largest_change_of_an_extent(scene):
     _, (done,) = replayed(scene, [edit.Scale(Select(primitives=(7, 9)), (1.2, 1.02, 0.9))])
     assert done.primitive.tolist() == [7, 9] and np.allclose(done.resized, 0.2, atol=1e-6) and not done.turned_rad.any()
 
 
 @pytest.mark.parametrize("hold", ["bottom", "centre"])
-def test_scale_along_own_axes(scene, hold):
+def test_scale_acts_along_own_axes(scene, hold):
     by = (0.5, 3.0, 1.25)
     scaled, (done,) = replayed(scene, [edit.Scale(ALL, by, hold)])
     assert len(done.primitive) == 60
@@ -166,7 +166,7 @@ def test_scale_along_own_axes(scene, hold):
     assert np.array_equal(np.sort(scaled.size_m, axis=1), as_given)
 
 
-def test_the_lowest_point_is_the_meshs(scene):
+def test_lowest_point_equals_that_of_mesh(scene):
     corners_m, _, primitive = scene_triangles(scene)
     for index in range(len(scene)):
         lowest_m = corners_m[primitive == index][..., 2].min()
@@ -176,7 +176,7 @@ def test_the_lowest_point_is_the_meshs(scene):
         assert lowest_m > scene.bottom_m[index] - 1e-4
 
 
-def test_relabel_changes_the_kind_too(scene):
+def test_relabel_changes_shape_kind(scene):
     made, _ = replayed(scene, [edit.Relabel(Select(where="length_m > 4"), "vegetation_ellipsoid")])
     long = scene.size_m[:, 0] > 4
     assert (made.category[long] == ELLIPSOID).all() and (made.label[long] == "vegetation_ellipsoid").all()
@@ -201,7 +201,7 @@ def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
         assert np.array_equal(snapped.center_m[~known], lifted.center_m[~known])
 
 
-def test_what_would_be_no_primitive_is_refused(scene):
+def test_edit_rejects_degenerate_primitive(scene):
     for wrong in (edit.Scale(ALL, (0, 1, 1)), edit.Scale(ALL, (1e6, 1, 1)), edit.Translate(ALL, (np.inf, 0, 0))):
         with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*thinner than 1 mm"):
             replayed(scene, [wrong])
@@ -211,7 +211,7 @@ def test_what_would_be_no_primitive_is_refused(scene):
 
 
 def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Scene:
-    """Two cars in a row on flat ground, their ends gap_m apart."""
+    """Two cars in a row on flat ground with a gap of gap_m."""
     scene = random_scene(0, 2, tilt_rad=0)
     front, back = sizes_m
     center_m = np.array([[30, 0, 1], [30 + (front[0] + back[0]) / 2 + gap_m, 0.1, 1]], np.float32)
@@ -226,7 +226,7 @@ def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Sce
     )
 
 
-def test_two_that_overlap_are_pushed_apart_by_the_shortest_way():
+def test_repair_separates_overlap_by_shortest_move():
     scene = two_boxes(-0.4)  # 0.4 of 7.6 m: an IoU3D of 0.0495 with the offset, or 0.0526 without
     scene = replace(scene, center_m=scene.center_m * np.array([1, 0, 1], np.float32))
     mended, (done,) = replayed(scene, [edit.Repair(ALL)])
@@ -249,12 +249,12 @@ def overlap(scene: Scene) -> float:
         ({"shrink": 0.0}, "shrink is 0.0"),
     ],
 )
-def test_a_repair_that_no_scene_can_take_is_refused(options, message):
+def test_repair_rejects_impossible_options(options, message):
     with pytest.raises(ValueError, match=message):
         edit.Repair(ALL, **options).check()
 
 
-def test_what_cannot_be_pushed_far_enough_shrinks_or_goes():
+def test_repair_shrinks_or_removes_unmovable_primitives():
     deep = two_boxes(-2, existence=np.array([0.9, 0.6], np.float32))
     mended, (done,) = replayed(deep, [edit.Repair(ALL)])
     assert len(mended) == 1 and mended.existence[0] == np.float32(0.9)
@@ -263,7 +263,7 @@ def test_what_cannot_be_pushed_far_enough_shrinks_or_goes():
     assert_same_primitives(kept, deep)
     far, _ = replayed(deep, [edit.Repair(ALL, push_m=1.5)])
     assert len(far) == 2 and overlap(far) < 0.05
-    other, _ = replayed(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # who is not chosen stays
+    other, _ = replayed(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # unselected primitives are kept
     assert_same_primitives(other.select(np.array([1])), deep.select(np.array([1])))
     assert overlap(other) < 0.05
     small = two_boxes(-0.8)
@@ -272,8 +272,8 @@ def test_what_cannot_be_pushed_far_enough_shrinks_or_goes():
     assert (done.moved_m <= 0.2001).all()
 
 
-def test_faults_of_a_spoilt_town_are_mended_and_the_rest_is_left(town_scenes):
-    """Every fifth thing lifted or sunk by 0.6 to 0.9 m, every fifth pushed along."""
+def test_repair_fixes_disturbed_town_and_keeps_the_rest(town_scenes):
+    """A fifth of the objects is lifted or sunk by 0.6 to 0.9 m, another fifth is shifted."""
     rng, overlapping = np.random.default_rng(1), []
     for scene in town_scenes:
         center_m = scene.center_m.copy()
@@ -287,7 +287,7 @@ def test_faults_of_a_spoilt_town_are_mended_and_the_rest_is_left(town_scenes):
         overlapping.append(before["overlapping"])
         wrong = np.any([bad for bad, _ in list(faults(spoilt, SLAB_OFFSET_M).values())[:3]], axis=0)
         partners = (iou3d_matrix(boxes_of(spoilt), boxes_of(spoilt)) > 0.05)[wrong].any(axis=0)
-        assert set(done.primitive) <= set(np.flatnonzero(wrong | partners))  # nothing that was right is touched
+        assert set(done.primitive) <= set(np.flatnonzero(wrong | partners))  # valid primitives are unchanged
         assert (done.change == "removed").mean() < 0.5
     assert np.mean(overlapping) > 0.02
 
@@ -306,7 +306,7 @@ LIST = [
 ]
 
 
-def test_a_list_replays_to_the_last_bit_after_a_round_trip(scene):
+def test_edit_list_replays_exactly_after_round_trip(scene):
     again = edits_from_json(json.loads(json.dumps(edits_to_json(LIST))))
     assert again == LIST and {e.name for e in LIST} == set(edit.EDITS)
     first, second = replayed(scene, LIST)[0], replayed(scene, again)[0]
@@ -329,6 +329,6 @@ def test_a_list_replays_to_the_last_bit_after_a_round_trip(scene):
         ([{"edit": "remove", "select": {"categories": ["human"]}}], r"edit 0 \(remove\): select.categories"),
     ],
 )
-def test_a_wrong_list_is_refused(content, message):
+def test_edit_list_rejects_wrong_values(content, message):
     with pytest.raises(ValueError, match=message):
         edits_from_json(content)

@@ -1,4 +1,4 @@
-"""What people look at shows what the tables hold."""
+"""The catalogue, contact sheets and the dataset page show the contents of the tables."""
 
 import re
 from collections import Counter
@@ -50,7 +50,7 @@ def generated(tmp_path_factory):
 # -------------------------------------------------------------------------------------------------- which scenes
 
 
-def test_scenes_are_found_by_id(town_dataset):
+def test_catalogue_finds_scene_by_id(town_dataset):
     catalogue = Catalogue.read(town_dataset)
     names = catalogue.column("scene_id")
     found = catalogue.find([names[7], names[0]])
@@ -60,7 +60,7 @@ def test_scenes_are_found_by_id(town_dataset):
     assert loaded[0].split == "train" and len(loaded[0]) == catalogue.column("num_primitives")[7]
 
 
-def test_an_unknown_id_is_refused_with_some_that_exist(town_dataset):
+def test_catalogue_suggests_ids_for_unknown_id(town_dataset):
     catalogue = Catalogue.read(town_dataset)
     with pytest.raises(ValueError, match=r"no scene 'town-9' among 12; there are: ") as error:
         catalogue.find(["town-9"])
@@ -72,7 +72,7 @@ def test_an_unknown_id_is_refused_with_some_that_exist(town_dataset):
 
 
 @pytest.mark.parametrize("sort, column", [("vegetation", "vegetation_volume_m3"), ("num_pole", "num_pole")])
-def test_scenes_are_chosen_in_order(town_dataset, sort, column):
+def test_catalogue_chooses_scenes_in_sorted_order(town_dataset, sort, column):
     catalogue = Catalogue.read(town_dataset)
     values = catalogue.column(column)
     ordered = np.sort(values)
@@ -82,7 +82,7 @@ def test_scenes_are_chosen_in_order(town_dataset, sort, column):
     assert np.array_equal(values[catalogue.choose(4, sort)], ordered[[1, 4, 7, 10]])
 
 
-def test_scenes_are_chosen_along_the_drives_or_at_random(town_dataset):
+def test_catalogue_chooses_scenes_evenly_or_randomly(town_dataset):
     catalogue = Catalogue.read(town_dataset)
     rows = list(zip(*(catalogue.column(n) for n in ("split", "sequence", "frame")), strict=True))
     assert [rows[k] for k in catalogue.choose(99, "drive")] == sorted(rows)
@@ -98,7 +98,7 @@ def test_scenes_are_chosen_along_the_drives_or_at_random(town_dataset):
 # ------------------------------------------------------------------------------------------------------ pictures
 
 
-def test_a_plate_holds_the_pictures_of_render(town_dataset):
+def test_plate_shows_rendered_pictures(town_dataset):
     (scene,) = islice((s for s in Shard(town_dataset, "town", "test", 0).scenes()), 1)
     plate, boxes = scene_plate(scene)
     assert set(boxes) == {"bev", "3d", "ground", "heights", "primitives"}
@@ -113,7 +113,7 @@ def test_a_plate_holds_the_pictures_of_render(town_dataset):
 
 
 @pytest.mark.parametrize("rows, cols, n", [(64, 32, 20), (32, 64, 0)])
-def test_a_plate_of_any_grid_and_of_nothing(rows, cols, n):
+def test_plate_accepts_any_grid_and_empty_scene(rows, cols, n):
     scene = random_scene(0, n, Grid(front_m=64, left_m=cols / 2, resolution_m=1, rows=rows, cols=cols))
     if n == 0:
         scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
@@ -123,7 +123,7 @@ def test_a_plate_of_any_grid_and_of_nothing(rows, cols, n):
     assert np.array_equal(boxes["bev"].of(plate), bev_picture(scene, max(boxes["bev"][2:]), supersample=2))
 
 
-def test_heights_are_drawn_on_their_scale():
+def test_plate_draws_heights_on_color_scale():
     scene = random_scene(0, 0, Grid(resolution_m=1, rows=64, cols=64))
     picture, (low, high) = heights_picture(scene, 64)
     surface, winner = scene.surface()
@@ -137,7 +137,7 @@ def test_heights_are_drawn_on_their_scale():
     assert (np.diff(picture[known].astype(int)[order][:, 1]) >= 0).all()  # the ramp's green only rises
 
 
-def test_footprints_are_the_shadows_of_the_meshes():
+def test_plate_footprints_equal_mesh_projections():
     scene = random_scene(3, 60, tilt_rad=1.2)
     outlines = footprints_m(scene)
     for triangles, tolerance in ((cuboid_triangles(scene), 1e-4), (ellipsoid_triangles(scene), 0.03)):
@@ -151,7 +151,7 @@ def test_footprints_are_the_shadows_of_the_meshes():
 
 
 @pytest.mark.parametrize("count, aspect", [(1, 1), (7, 1), (64, 1), (48, 4 / 3), (1000, 1)])
-def test_a_sheet_is_about_five_to_four(count, aspect):
+def test_sheet_has_aspect_ratio_of_five_to_four(count, aspect):
     columns = best_columns(count, aspect)
     assert 1 <= columns <= count
     if count >= 48:
@@ -166,7 +166,7 @@ def histogram_titles(svg):
 
 
 @pytest.mark.parametrize("counts", [[0, 0, 1], [3], list(range(100)), [0, 514, 514, 7]])
-def test_histograms_hold_every_scene_once(counts):
+def test_histograms_count_every_scene_once(counts):
     counts = np.array(counts)
     width, scenes = count_bins(counts)
     assert scenes.sum() == len(counts)
@@ -174,7 +174,7 @@ def test_histograms_hold_every_scene_once(counts):
     assert sum(histogram_titles(count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
 
 
-def test_the_page_is_whole_and_fetches_nothing(facts):
+def test_dataset_page_is_well_formed_and_self_contained(facts):
     html = dataset_html(facts)
     page = SvgPage(html)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
@@ -192,7 +192,7 @@ def test_the_page_is_whole_and_fetches_nothing(facts):
         assert text in page.text
 
 
-def test_the_page_says_what_the_tables_hold(facts, town_dataset):
+def test_dataset_page_states_table_contents(facts, town_dataset):
     html = dataset_html(facts)
     scenes = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes()]
     for k, name in enumerate(CATEGORIES):
@@ -212,7 +212,7 @@ def test_the_page_says_what_the_tables_hold(facts, town_dataset):
     assert total == sum(map(len, scenes)) == sum(map(len, facts.sizes_m.values()))
 
 
-def test_ground_shares_and_labels_add_up(facts, town_dataset):
+def test_dataset_page_ground_shares_and_labels_add_up(facts, town_dataset):
     html = dataset_html(facts)
     low = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes() if s.vegetation_density == "low"]
     share = np.mean([s.occupied[0].mean() for s in low])
@@ -223,7 +223,7 @@ def test_ground_shares_and_labels_add_up(facts, town_dataset):
     assert sum(int(n) for vegetation, _, n in cells if vegetation == "low") == len(low) == 3
 
 
-def test_the_map_has_a_dot_per_scene_in_its_place(facts):
+def test_dataset_map_has_one_dot_per_scene(facts):
     catalogue = facts.catalogue
     paths = re.findall(r'data-split="(\w+)" d="([^"]*)"', dataset_html(facts))
     dots = {split: np.array(re.findall(r"M([-\d.]+) ([-\d.]+)h0", d), float) for split, d in paths}
@@ -237,7 +237,7 @@ def test_the_map_has_a_dot_per_scene_in_its_place(facts):
 
 
 @pytest.mark.parametrize("sequences", [1, 9, MAX_NAMED + 1, 1000])
-def test_maps_of_many_sequences_fit_the_page(sequences):
+def test_dataset_maps_of_many_sequences_fit_page(sequences):
     rng = np.random.default_rng(sequences)
     tracks = {
         f"{k:05d}": {"train": rng.uniform(0, rng.uniform(1, 900, 2), (7, 2)) + 4000, "unused": np.full((1, 2), 4100.0)}
@@ -257,7 +257,7 @@ def test_maps_of_many_sequences_fit_the_page(sequences):
     assert (apart | apart.T | np.eye(sequences, dtype=bool)).all()
 
 
-def test_a_generated_directory_has_a_page_without_dataset_json(generated, tmp_path):
+def test_dataset_page_works_without_dataset_json(generated, tmp_path):
     path = write_page(Report(dataset=generated, pictures=0, output=str(tmp_path / "page.html")))
     page = SvgPage(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
@@ -270,7 +270,7 @@ def test_a_generated_directory_has_a_page_without_dataset_json(generated, tmp_pa
 # -------------------------------------------------------------------------------------------------------- the job
 
 
-def test_scenes_are_written_without_ray(generated, tmp_path, monkeypatch):
+def test_draw_scenes_runs_without_ray(generated, tmp_path, monkeypatch):
     monkeypatch.setattr("jobs.inspect_scenes.start_ray", None)
     written = draw_scenes(OneScene(dataset=generated, count=2, seed=1, glb=True, output=str(tmp_path)))
     assert sorted(path.rsplit(".", 1)[1] for path in written) == ["glb", "glb", "png", "png"]

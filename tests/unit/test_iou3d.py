@@ -1,4 +1,4 @@
-"""IoU3D against polytope volumes from manifold3d and, where that is the one in doubt, from half-space intersection."""
+"""IoU3D compared with polytope volumes from manifold3d and, where these are inexact, from half-space intersection."""
 
 import manifold3d
 import numpy as np
@@ -62,12 +62,12 @@ def disturbed(rng, a: Boxes, noise: float) -> Boxes:
 
 
 def shifted(a: Boxes, share: float, axis: int) -> Boxes:
-    """The same boxes moved along one of their own axes by a share of their extent there."""
+    """The same boxes moved along one of their own axes by a fraction of their extent."""
     return a._replace(center_m=a.center_m + share * a.rotation[:, :, axis] * a.size_m[:, axis, None])
 
 
 def relabelled(a: Boxes, order: list[int]) -> Boxes:
-    """The very same solids with their axes named in another order (turned by 90 degrees)."""
+    """The same solids with permuted axes (turned by 90 degrees)."""
     return boxes(a.center_m, a.rotation[:, :, order], a.size_m[:, order])
 
 
@@ -97,7 +97,7 @@ def pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
     }
 
 
-def test_no_pair_of_10000_is_off_by_more_than_1e_4():
+def test_iou3d_of_10000_pairs_is_within_1e_4_of_oracle():
     cases, total, off = pairs(np.random.default_rng(0)), 0, []
     for name, (a, b) in cases.items():
         ours, oracle = iou3d_pairs(a, b), manifold_iou(a, b)
@@ -110,14 +110,14 @@ def test_no_pair_of_10000_is_off_by_more_than_1e_4():
     assert not off, off
 
 
-def test_both_oracles_agree_with_ours_on_random_pairs():
+def test_iou3d_agrees_with_both_oracles_on_random_pairs():
     rng = np.random.default_rng(1)
     a, b = random_boxes(rng, 60, 0.5, 0.5, 4), random_boxes(rng, 60, 0.5, 0.5, 4)
     np.testing.assert_allclose(iou3d_pairs(a, b), [halfspace_iou(a, b, i) for i in range(60)], atol=1e-7)
     np.testing.assert_allclose(iou3d_pairs(a, b), manifold_iou(a, b), atol=1e-7)
 
 
-def test_hand_computed_cases():
+def test_iou3d_equals_hand_computed_cases():
     unit = boxes(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
     assert iou3d_pairs(unit, unit) == pytest.approx(1, abs=1e-12)
     assert iou3d_pairs(unit, shifted(unit, 0.5, 0)) == pytest.approx(1 / 3, abs=1e-8)
@@ -129,7 +129,7 @@ def test_hand_computed_cases():
     assert iou3d_pairs(unit, unit._replace(rotation=diagonal)) == pytest.approx(octagon / (2 - octagon), abs=1e-8)
 
 
-def test_symmetric_and_independent_of_place_turn_and_chunks(monkeypatch):
+def test_iou3d_is_symmetric_and_invariant_to_pose_and_chunks(monkeypatch):
     rng = np.random.default_rng(2)
     a, b = random_boxes(rng, 300), random_boxes(rng, 300)
     iou = iou3d_pairs(a, b)
@@ -141,7 +141,7 @@ def test_symmetric_and_independent_of_place_turn_and_chunks(monkeypatch):
     np.testing.assert_array_equal(iou, iou3d_pairs(a, b))
 
 
-def test_matrix_equals_pairs_and_takes_empty_sides():
+def test_iou3d_matrix_equals_pairs_and_accepts_empty_sides():
     rng = np.random.default_rng(3)
     a, b = random_boxes(rng, 40, 10), random_boxes(rng, 30, 10)
     i, j = np.indices((40, 30)).reshape(2, -1)
@@ -152,7 +152,7 @@ def test_matrix_equals_pairs_and_takes_empty_sides():
     assert iou3d_matrix(empty, b).shape == (0, 30) and iou3d_matrix(a, empty).shape == (40, 0)
 
 
-def test_boxes_without_volume_overlap_nothing():
+def test_iou3d_of_boxes_without_volume_is_zero():
     flat = boxes(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 1.0, 0.0]]))
     assert iou3d_pairs(flat, flat) == 0
 
@@ -161,15 +161,15 @@ def test_boxes_without_volume_overlap_nothing():
     ("part", "value", "message"),
     [(0, np.nan, "NaN"), (2, -1.0, "negative extents"), (1, 2 * np.eye(3), "orthonormal")],
 )
-def test_bad_boxes_are_refused(part, value, message):
+def test_iou3d_rejects_invalid_boxes(part, value, message):
     parts = [np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.ones((2, 3))]
     parts[part][1] = value
     with pytest.raises(ValueError, match=message):
         boxes(*parts)
 
 
-def test_sampled_ellipsoids_keep_their_stated_error():
-    """Oracles: spheres in closed form; and any pair after the linear map that turns one ellipsoid into a sphere."""
+def test_ellipsoid_iou3d_keeps_stated_error():
+    """Oracles: closed form for spheres, and pairs after the linear map that turns one ellipsoid into a sphere."""
     rng = np.random.default_rng(4)
     n = 200
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
@@ -179,7 +179,7 @@ def test_sampled_ellipsoids_keep_their_stated_error():
     )
     lens = sphere_lens(*radius, distance)
     exact = lens / (4 / 3 * np.pi * (radius**3).sum(axis=0) - lens)
-    stretch = np.array([4.0, 1.0, 0.5])  # keeps IoU; spheres become aligned ellipsoids
+    stretch = np.array([4.0, 1.0, 0.5])  # preserves IoU; spheres become aligned ellipsoids
     stretched = [boxes(x.center_m * stretch, np.tile(np.eye(3), (n, 1, 1)), x.size_m * stretch) for x in (a, b)]
     for pair in ((a, b), stretched):
         error = iou3d.ellipsoid_iou3d_pairs(*pair) - exact
@@ -197,7 +197,7 @@ def sphere_lens(r: np.ndarray, s: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.where(d >= r + s, 0, lens)
 
 
-def test_points_fill_the_ball_evenly():
+def test_ball_points_are_uniform():
     points = iou3d.ball_points(4096)
     radius = np.linalg.norm(points, axis=1)
     assert radius.max() <= 1

@@ -1,4 +1,4 @@
-"""The KITTI-360 reader: geometry against the files' own vertices, every trap and defect, and broken files."""
+"""The KITTI-360 reader: geometry equals the vertices of the files; defects and broken files are reported."""
 
 import re
 from pathlib import Path
@@ -114,7 +114,7 @@ def numbers(element: ElementTree.Element, cols: int) -> np.ndarray:
     return np.array(element.findtext("data").split(), float).reshape(-1, cols)
 
 
-def test_real_boxes_have_the_corners_the_file_says(real):
+def test_kitti360_real_boxes_have_corners_of_file(real):
     drive, _, xml = real
     row_of = {index: row for row, index in enumerate(drive.instance_id)}
     cuboids = ellipsoids = 0
@@ -140,7 +140,7 @@ def test_real_boxes_have_the_corners_the_file_says(real):
     assert (cuboids, ellipsoids) == (np.sum(drive.category != 1), np.sum(drive.category == 1))
 
 
-def test_real_duplicates_are_equal_text_or_the_same_size_nearly_there(real):
+def test_kitti360_real_duplicates_are_nearly_identical(real):
     drive, report, xml = real
     written = [tuple(e.findtext(t) for t in ("label", "transform/data", "vertices/data")) for e in xml]
     assert report.objects == len(written) == 977
@@ -158,7 +158,7 @@ def test_real_duplicates_are_equal_text_or_the_same_size_nearly_there(real):
     assert (len(drive.category), len(drive.ground.slab_class)) == (report.boxes, report.slabs)
 
 
-def test_real_cars_stand_a_slab_half_below_the_raster(real):
+def test_kitti360_real_cars_stand_half_a_slab_below_raster(real):
     drive, _, _ = real
     depth, road_below = [], []
     for k in range(0, len(drive), 25):
@@ -175,14 +175,14 @@ def test_real_cars_stand_a_slab_half_below_the_raster(real):
     assert abs(np.median(road_below) + 0.63) < 0.1
 
 
-def test_the_real_road_lies_ahead(real):
+def test_kitti360_real_road_lies_ahead(real):
     drive, _, _ = real
     ahead = np.mean([drive.scene(k).occupied[0][:, 118:138].mean() for k in range(50, 450, 50)])
     aside = np.mean([drive.scene(k).occupied[0][:, :20].mean() for k in range(50, 450, 50)])
     assert ahead > 2 * aside
 
 
-def test_real_parked_cars_point_along_the_road(real):
+def test_kitti360_real_parked_cars_point_along_road(real):
     drive, _, _ = real
     headed = np.flatnonzero(np.isfinite(drive.heading_rad))
     assert set(drive.label[headed]) == {"car", "truck"}
@@ -212,7 +212,7 @@ LABELS = {
 @pytest.mark.parametrize(
     ("label", "category"), [(label, category) for category, labels in LABELS.items() for label in labels]
 )
-def test_every_object_label_has_its_category(tmp_path, label, category):
+def test_kitti360_maps_every_object_label_to_category(tmp_path, label, category):
     drive, report = read(tmp_path, an_object(label))
     assert [CATEGORIES[c] for c in drive.category] == [category]
     assert drive.label.tolist() == [label]
@@ -226,7 +226,7 @@ def test_every_object_label_has_its_category(tmp_path, label, category):
     [("road", "road"), ("sidewalk", "sidewalk"), ("driveway", "parking"), ("parking", "parking"),
      ("ground", "terrain"), ("unknownGround", "ground")],
 )  # fmt: skip
-def test_ground_is_decided_by_label_even_when_it_looks_like_a_cuboid(tmp_path, label, ground_class):
+def test_kitti360_recognizes_ground_by_label_not_shape(tmp_path, label, ground_class):
     flat = an_object(label, affine(np.diag([20.0, 10.0, 0.6])), category="stuff", index=2)
     drive, report = read(tmp_path, a_slab(label), flat)
     assert (report.slabs, report.boxes) == (2, 0)
@@ -237,14 +237,14 @@ def test_ground_is_decided_by_label_even_when_it_looks_like_a_cuboid(tmp_path, l
 @pytest.mark.parametrize(
     "label", ["tunnel", "bridge", "train", "stop", "caravan", "vendingmachine", "railtrack", "sky"]
 )
-def test_labels_without_a_category_are_dropped_and_counted(tmp_path, label):
+def test_kitti360_counts_dropped_labels_without_category(tmp_path, label):
     drive, report = read(tmp_path, an_object(label), an_object("spaceship", index=2), an_object(index=3))
     assert (report.dropped, report.unknown, report.boxes) == ({label: 1}, {"spaceship": 1}, 1)
     assert len(drive.category) == 1
     assert "spaceship 1" in report.summary()
 
 
-def test_a_sphere_mesh_is_an_ellipsoid_of_twice_the_column_norm(tmp_path):
+def test_kitti360_sphere_mesh_becomes_ellipsoid(tmp_path):
     turn = Rotation.from_euler("zyx", [0.5, 0.2, -0.1]).as_matrix()
     drive, _ = read(tmp_path, an_object("vegetation", affine(turn @ np.diag([1.0, 2.0, 3.0])), sphere(), "0 1 2"))
     assert CATEGORIES[drive.category[0]] == "vegetation_ellipsoid"
@@ -252,7 +252,7 @@ def test_a_sphere_mesh_is_an_ellipsoid_of_twice_the_column_norm(tmp_path):
     assert np.allclose(drive.rotation[0], turn, atol=1e-6)
 
 
-def test_ground_slabs_keep_their_non_convex_outline_and_height(tmp_path):
+def test_kitti360_slab_keeps_non_convex_outline_and_height(tmp_path):
     drive, _ = read(tmp_path, a_slab(at=(110.0, 195.0, 116.0)))
     scene = drive.scene(0)  # ego at (100, 200, 117), looking east
     assert abs(scene.ground_area_m2()[0] - 64) < 1
@@ -260,7 +260,7 @@ def test_ground_slabs_keep_their_non_convex_outline_and_height(tmp_path):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_mirrored_box_is_the_same_box(tmp_path, axis):
+def test_kitti360_mirrored_box_equals_box(tmp_path, axis):
     turn = Rotation.from_euler("z", 0.7).as_matrix()
     mirror = np.ones(3)
     mirror[axis] = -1
@@ -272,7 +272,7 @@ def test_a_mirrored_box_is_the_same_box(tmp_path, axis):
     assert abs(np.cos(drive.heading_rad[0] - 0.7) - (1 if axis else -1)) < 1e-6
 
 
-def test_a_slightly_sheared_box_gets_the_nearest_rotation(tmp_path):
+def test_kitti360_sheared_box_gets_nearest_rotation(tmp_path):
     turn = Rotation.from_euler("zyx", [1.0, 0.2, 0.1]).as_matrix()
     shear = np.array([[1, 0.04, 0], [0, 1, 0.02], [0, 0, 1]])
     drive, report = read(tmp_path, an_object("building", affine(turn @ shear @ np.diag([8.0, 5.0, 3.0]))))
@@ -282,19 +282,19 @@ def test_a_slightly_sheared_box_gets_the_nearest_rotation(tmp_path):
     assert np.allclose(drive.size_m[0], [8, 5, 3], rtol=0.01)
 
 
-def test_a_tilted_box_keeps_its_tilt(tmp_path):
+def test_kitti360_tilted_box_keeps_tilt(tmp_path):
     turn = Rotation.from_euler("zyx", np.radians([30, 20, -15])).as_matrix()
     drive, _ = read(tmp_path, an_object("wall", affine(turn @ np.diag([3.0, 0.5, 1.5]))))
     assert np.allclose(drive.rotation[0], turn, atol=1e-6)
 
 
-def test_vertices_that_are_no_unit_cube_count_as_they_are(tmp_path):
+def test_kitti360_uses_vertices_of_non_unit_cube(tmp_path):
     drive, _ = read(tmp_path, an_object("box", affine(np.eye(3), (120, 200, 117)), (CUBE + 0.5) * [2, 4, 6]))
     assert np.allclose(drive.size_m[0], [2, 4, 6])
     assert np.allclose(drive.center_m[0], [121, 202, 120])
 
 
-def test_the_same_object_written_twice_appears_once(tmp_path):
+def test_kitti360_removes_duplicate_objects(tmp_path):
     shifted = affine(np.diag([4.4, 2.0, 1.5]), (130.0004, 204.9997, 117))
     drive, report = read(
         tmp_path,
@@ -303,7 +303,7 @@ def test_the_same_object_written_twice_appears_once(tmp_path):
         an_object(index=3, start_frame=90, end_frame=199),
         an_object(index=4, transform=shifted),
         a_slab(index=5),
-        an_object("truck", index=6),  # in the same place, but another thing
+        an_object("truck", index=6),  # in the same place, but another object
         an_object(index=7, transform=affine(np.diag([4.4, 2.0, 1.5]), (130.3, 205.1, 117))),  # another window's
         an_object(index=8, transform=affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # another car
         an_object(index=9, transform=affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # another size
@@ -314,7 +314,7 @@ def test_the_same_object_written_twice_appears_once(tmp_path):
     assert (report.duplicates, report.slabs) == (4, 1)
 
 
-def test_moving_objects_are_where_they_are_in_their_frame(tmp_path):
+def test_kitti360_places_moving_objects_by_frame(tmp_path):
     moving = [
         an_object(
             transform=affine(np.eye(3), (120 + k, 200, 117)),
@@ -333,15 +333,15 @@ def test_moving_objects_are_where_they_are_in_their_frame(tmp_path):
     assert np.allclose(drive.scene(2).center_m[0], [120 + 2 - 102, 0, 0])
 
 
-def test_the_order_of_elements_does_not_matter(tmp_path):
+def test_kitti360_is_independent_of_element_order(tmp_path):
     element = ElementTree.fromstring(an_object())
     element[:] = reversed(element[:])
     drive, _ = read(tmp_path, ElementTree.tostring(element, "unicode"))
     assert drive.size_m.tolist() == [[4.4, 2.0, 1.5]]
 
 
-def test_left_is_left_and_ahead_is_ahead(tmp_path):
-    """The car looks east: north of it is left. Coordinates of many km keep their millimetres."""
+def test_kitti360_scene_axes_point_ahead_and_left(tmp_path):
+    """The car faces east, so north is left. Coordinates of many km keep millimetre precision."""
     far_pose = IDENTITY_POSE.replace("100", "41100").replace("200", "98200")
     far_box = an_object(transform=affine(np.eye(3), (41110.001, 98203.002, 118)))
     drive, _ = read_drive(write(tmp_path, document(far_box), f"0 {far_pose}\n"), "0003")
@@ -349,7 +349,7 @@ def test_left_is_left_and_ahead_is_ahead(tmp_path):
     assert np.allclose(scene.center_m, [[10.001, 3.002, 1]], atol=1e-5)
 
 
-def test_a_drive_may_have_no_boxes_or_no_ground(tmp_path):
+def test_kitti360_reads_drive_without_boxes_or_ground(tmp_path):
     drive, _ = read(tmp_path, a_slab())
     assert len(drive.scene(0)) == 0
     drive, _ = read(tmp_path, an_object())
@@ -390,7 +390,7 @@ BROKEN_OBJECTS = {
 
 
 @pytest.mark.parametrize("name", BROKEN_OBJECTS)
-def test_a_defective_object_is_dropped_with_its_reason_and_the_rest_is_read(tmp_path, name):
+def test_kitti360_drops_defective_object_with_reason(tmp_path, name):
     breaks, reason = BROKEN_OBJECTS[name]
     broken = breaks(an_object(index=77, transform=affine(np.diag([4.4, 2.0, 1.5]), (130, 205, 117))))
     assert broken != an_object(index=77)
@@ -412,13 +412,13 @@ def test_a_defective_object_is_dropped_with_its_reason_and_the_rest_is_read(tmp_
         ("", "no faces"),
     ],
 )
-def test_a_defective_slab_is_dropped_with_its_reason(tmp_path, faces, reason):
+def test_kitti360_drops_defective_slab_with_reason(tmp_path, faces, reason):
     drive, report = read(tmp_path, a_slab(faces=faces, index=5), an_object(index=2))
     assert reason in report.defects[0].reason and report.defects[0].index == 5
     assert len(drive.ground.slab_class) == 0 and len(drive.category) == 1
 
 
-def test_a_sheared_flat_box_is_defective(tmp_path):
+def test_kitti360_sheared_flat_box_is_defective(tmp_path):
     transform = affine(np.array([[4, 2, 0], [0, 0.5, 0], [0, 0, 1.5]]))
     _, report = read(tmp_path, an_object(transform=transform))
     assert "sheared flat" in report.defects[0].reason
@@ -450,7 +450,7 @@ BROKEN_FILES = {
 
 
 @pytest.mark.parametrize("name", BROKEN_FILES)
-def test_a_broken_xml_is_one_clear_error(tmp_path, name):
+def test_kitti360_names_broken_xml(tmp_path, name):
     write(tmp_path, BROKEN_FILES[name])
     with pytest.raises(ValueError) as error:
         read_drive(tmp_path, "0003")
@@ -477,7 +477,7 @@ BROKEN_POSES = {
 
 
 @pytest.mark.parametrize("name", BROKEN_POSES)
-def test_broken_poses_are_one_clear_error(tmp_path, name):
+def test_kitti360_names_broken_poses(tmp_path, name):
     poses, reason = BROKEN_POSES[name]
     write(tmp_path, GOOD, poses)
     with pytest.raises(ValueError) as error:
@@ -486,7 +486,7 @@ def test_broken_poses_are_one_clear_error(tmp_path, name):
     assert reason in str(error.value) and "poses.txt" in str(error.value)
 
 
-def test_missing_files_are_named(tmp_path):
+def test_kitti360_names_missing_file(tmp_path):
     with pytest.raises(ValueError, match="data_3d_bboxes"):
         sequences(tmp_path)
     write(tmp_path, GOOD)
@@ -508,7 +508,7 @@ def test_missing_files_are_named(tmp_path):
         read_drive(tmp_path / "two", "0002")
 
 
-def test_poses_come_in_world_coordinates(tmp_path):
+def test_kitti360_poses_are_in_world_coordinates(tmp_path):
     write(tmp_path, GOOD)
     frame, world_from_imu = read_poses(tmp_path, "0003")
     assert frame.tolist() == [0, 1, 2, 5]
@@ -516,7 +516,7 @@ def test_poses_come_in_world_coordinates(tmp_path):
     assert world_from_imu[3, :, 3].tolist() == [105, 200, 117]
 
 
-def test_two_hundred_random_mutations_never_end_in_another_exception(tmp_path):
+def test_kitti360_raises_only_named_errors_for_mutated_files(tmp_path):
     rng = np.random.default_rng(0)
     good = document(an_object(index=1), a_slab(index=2), an_object("truck", index=3)).encode()
     refused = 0

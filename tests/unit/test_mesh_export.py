@@ -1,4 +1,4 @@
-"""A scene's GLB, read back by trimesh, has the scene's nodes, corners, volumes and colours."""
+"""The GLB of a scene, read by trimesh, has the nodes, corners, volumes and colours of the scene."""
 
 import io
 import json
@@ -44,7 +44,7 @@ def placed(loaded: trimesh.Scene, node: str) -> trimesh.Trimesh:
     return mesh
 
 
-def test_one_named_node_per_primitive_and_one_for_the_ground():
+def test_scene_glb_has_named_node_per_primitive_and_ground():
     scene = example_scene()
     loaded = load(scene_glb(scene))
     expected = {f"{CATEGORIES[c]}_{i:04d}" for i, c in enumerate(scene.category)} | {"ground"}
@@ -56,7 +56,7 @@ def test_one_named_node_per_primitive_and_one_for_the_ground():
     assert np.array_equal(np.float32(extras["size_m"]), scene.size_m[5])
 
 
-def test_gltf_is_y_up_with_forward_z_and_left_x():
+def test_scene_glb_is_y_up_with_forward_z_and_left_x():
     assert np.isclose(np.linalg.det(GLTF_FROM_SCENE), 1)
     forward, left, up = np.eye(3)
     assert np.array_equal(GLTF_FROM_SCENE[:3, :3] @ forward, [0, 0, 1])
@@ -64,7 +64,7 @@ def test_gltf_is_y_up_with_forward_z_and_left_x():
     assert np.array_equal(GLTF_FROM_SCENE[:3, :3] @ up, [0, 1, 0])
 
 
-def test_corners_and_volumes_survive_the_file():
+def test_scene_glb_keeps_corners_and_volumes():
     scene = example_scene()
     loaded = load(scene_glb(scene))
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
@@ -80,7 +80,7 @@ def test_corners_and_volumes_survive_the_file():
         assert distance.min(axis=1).max() < 1e-3
 
 
-def test_ground_is_the_fused_surface_at_pixel_centres():
+def test_ground_mesh_is_fused_surface_at_pixel_centers():
     scene = example_scene()
     vertices, triangles, class_id = ground_mesh(scene)
     height, winner = scene.surface()
@@ -103,7 +103,7 @@ def test_ground_is_the_fused_surface_at_pixel_centres():
     assert np.allclose(loaded.vertices, vertices, atol=1e-4) and np.array_equal(loaded.faces, triangles)
 
 
-def test_diagonal_and_winding_of_one_block():
+def test_ground_mesh_diagonal_and_winding_of_one_block():
     grid = Grid(front_m=2, left_m=1, resolution_m=1, rows=2, cols=2)
     scene = example_scene(0, grid)
     height, occupied = np.zeros((5, 2, 2), np.float32), np.zeros((5, 2, 2), bool)
@@ -124,7 +124,7 @@ def linear_light(color_hex: str) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def test_colours_are_the_palette_in_linear_light():
+def test_scene_glb_colors_are_palette_in_linear_light():
     glb = scene_glb(example_scene())
     header = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
     factors = {m["name"]: m["pbrMetallicRoughness"]["baseColorFactor"][:3] for m in header["materials"]}
@@ -136,10 +136,10 @@ def test_colours_are_the_palette_in_linear_light():
     expected = np.array([linear_light(COLOR_HEX[name]) for name in KITTI_GROUND_CLASSES])
     distance = np.abs(painted[::97, None] - expected[None]).max(axis=-1)
     assert distance.min(axis=1).max() <= 0.5 / 255 + 1e-6
-    assert (distance.min(axis=0) < 0.01).all()  # each class is there
+    assert (distance.min(axis=0) < 0.01).all()  # each class occurs
 
 
-def test_triangle_soup_is_closed_around_each_primitive():
+def test_scene_triangles_are_closed_per_primitive():
     scene = example_scene()
     corners, class_id, primitive = scene_triangles(scene)
     assert len(corners) == len(class_id) == len(primitive)
@@ -152,23 +152,23 @@ def test_triangle_soup_is_closed_around_each_primitive():
     assert CLASS_COLORS[class_id].shape == (len(corners), 3)
 
 
-def test_scene_from_unit_places_the_unit_box():
+def test_scene_from_unit_places_unit_box():
     scene = example_scene()
     corner = scene_from_unit(scene) @ np.array([0.5, 0.5, 0.5, 1])
     expected = scene.center_m + np.einsum("nij,nj->ni", scene.rotation, scene.size_m / 2)
     assert np.allclose(corner[:, :3], expected, atol=1e-4)
 
 
-def test_empty_scene():
+def test_scene_glb_accepts_empty_scene():
     scene = empty_scene()
     assert scene_triangles(scene).corners_m.shape == (0, 3, 3)
     loaded = load(scene_glb(scene))
     assert len(loaded.graph.nodes_geometry) == 0 and "scene" in loaded.graph.nodes
 
 
-def test_khronos_validator_finds_nothing_to_say(tmp_path):
-    """glTF's own validator: no errors, warnings, remarks or hints, and it finds every mesh."""
-    modules = Path(sys.prefix) / "npm" / "node_modules"  # where the Makefile puts it, if there is npm
+def test_scene_glb_passes_khronos_validator(tmp_path):
+    """The glTF validator reports no errors, warnings, infos or hints, and finds every mesh."""
+    modules = Path(sys.prefix) / "npm" / "node_modules"  # installed by the Makefile where npm exists
     if not (shutil.which("node") and modules.is_dir()):
         pytest.skip("no node, or no gltf-validator in .venv/npm")
     scenes = [example_scene(), example_scene(3), replace(example_scene(2), occupied=np.zeros((5, 256, 256), bool))]
@@ -182,7 +182,7 @@ def test_khronos_validator_finds_nothing_to_say(tmp_path):
         assert report["info"]["drawCallCount"] == len(np.unique(scene.category)) + scene.occupied.any()  # meshes
 
 
-def test_writing_leaves_only_the_file(tmp_path):
+def test_write_glb_leaves_only_its_file(tmp_path):
     scene = example_scene(5)
     write_glb(scene, tmp_path / "scene.glb")
     assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]

@@ -1,4 +1,4 @@
-"""What a GLB shows comes back as a Scene: our own export exactly, the authors' form (FORMATS.md, section 4) by shape."""
+"""GLB files are read as scenes: own exports exactly, files of the authors (FORMATS.md, section 4) by shape."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ def corners_m(scene: Scene) -> np.ndarray:
 
 
 def scatter_m2(scene: Scene) -> np.ndarray:
-    """(n, 3, 3) R diag(size)^2 R^T: the shape of an ellipsoid, whatever it is called."""
+    """(n, 3, 3) R diag(size)^2 R^T: the shape of an ellipsoid, independent of its axis order."""
     axes = scene.rotation.astype(float) * scene.size_m[:, None]
     return axes @ np.swapaxes(axes, 1, 2)
 
@@ -69,7 +69,7 @@ def assert_same_scene(got: Scene, want: Scene) -> None:
     assert_same_ground(got, want)
 
 
-def test_our_export_comes_back_exactly(town_scenes):
+def test_scene_from_glb_round_trips_own_export(town_scenes):
     labelled = replace(town_scenes[0], vegetation_density="high", vehicle_density="low")
     for scene in (*town_scenes, labelled, random_scene(1, tilt_rad=np.pi)):
         got = scene_from_glb(scene_glb(scene))
@@ -78,21 +78,21 @@ def test_our_export_comes_back_exactly(town_scenes):
     assert len(scene) == 40 and sum(len(s) for s in town_scenes) > 100 and labelled.occupied.any()
 
 
-def test_a_fused_scene_is_a_fixed_point(town_scenes):
+def test_scene_from_glb_keeps_fused_scene(town_scenes):
     once = scene_from_glb(scene_glb(town_scenes[0]))
     twice = scene_from_glb(scene_glb(once))
     assert np.array_equal(once.height_m, twice.height_m) and np.array_equal(once.occupied, twice.occupied)
     assert np.array_equal(once.size_m, twice.size_m)
 
 
-def test_any_grid_and_crossings_come_back():
+def test_scene_from_glb_round_trips_any_grid():
     grid = Grid(front_m=96.5, left_m=20.0, resolution_m=0.7, rows=30, cols=50)
     scene = replace(random_scene(2, grid=grid), ground_classes=("sidewalk", "crossing", "road", "ground", "terrain"))
     assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
 
 
 @pytest.mark.parametrize("stride", [2, 256])
-def test_pixels_without_neighbours_come_back(stride):
+def test_scene_from_glb_round_trips_isolated_pixels(stride):
     scene = random_scene(3, n=2)
     lonely = np.zeros_like(scene.occupied)
     lonely[2, ::stride, ::stride] = True
@@ -100,14 +100,14 @@ def test_pixels_without_neighbours_come_back(stride):
     assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
 
 
-def test_an_empty_scene_comes_back():
+def test_scene_from_glb_round_trips_empty_scene():
     scene = random_scene(0, n=0)
     scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
     got = scene_from_glb(scene_glb(scene))
     assert len(got) == 0 and not got.occupied.any() and got.grid == scene.grid
 
 
-def test_a_moved_and_turned_node_is_where_it_was_left():
+def test_scene_from_glb_applies_node_transform():
     scene = replace(random_scene(4, n=3, tilt_rad=0.0), heading_rad=np.float32([0.1, 0.2, 0.3]))
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
 
@@ -130,7 +130,7 @@ def test_a_moved_and_turned_node_is_where_it_was_left():
 
 
 def three_sphere() -> tuple[np.ndarray, np.ndarray]:
-    """63 vertices of radius 1, 9 columns x 7 rows, poles on y, and 80 triangles; two vertices are in none."""
+    """63 vertices of radius 1, 9 columns x 7 rows, poles on y, and 80 triangles; two vertices are unused."""
     u, v = np.meshgrid(np.arange(9) / 8 * 2 * np.pi, np.arange(7) / 6 * np.pi)
     vertices = np.stack([-np.cos(u) * np.sin(v), np.cos(v), np.sin(u) * np.sin(v)], axis=-1).reshape(-1, 3)
     faces = []
@@ -181,7 +181,7 @@ def authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
 def authors_glb(
     scene: Scene, merged: bool = False, linear: bool = False, unmerged: bool = False, faces: bool = False
 ) -> bytes:
-    """The scene as FORMATS.md, section 4 describes the published ones, exported by trimesh."""
+    """The scene in the format of the published files (FORMATS.md, section 4), exported by trimesh."""
     parts = [(authors_ground(scene, linear), np.eye(4))] if scene.occupied.any() else []
     for k, category in enumerate(scene.category):
         round_ = category == ELLIPSOID
@@ -205,7 +205,7 @@ def authors_glb(
 
 
 def assert_same_primitives(got: Scene, want: Scene) -> None:
-    """One to one in any order: boxes by their corners, ellipsoids by their shape."""
+    """Asserts a one-to-one match in any order: boxes by their corners, ellipsoids by their shape."""
     assert np.array_equal(got.counts(), want.counts())
     left = list(range(len(got)))
     for k, corners in enumerate(corners_m(want)):
@@ -230,7 +230,7 @@ def assert_same_primitives(got: Scene, want: Scene) -> None:
 
 @pytest.mark.parametrize("merged", [False, True], ids=["instances", "merged"])
 @pytest.mark.parametrize("linear", [False, True], ids=["sRGB", "linear"])
-def test_the_authors_form_comes_back(town_scenes, merged, linear):
+def test_scene_from_glb_reads_format_of_authors(town_scenes, merged, linear):
     scene = town_scenes[1]
     got = scene_from_glb(authors_glb(scene, merged, linear))
     assert_same_primitives(got, scene)
@@ -239,7 +239,7 @@ def test_the_authors_form_comes_back(town_scenes, merged, linear):
 
 
 @pytest.mark.parametrize("merged", [False, True])
-def test_boxes_with_pitch_and_roll_come_back(merged):
+def test_scene_from_glb_keeps_pitch_and_roll(merged):
     rng = np.random.default_rng(5)
     rotation, size_m = canonical_boxes(random_rotations(rng, 60), rng.choice([0.05, 0.5, 3, 14], (60, 3)))
     roll = trimesh.transformations.rotation_matrix(0.4, [1, 0, 0])[:3, :3]
@@ -248,17 +248,17 @@ def test_boxes_with_pitch_and_roll_come_back(merged):
     assert_same_primitives(scene_from_glb(authors_glb(scene, merged)), scene)
 
 
-def test_flat_shaded_files_repeat_vertices(town_scenes):
+def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
     scene = town_scenes[1].select(np.arange(20))
     assert {ELLIPSOID, *scene.category} > {ELLIPSOID}
     for merged in (False, True):
         got = scene_from_glb(authors_glb(scene, merged, unmerged=True))
         assert_same_primitives(got, scene)
-        isolated = got.occupied.any(axis=0) != scene.occupied.any(axis=0)  # in no triangle: not in such a file
+        isolated = got.occupied.any(axis=0) != scene.occupied.any(axis=0)  # in no triangle, so absent from this file
         assert isolated.sum() < 50
 
 
-def test_colours_of_faces_mix_on_borders_only(town_scenes):
+def test_scene_from_glb_mixes_face_colors_only_on_borders(town_scenes):
     scene = town_scenes[1]
     got = scene_from_glb(authors_glb(scene, merged=True, faces=True))
     assert_same_primitives(got, scene)
@@ -268,8 +268,8 @@ def test_colours_of_faces_mix_on_borders_only(town_scenes):
     assert (surface_classes(got) == surface_classes(scene))[both].mean() > 0.97
 
 
-def test_a_mesh_without_our_extras_is_read_by_its_shape(town_scenes):
-    """Our export after an editor that drops extras: y up, vertices at pixel centres, linear light."""
+def test_scene_from_glb_reads_mesh_without_extras_by_shape(town_scenes):
+    """Own export without extras, as some editors write it: y up, vertices at pixel centres, linear light."""
     scene = town_scenes[1]
 
     def strip(tree):
@@ -281,7 +281,7 @@ def test_a_mesh_without_our_extras_is_read_by_its_shape(town_scenes):
     assert_same_ground(got, scene)
 
 
-def test_ids_come_from_the_file(tmp_path, town_scenes):
+def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
     (tmp_path / "scene-7.glb").write_bytes(authors_glb(town_scenes[0].select([0])))
     assert scene_from_glb(tmp_path / "scene-7.glb").scene_id == "scene-7"
     assert scene_from_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
@@ -342,7 +342,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_mesh_that_fits_neither_form_is_named_with_what_was_found(tmp_path, fault):
+def test_scene_from_glb_names_unknown_mesh_and_its_content(tmp_path, fault):
     make, words = FAULTS[fault]
     path = tmp_path / "theirs.glb"
     path.write_bytes(make())
@@ -350,7 +350,7 @@ def test_a_mesh_that_fits_neither_form_is_named_with_what_was_found(tmp_path, fa
         scene_from_glb(path)
 
 
-def test_a_wrong_frame_is_refused_and_axes_are_checked(town_scenes):
+def test_scene_from_glb_rejects_wrong_frame_and_axes(town_scenes):
     glb = authors_glb(town_scenes[0])
     with pytest.raises(ValueError, match=r"ground vertices, x .* are not one per pixel .*check the axes"):
         scene_from_glb(glb, axes=("y+", "x+", "z+"))
@@ -358,19 +358,19 @@ def test_a_wrong_frame_is_refused_and_axes_are_checked(town_scenes):
         scene_from_glb(glb, axes=("x+", "x+", "z+"))
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_scene_from_glb_names_missing_file(tmp_path):
     with pytest.raises(ValueError, match=r"absent\.glb: cannot be read"):
         scene_from_glb(tmp_path / "absent.glb")
 
 
 def leaves(tree: dict | list) -> list[tuple]:
-    """(container, key) of everything in a JSON tree."""
+    """(container, key) of every value in a JSON tree."""
     items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
     return [(tree, k) for k, _ in items] + [leaf for _, v in items if isinstance(v, dict | list) for leaf in leaves(v)]
 
 
 @pytest.mark.parametrize("make", [scene_glb, authors_glb], ids=["ours", "theirs"])
-def test_any_value_in_the_json_gives_a_scene_or_a_value_error(make):
+def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
     grid = Grid(front_m=64.0, left_m=32.0, resolution_m=0.25, rows=8, cols=8)
     glb, rng = make(random_scene(7, n=4, grid=grid)), np.random.default_rng(0)
     values = [None, -1, 0, 10**6, 10**12, 10**400, 1e300, float("nan"), 0.5, True, "x", [], {}, [[1]], {"a": 1}]
@@ -390,5 +390,5 @@ def test_any_value_in_the_json_gives_a_scene_or_a_value_error(make):
     assert min(outcomes.values()) > 25
 
 
-def test_ground_classes_of_the_authors_are_always_five(town_scenes):
+def test_scene_from_glb_of_authors_has_five_ground_classes(town_scenes):
     assert scene_from_glb(authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]

@@ -1,4 +1,4 @@
-"""ADM's .npz batches: what numpy writes is read in pieces, what is written numpy reads, and damage is named."""
+"""ADM's .npz batches are exchanged with numpy in bounded memory; errors name damaged files."""
 
 import tracemalloc
 import zipfile
@@ -16,7 +16,7 @@ def pictures(n=7, height=5, width=6) -> np.ndarray:
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 @pytest.mark.parametrize("batch", [1, 3, 7, 100])
-def test_pictures_come_in_order_and_whole(tmp_path, save, batch):
+def test_npz_images_are_read_whole_in_order(tmp_path, save, batch):
     path = str(tmp_path / "samples.npz")
     save(path, pictures(), np.arange(7))  # as ADM: pictures, then labels as arr_1
     assert picture_shape(path) == (7, 5, 6, 3)
@@ -26,13 +26,13 @@ def test_pictures_come_in_order_and_whole(tmp_path, save, batch):
     np.testing.assert_array_equal(np.concatenate(parts), pictures())
 
 
-def test_no_pictures_are_no_batches(tmp_path):
+def test_npz_without_images_has_no_batches(tmp_path):
     np.savez(tmp_path / "none.npz", pictures(0))
     assert list(pictures_in_npz(str(tmp_path / "none.npz"), 4)) == []
 
 
 @pytest.mark.parametrize("grouping", [[7], [3, 4], [1] * 7])
-def test_what_is_written_numpy_reads(tmp_path, grouping):
+def test_npz_writer_is_readable_by_numpy(tmp_path, grouping):
     path = str(tmp_path / "new" / "samples.npz")
     write_npz(path, iter(np.split(pictures(), np.cumsum(grouping)[:-1])), 7)
     with np.load(path, allow_pickle=False) as written:
@@ -41,8 +41,8 @@ def test_what_is_written_numpy_reads(tmp_path, grouping):
     np.testing.assert_array_equal(np.concatenate(list(pictures_in_npz(path, 2))), pictures())
 
 
-def test_memory_is_that_of_a_batch(tmp_path):
-    """64 MB of pictures through less than 8 MB, both ways."""
+def test_npz_memory_is_bounded_by_batch(tmp_path):
+    """Reads and writes 64 MB of images with less than 8 MB of memory."""
     path = str(tmp_path / "many.npz")
     tracemalloc.start()
     try:
@@ -59,11 +59,11 @@ def test_memory_is_that_of_a_batch(tmp_path):
 
 def refused(path, match):
     with pytest.raises(ValueError, match=match) as raised:
-        pictures_in_npz(str(path), 4)  # at once, before the first picture
+        pictures_in_npz(str(path), 4)  # immediately, before the first image
     assert str(path) in str(raised.value)
 
 
-def test_files_that_hold_no_pictures_are_refused(tmp_path):
+def test_npz_reader_rejects_files_without_images(tmp_path):
     path = tmp_path / "x.npz"
     refused(path, "no such file")
     path.write_bytes(b"not an archive")
@@ -81,7 +81,7 @@ def test_files_that_hold_no_pictures_are_refused(tmp_path):
         pictures_in_npz(str(path), 0)
 
 
-def test_a_pickled_array_is_refused_unread(tmp_path):
+def test_npz_reader_rejects_pickle_without_reading(tmp_path):
     class Trap:
         def __reduce__(self):
             return open, (str(tmp_path / "sprung"), "w")
@@ -95,7 +95,7 @@ def test_a_pickled_array_is_refused_unread(tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_truncated_and_damaged_files_are_named(tmp_path):
+def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
     path = tmp_path / "x.npz"
     np.savez(path, pictures())
     whole = path.read_bytes()
@@ -114,7 +114,7 @@ def test_truncated_and_damaged_files_are_named(tmp_path):
     refused(path, r"arr_0 of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
 
 
-def test_writing_refuses_what_does_not_fit_and_leaves_nothing(tmp_path):
+def test_npz_writer_rejects_bad_images_and_leaves_nothing(tmp_path):
     path = str(tmp_path / "x.npz")
     for batches, count, match in (
         ([pictures()], 8, "got 7 pictures, 8 were announced"),
@@ -132,7 +132,7 @@ def test_writing_refuses_what_does_not_fit_and_leaves_nothing(tmp_path):
 # ----------------------------------------------------------------------------------------------- reference batches
 
 
-def test_reference_moments_are_those_of_the_features(tmp_path):
+def test_npz_reference_moments_equal_those_of_features(tmp_path):
     rng = np.random.default_rng(1)
     pool3, spatial = rng.normal(size=(30, 2048)).astype(np.float32), rng.normal(size=(30, 2023)).astype(np.float32)
     path = str(tmp_path / "reference.npz")
@@ -145,20 +145,20 @@ def test_reference_moments_are_those_of_the_features(tmp_path):
     np.testing.assert_allclose(found.pool3.covariance, moments(pool3).covariance, atol=1e-12)
     np.testing.assert_array_equal(np.concatenate(list(pictures_in_npz(path, 4))), pictures())
 
-    np.savez(path, **arrays)  # as TTUR and pytorch-fid keep them
+    np.savez(path, **arrays)  # as TTUR and pytorch-fid store them
     assert reference_moments(path).spatial is None
     np.savez(path, pictures())
     assert reference_moments(path) is None
 
 
-def test_a_distance_takes_reference_moments():
+def test_npz_reference_moments_give_frechet_distance():
     deviation = np.array([0.0, 1.0, 2.0])
     reference = Gaussian(np.zeros(3), np.diag(deviation**2))
     assert frechet_distance(moments(np.ones((3, 3))), reference) == pytest.approx(3 + 5)
     assert frechet_distance(reference, moments(np.ones((3, 3)))) == pytest.approx(3 + 5)
 
 
-def test_moments_that_are_incomplete_or_of_another_network_are_refused(tmp_path):
+def test_npz_reader_rejects_incomplete_or_foreign_moments(tmp_path):
     path = str(tmp_path / "x.npz")
     mu, sigma = np.zeros(2048), np.eye(2048, dtype=np.float32)
     broken = mu.copy()

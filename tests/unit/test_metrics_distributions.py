@@ -1,4 +1,4 @@
-"""Histograms of layouts by hand; distances against scipy; floors and failures."""
+"""Layout histograms equal hand-computed values; distances equal scipy; errors and noise floors."""
 
 import numpy as np
 import pytest
@@ -54,8 +54,8 @@ def bin_of(name: str, value: float) -> int:
     return int(np.searchsorted(one.edges, value, side="right") - 1)
 
 
-def test_histograms_by_hand():
-    scene = street(24, [(10, 0), (10, 5), (13, 9)])  # a road of 6 m: one car on it, two beside it
+def test_histograms_equal_hand_computed():
+    scene = street(24, [(10, 0), (10, 5), (13, 9)])  # a road of 6 m: one car on it, two next to it
     below = histogram(scene, "vehicle_small.ground_below")
     names = next(one for one in HISTOGRAMS if one.name == "vehicle_small.ground_below").bins
     assert dict(zip(names, below.tolist(), strict=True)) | {"road": 1, "terrain": 2} == dict(
@@ -74,13 +74,13 @@ def test_histograms_by_hand():
 
 @pytest.mark.parametrize("tilted", [False, True])
 @pytest.mark.parametrize("width_px", [24, 41])
-def test_the_width_of_a_straight_road(width_px, tilted):
+def test_road_width_of_straight_road(width_px, tilted):
     width_m, _ = road_widths(street(width_px, tilted=tilted))
     assert len(width_m) >= 200
     assert np.median(width_m) == pytest.approx(width_px * 0.25, abs=0.5)
 
 
-def test_scenes_without_road_all_road_or_nothing():
+def test_road_widths_of_scenes_without_or_with_only_road():
     empty = street(0)
     assert road_widths(empty)[1] is None and len(road_widths(empty)[0]) == 0
     everywhere = street(600)
@@ -88,7 +88,7 @@ def test_scenes_without_road_all_road_or_nothing():
     assert scene_histograms(empty).sum() == 0
 
 
-def test_an_object_beyond_the_grid_lies_over_no_ground():
+def test_histograms_object_beyond_grid_has_no_ground():
     scene = street(24, [(70, 0)])
     below = histogram(scene, "vehicle_small.ground_below")
     assert below[-1] == 1 and below.sum() == 1
@@ -102,7 +102,7 @@ def test_pair_distances_equal_loops():
     assert len(pair_distances(points[:1])) == 0
 
 
-def test_distances_of_distributions_equal_scipys():
+def test_distribution_distances_equal_scipy():
     rng = np.random.default_rng(1)
     edges = np.sort(rng.uniform(0, 10, 13))
     middle = (edges[1:] + edges[:-1]) / 2
@@ -115,7 +115,7 @@ def test_distances_of_distributions_equal_scipys():
     assert np.isnan(normalised(np.zeros((1, 3)))).all()
 
 
-def test_a_shift_of_sizes_is_measured_in_metres():
+def test_size_distance_of_shift_is_in_meters():
     rng = np.random.default_rng(2)
     scenes = [random_scene(seed, n=60) for seed in range(24)]
     real = np.stack([scene_histograms(scene) for scene in scenes])
@@ -131,10 +131,10 @@ def test_a_shift_of_sizes_is_measured_in_metres():
     got = histogram_distances(near, longer)
     assert got["vehicle_small.length_m"].value == pytest.approx(middle[at + 3] - middle[at])
     assert all(found.value == 0 for name, found in got.items() if name != "vehicle_small.length_m")
-    assert "pole.length_m" not in got  # on neither side
+    assert "pole.length_m" not in got  # in neither source
 
 
-def test_count_distances_name_the_category_that_differs():
+def test_count_distance_names_differing_category():
     counts = np.random.default_rng(4).integers(0, 6, (200, len(CATEGORIES)))
     other = counts[::-1].copy()
     other[:, CAR] += 10

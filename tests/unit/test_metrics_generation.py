@@ -1,4 +1,4 @@
-"""Scores of features against literal float64 versions of their definitions, and intervals against repetition."""
+"""Scores equal literal float64 versions of their definitions; intervals have the stated coverage."""
 
 import warnings
 
@@ -19,7 +19,7 @@ from pipelines.metrics.neighbours import ball_radii, nearest, neighbourhoods, pr
 
 
 def literal_fid(x: np.ndarray, y: np.ndarray) -> float:
-    """As written by Heusel et al.: a general matrix square root."""
+    """Heusel et al. 2017, with a general matrix square root."""
     a, b = np.cov(x, rowvar=False), np.cov(y, rowvar=False)
     root = scipy.linalg.sqrtm(a @ b)
     return float(np.square(x.mean(0) - y.mean(0)).sum() + np.trace(a + b - 2 * np.real(root)))
@@ -30,14 +30,14 @@ def sets(rng, n=400, m=300, d=32):
     return rng.normal(size=(n, d)) @ mix_x, rng.normal(size=(m, d)) @ mix_y + 0.3
 
 
-def test_frechet_distance_equals_the_literal_version():
+def test_frechet_distance_equals_literal_version():
     for seed in range(5):
         x, y = sets(np.random.default_rng(seed))
         assert frechet_distance(moments(x), moments(y)) == pytest.approx(literal_fid(x, y), rel=1e-6)
         assert frechet_distance(moments(x), moments(y)) == pytest.approx(frechet_distance(moments(y), moments(x)))
 
 
-def test_frechet_distance_in_closed_form():
+def test_frechet_distance_equals_closed_form():
     """Diagonal covariances: the sum of (mean difference)^2 + (deviation difference)^2."""
     rng = np.random.default_rng(0)
     mean, other_mean = rng.normal(size=(2, 6))
@@ -49,7 +49,7 @@ def test_frechet_distance_in_closed_form():
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-12)
 
 
-def test_same_constant_and_few_samples_give_the_right_distance():
+def test_frechet_distance_handles_constant_and_few_samples():
     rng = np.random.default_rng(1)
     x, _ = sets(rng)
     assert frechet_distance(moments(x), moments(x)) == pytest.approx(0, abs=1e-6)
@@ -75,7 +75,7 @@ def test_moments_add_up_exactly_in_any_grouping():
 # ------------------------------------------------------------------------------------------ Inception score
 
 
-def test_inception_score_equals_the_literal_version(monkeypatch):
+def test_inception_score_equals_literal_version(monkeypatch):
     monkeypatch.setattr(inception_score_module, "SPLIT_SAMPLES", 500)
     logits = np.random.default_rng(3).normal(0, 2, (1300, 20))
     scores = []
@@ -85,7 +85,7 @@ def test_inception_score_equals_the_literal_version(monkeypatch):
     assert inception_score(logits).value == pytest.approx(np.mean(scores), rel=1e-9)
 
 
-def test_inception_score_of_certain_and_of_equal_predictions():
+def test_inception_score_of_certain_and_equal_predictions():
     assert inception_score(np.eye(7).repeat(3, axis=0) * 1e4).value == pytest.approx(7)
     assert inception_score(np.ones((9, 7))).value == pytest.approx(1)
     assert inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])).value == pytest.approx(1)  # a class that never occurs
@@ -119,18 +119,18 @@ def scores(real, generated, k) -> list[tuple]:
 
 
 def clustered(rng, n: int, d: int, shift: float) -> np.ndarray:
-    """Some strong directions and many weak ones, as features have: the filter decides most, not all."""
+    """A few strong and many weak directions, as in real features: the filter decides most pairs, not all."""
     strength = 0.85 ** np.arange(d)
     return (shift + rng.normal(size=(n, d)) + rng.integers(0, 3, (n, 1))) * strength
 
 
 @pytest.mark.parametrize("seed", range(9))
-def test_neighbourhoods_equal_brute_force_exactly(seed, monkeypatch):
+def test_neighborhood_scores_equal_brute_force(seed, monkeypatch):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", 32)
     rng = np.random.default_rng(seed)
     if seed % 3 == 1:
         real, generated = rng.normal(size=(90, 6)), rng.normal(0.5, 0.8, size=(70, 6))
-    elif seed % 3 == 2:  # no axes that hold most: the filter takes whole features
+    elif seed % 3 == 2:  # without dominant axes the filter uses all features
         monkeypatch.setattr(neighbours, "BASIS_SAMPLES", 20)
         real, generated = rng.normal(size=(90, 50)), rng.normal(0.05, 0.98, size=(70, 50))
         assert not prepare(real, generated, (3,))[0].rest.any()
@@ -142,7 +142,7 @@ def test_neighbourhoods_equal_brute_force_exactly(seed, monkeypatch):
         assert 0 < got[0] <= 1 and 0 < got[1] <= 1
 
 
-def test_distances_that_are_equal_count_as_within():
+def test_neighborhood_scores_count_ties_as_within():
     """Integer points far from the origin: many ties, exact in differences, blurred in a matrix product."""
     rng = np.random.default_rng(5)
     real, generated = rng.integers(0, 4, (2, 60, 3)).astype(float) + 1e6
@@ -150,7 +150,7 @@ def test_distances_that_are_equal_count_as_within():
         assert got == brute_force(real, generated, k)
 
 
-def test_a_memorised_sample_lies_on_the_border_of_a_ball():
+def test_neighborhood_scores_include_border_of_ball():
     """generated[0] is real[1], the nearest neighbour of the far-away real[0]: its distance is that radius."""
     rng = np.random.default_rng(6)
     base = rng.normal(size=(40, 512))
@@ -161,7 +161,7 @@ def test_a_memorised_sample_lies_on_the_border_of_a_ball():
     assert got == brute_force(base, generated, 1)
 
 
-def test_duplicated_samples_have_radius_zero_and_still_contain_their_copies():
+def test_neighborhood_of_duplicates_contains_copies():
     rng = np.random.default_rng(7)
     real = np.repeat(rng.normal(size=(5, 16)) * 1e3, 4, axis=0)  # every sample four times: radius 0 at k = 3
     side = short_vectors(real, principal_axes(real, real))
@@ -170,13 +170,13 @@ def test_duplicated_samples_have_radius_zero_and_still_contain_their_copies():
     assert scores(real, real + 1e-3, [3])[0] == (0, 0, 0, 0)
 
 
-def test_constant_features_lie_within_each_other_only_if_equal():
+def test_neighborhood_of_constant_features_requires_equality():
     constant = np.full((6, 3), 0.1)
     assert scores(constant, constant, [3])[0] == (1, 1, 2, 1)
     assert scores(constant, constant + 1e-9, [3])[0] == (0, 0, 0, 0)
 
 
-def test_nearest_names_the_neighbours_in_order(monkeypatch):
+def test_nearest_returns_neighbors_in_order(monkeypatch):
     rng = np.random.default_rng(9)
     a, b = clustered(rng, 50, 40, 0), clustered(rng, 80, 40, 0)
     b[30] = b[60]  # equal distances: the lower index first
@@ -191,7 +191,7 @@ def test_nearest_names_the_neighbours_in_order(monkeypatch):
 
 
 def literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
-    """Binkowski et al., by loops."""
+    """Binkowski et al. 2018, with loops."""
 
     def k(a, b):
         return (a @ b / len(a) + 1) ** 3
@@ -202,7 +202,7 @@ def literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
     return own + other - 2 * np.mean([[k(a, b) for b in y] for a in x])
 
 
-def test_kernel_distance_equals_the_literal_version(monkeypatch):
+def test_kernel_distance_equals_literal_version(monkeypatch):
     rng = np.random.default_rng(10)
     x, y = rng.normal(size=(40, 8)), rng.normal(0.4, 1.2, size=(50, 8))
     got = kernel_distance(x, y)
@@ -213,7 +213,7 @@ def test_kernel_distance_equals_the_literal_version(monkeypatch):
     assert kernel_distance(x, y).value == pytest.approx(np.mean(halves), rel=1e-9)
 
 
-def test_kernel_distance_of_equal_sources_is_zero_within_its_interval():
+def test_kernel_distance_of_equal_sources_contains_zero():
     rng = np.random.default_rng(11)
     got = kernel_distance(*rng.normal(size=(2, 300, 16)))
     assert got.low < 0 < got.high
@@ -222,8 +222,8 @@ def test_kernel_distance_of_equal_sources_is_zero_within_its_interval():
 # ------------------------------------------------------------------------------------------ intervals
 
 
-def test_intervals_hold_the_truth_about_as_often_as_they_say():
-    """200 experiments of 150 scenes each: a mean and a share of objects."""
+def test_intervals_have_stated_coverage():
+    """200 experiments with 150 scenes each, for a mean and for a fraction of objects."""
     rng = np.random.default_rng(12)
     held = np.zeros(2)
     for _ in range(200):
@@ -240,7 +240,7 @@ def both_influences(real: np.ndarray, generated: np.ndarray) -> list[np.ndarray]
     return [frechet_influence(real, a, b.mean, maps[0]), frechet_influence(generated, b, a.mean, maps[1])]
 
 
-def test_the_interval_of_a_frechet_distance_is_as_wide_as_the_distance_varies():
+def test_frechet_interval_matches_spread_of_distance():
     rng = np.random.default_rng(13)
     scale = 0.8 ** np.arange(24)
 
@@ -260,8 +260,8 @@ def test_the_interval_of_a_frechet_distance_is_as_wide_as_the_distance_varies():
     assert np.mean(widths) == pytest.approx(2 * 1.96 * np.std(repeated), rel=0.25)
 
 
-def test_influences_are_the_derivatives_of_the_distance():
-    """Against moments that move a little towards one sample."""
+def test_influences_are_derivatives_of_frechet_distance():
+    """Compares with finite differences of moments moved towards one sample."""
     rng = np.random.default_rng(14)
     real, generated = rng.normal(size=(600, 5)), rng.normal(0.5, 1.5, size=(700, 5))
     a, b = moments(real), moments(generated)
@@ -280,7 +280,7 @@ def test_influences_are_the_derivatives_of_the_distance():
         assert slope == pytest.approx(influences[1][i], rel=1e-3, abs=0.02)
 
 
-def test_bad_features_are_refused():
+def test_scores_reject_invalid_features():
     x = np.random.default_rng(8).normal(size=(10, 4))
     broken = x.copy()
     broken[3, 1] = np.nan

@@ -1,4 +1,4 @@
-"""The Inception network against published parameter names, a literal resize, torch's layers and torch-fidelity."""
+"""The Inception network, compared with published parameter names, plain torch layers and torch-fidelity."""
 
 import hashlib
 import warnings
@@ -25,7 +25,7 @@ from pipelines.metrics.inception import (
 
 @pytest.fixture(scope="module")
 def network() -> Inception:
-    """Random weights that keep activations alive through all layers, batch norm with statistics of its own."""
+    """Random weights with non-vanishing activations in all layers and random batch norm statistics."""
     torch.manual_seed(0)
     network = Inception()
     for module in network.modules():
@@ -103,15 +103,15 @@ def published_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def test_parameter_names_and_shapes_are_the_published_ones(network):
+def test_inception_parameters_match_published_names_and_shapes(network):
     ours = {name: tuple(value.shape) for name, value in network.state_dict().items() if "num_batches" not in name}
     assert ours == published_shapes()
     # The usual 1000-class Inception v3 without its auxiliary head has 23,834,568; this one has 8 classes more.
     assert sum(p.numel() for p in network.parameters()) == 23_834_568 + 8 * 2049
 
 
-def test_features_equal_a_literal_forward_pass(network):
-    """The same weights through plain functions, block by block as the TensorFlow graph is described."""
+def test_inception_features_equal_literal_forward_pass(network):
+    """Applies the same weights with plain functions, block by block as in the TensorFlow graph."""
     images = pictures(1, 80, 100)
     state = network.state_dict()
 
@@ -181,7 +181,7 @@ def test_features_equal_a_literal_forward_pass(network):
 
     pool3, _, logits = inception_features(network, images)
     scale = expected.abs().max().item()
-    assert expected.std().item() > 0.01 * scale  # the network is alive
+    assert expected.std().item() > 0.01 * scale  # activations do not vanish
     np.testing.assert_allclose(pool3, expected, atol=1e-4 * scale)
     np.testing.assert_allclose(logits, expected @ state["fc.weight"].T, atol=1e-3 * scale)
 
@@ -205,13 +205,13 @@ def literal_resize(picture: np.ndarray, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("height", "width", "size"), [(5, 7, 13), (16, 9, 6), (12, 12, 12)])
-def test_resize_equals_tensorflows_arithmetic(height, width, size):
+def test_inception_resize_equals_tensorflow(height, width, size):
     picture = pictures(1, height, width)[0].astype(np.float64)
     got = resize_like_tensorflow1(torch.from_numpy(picture).permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
     np.testing.assert_allclose(got, literal_resize(picture, size), atol=1e-3)
 
 
-def test_features_do_not_depend_on_the_batch(network):
+def test_inception_features_are_independent_of_batch(network):
     images = pictures(3)
     together = inception_features(network, images, batch_size=3)
     alone = inception_features(network, images, batch_size=1)
@@ -220,8 +220,8 @@ def test_features_do_not_depend_on_the_batch(network):
     assert [part.shape for part in inception_features(network, images[:0])] == [(0, 2048), (0, 2023), (0, 1008)]
 
 
-def test_spatial_features_are_seven_channels_of_mixed_6_conv_channels_last(network):
-    """TensorFlow flattens row, column, channel; precomputed moments of ADM's reference batches are in that order."""
+def test_inception_spatial_features_are_mixed_6_channels_last(network):
+    """TensorFlow flattens row, column, channel: the order of the moments of ADM's reference batches."""
     maps = []
     hook = network.Mixed_6d.branch1x1.register_forward_hook(lambda module, inputs, output: maps.append(output))
     spatial = inception_features(network, pictures()).spatial
@@ -265,20 +265,20 @@ def golden_difference(network: Inception) -> dict[str, float]:
     return {layer: np.abs(got[layer] - expected[layer]).max() / np.abs(expected[layer]).max() for layer in expected}
 
 
-def test_features_are_torch_fidelitys(golden_network):
-    """Every layer that torch-fidelity gives, for enlarged and for reduced pictures, to 1e-5 of its scale."""
+def test_inception_features_equal_torch_fidelity(golden_network):
+    """Every layer that torch-fidelity returns, for enlarged and reduced images, to 1e-5 of its scale."""
     difference = golden_difference(golden_network)
     assert max(difference.values()) < 1e-5, difference
 
 
-def test_golden_pictures_are_told_apart_by_every_layer():
+def test_inception_layers_distinguish_golden_pictures():
     for layer, features in safetensors.numpy.load_file(golden_recipe.GOLDEN).items():
         assert 0.1 < np.abs(features).max() < 100, layer
         gaps = np.abs(features[:, None] - features[None]).max(axis=-1) / features.std()
         assert gaps[~np.eye(len(features), dtype=bool)].min() > 0.1, layer
 
 
-def test_a_half_pixel_shift_would_be_noticed(golden_network, monkeypatch):
+def test_inception_parity_detects_half_pixel_shift(golden_network, monkeypatch):
     def torchs_own(x, size):
         return F.interpolate(x, (size, size), mode="bilinear", align_corners=False)
 
@@ -287,7 +287,7 @@ def test_a_half_pixel_shift_would_be_noticed(golden_network, monkeypatch):
 
 
 @pytest.mark.parametrize("mistake", ["7c averages", "padding counts", "epsilon"])
-def test_another_layer_would_be_noticed(golden_network, monkeypatch, mistake):
+def test_inception_parity_detects_layer_variants(golden_network, monkeypatch, mistake):
     if mistake == "7c averages":
         monkeypatch.setattr(golden_network.Mixed_7c, "max_pool", False)
     elif mistake == "padding counts":
@@ -303,7 +303,7 @@ def test_another_layer_would_be_noticed(golden_network, monkeypatch, mistake):
 # ------------------------------------------------------------------------------------------ weight files
 
 
-def test_weights_load_from_pth_and_safetensors(network, tmp_path):
+def test_inception_loads_pth_and_safetensors(network, tmp_path):
     # Converted files were written before batch norm counted its batches.
     state = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
     torch.save(state, tmp_path / "weights.pth")
@@ -318,7 +318,7 @@ def test_weights_load_from_pth_and_safetensors(network, tmp_path):
             np.testing.assert_array_equal(got, want)
 
 
-def test_a_missing_corrupted_or_foreign_file_is_refused(tmp_path):
+def test_inception_rejects_missing_corrupted_or_foreign_file(tmp_path):
     with pytest.raises(ValueError, match="no such file"):
         load_inception(tmp_path / "absent.pth")
     known = tmp_path / "weights-inception-2015-12-05-6726825d.pth"
@@ -337,7 +337,7 @@ def test_a_missing_corrupted_or_foreign_file_is_refused(tmp_path):
         load_inception(tmp_path / "list.pth")
 
 
-def test_the_published_weights_are_known_by_their_sha_whatever_their_name(network, tmp_path, monkeypatch):
+def test_inception_recognizes_published_weights_by_sha(network, tmp_path, monkeypatch):
     path = tmp_path / "mine.pth"
     torch.save(network.state_dict(), path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -349,7 +349,7 @@ def test_the_published_weights_are_known_by_their_sha_whatever_their_name(networ
         assert load_inception(path).weights_sha256 == sha256
 
 
-def test_gpu_convolutions_keep_all_their_digits(network):
+def test_inception_gpu_convolutions_use_full_precision(network):
     allowed = []
     hook = network.Mixed_7c.register_forward_hook(lambda *_: allowed.append(torch.backends.cudnn.allow_tf32))
     before = torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled
@@ -359,7 +359,7 @@ def test_gpu_convolutions_keep_all_their_digits(network):
     assert (torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled) == before
 
 
-def test_pictures_of_another_kind_are_refused(network):
+def test_inception_rejects_images_of_another_kind(network):
     with pytest.raises(ValueError, match="uint8"):
         inception_features(network, pictures().astype(np.float32))
     with pytest.raises(ValueError, match="uint8"):
@@ -369,7 +369,7 @@ def test_pictures_of_another_kind_are_refused(network):
 # ------------------------------------------------------------------------------------------ without weights
 
 
-def test_random_features_are_fixed_finite_and_tell_pictures_apart():
+def test_random_features_are_fixed_finite_and_discriminative():
     images = pictures(5)
     features = random_features(images)
     assert features.shape == (5, 480) and np.isfinite(features).all()
@@ -378,7 +378,7 @@ def test_random_features_are_fixed_finite_and_tell_pictures_apart():
     assert np.abs(features - random_features(images, seed=1)).max() > 0.01
     black, white = np.zeros_like(images), np.full_like(images, 255)
     assert np.abs(random_features(black) - random_features(white)).max() > 0.1
-    # Frozen: numbers of older reports stay comparable.
+    # Fixed, so that results of older reports remain comparable.
     np.testing.assert_allclose(
         random_features(white[:1])[0, [0, 100, 300, 479]], [2.72897, 0.675502, 0.103905, 1.17206], rtol=1e-4
     )

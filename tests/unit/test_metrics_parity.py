@@ -40,7 +40,7 @@ def adm_frechet(real: np.ndarray, generated: np.ndarray) -> float:
 
 
 def adm_inception_score(scores: np.ndarray, chunk: int = 5000) -> float:
-    """Mean over chunks in the order of the samples of exp(E KL(p(y|x) || p(y))), p(y) that of the chunk."""
+    """Mean over consecutive chunks of exp(E KL(p(y|x) || p(y))), with p(y) of the chunk."""
     found = []
     for start in range(0, len(scores), chunk):
         p = scipy.special.softmax(scores[start : start + chunk], axis=1)
@@ -49,7 +49,7 @@ def adm_inception_score(scores: np.ndarray, chunk: int = 5000) -> float:
 
 
 def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float]:
-    """Whole distance matrices. Sorted, a sample itself comes first in its row, so that entry k is the k-th other."""
+    """Uses whole distance matrices. In a sorted row the sample itself comes first; entry k is its k-th neighbour."""
 
     def distances(x, y):
         return np.array([np.square(row - y).sum(axis=1) for row in x])
@@ -63,13 +63,13 @@ def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int) -> tup
 
 
 def walks(seed: int, n: int, d: int) -> np.ndarray:
-    """Correlated features, as float32, with a scale and a place of their own."""
+    """Correlated float32 features with different scales and offsets."""
     rng = np.random.default_rng(seed)
     return (rng.uniform(0.8, 1.2) * np.cumsum(rng.normal(size=(n, d)), axis=1) + rng.normal(size=d)).astype(np.float32)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_scores_of_given_features_are_adms(seed):
+def test_scores_equal_adm(seed):
     real, generated = walks(seed, 400, 48), walks(seed + 10, 250, 48)
     exact = real.astype(np.float64), generated.astype(np.float64)
     assert fid(real, generated) == pytest.approx(adm_frechet(*exact), rel=1e-6)
@@ -78,7 +78,7 @@ def test_scores_of_given_features_are_adms(seed):
     assert 0 < found[1].precision < 1 and 0 < found[1].recall < 1
 
 
-def test_inception_score_of_several_chunks_is_adms(monkeypatch):
+def test_inception_score_of_chunks_equals_adm(monkeypatch):
     rng = np.random.default_rng(4)
     scores = rng.normal(0, 2, (12_000, 10)) + 3 * np.eye(10)[np.sort(rng.integers(0, 10, 12_000))]  # in class order
     in_chunks = inception_score(scores).value
@@ -88,8 +88,8 @@ def test_inception_score_of_several_chunks_is_adms(monkeypatch):
     assert inception_score(scores).value > 1.1 * in_chunks
 
 
-def test_adms_half_precision_moves_precision_and_recall_by_less_than_a_hundredth():
-    """ADM multiplies matrices in float16, here every comparison is exact: a model of its rounding, and what it does."""
+def test_adm_half_precision_shifts_precision_recall_below_0_01():
+    """ADM multiplies matrices in float16; here comparisons are exact. Models that rounding and bounds its effect."""
 
     def distances(x, y):
         x, y = x.astype(np.float16), y.astype(np.float16)
@@ -111,15 +111,15 @@ def test_adms_half_precision_moves_precision_and_recall_by_less_than_a_hundredth
 # ------------------------------------------------------------------------------------------------ torch-fidelity
 
 
-def test_frechet_distance_is_torch_fidelitys(torch_fidelity):
-    """Also of fewer samples than dimensions: 20 in 32."""
+def test_frechet_distance_equals_torch_fidelity(torch_fidelity):
+    """Includes fewer samples than dimensions: 20 in 32."""
     real, generated = feature_sets()
     for name, samples in (("fid", generated), ("fid_few", generated[:20])):
         theirs = torch_fidelity[f"{name}.frechet_inception_distance"]
         assert fid(real, samples) == pytest.approx(theirs, rel=1e-6)
 
 
-def test_inception_score_is_torch_fidelitys_over_the_same_splits(torch_fidelity, monkeypatch):
+def test_inception_score_equals_torch_fidelity_on_same_splits(torch_fidelity, monkeypatch):
     """One split: ADM's score of up to 5000 samples. Ten shuffled ones, its default: 5 % less for these 300."""
     one, ten = (torch_fidelity[f"isc_{splits}.inception_score_mean"] for splits in (1, 10))
     assert inception_score(logits()).value == pytest.approx(one, rel=1e-6)
@@ -129,12 +129,12 @@ def test_inception_score_is_torch_fidelitys_over_the_same_splits(torch_fidelity,
     assert ten == pytest.approx(0.95 * one, rel=0.01)
 
 
-def test_precision_and_recall_are_torch_fidelitys(torch_fidelity):
+def test_precision_and_recall_equal_torch_fidelity(torch_fidelity):
     real, generated = feature_sets()
     for name, samples in (("prc_{}", generated), ("prc_{}_few", generated[:20])):
         for found in neighbourhoods(real, samples, k=(1, 3, 5)):
             theirs = {key: torch_fidelity[f"{name.format(found.k)}.{key}"] for key in ("precision", "recall")}
-            # Theirs are means of float32.
+            # torch-fidelity averages in float32.
             assert found.precision == pytest.approx(theirs["precision"], rel=1e-6)
             assert found.recall == pytest.approx(theirs["recall"], rel=1e-6)
             assert theirs["precision"] != theirs["recall"]
@@ -151,8 +151,8 @@ def polynomial_kid(x: np.ndarray, y: np.ndarray) -> float:
     return float(within - 2 * kernel(x, y).mean())
 
 
-def test_kid_of_all_samples_is_torch_fidelitys(torch_fidelity):
-    """Its subsets are drawn at random, ours hold each sample once: equal where there is one group."""
+def test_kid_of_all_samples_equals_torch_fidelity(torch_fidelity):
+    """torch-fidelity draws random subsets, ours use each sample once: both are equal for a single group."""
     real, generated = feature_sets()
     whole = torch_fidelity["kid_all.kernel_inception_distance_mean"]
     assert kernel_distance(real, generated).value == pytest.approx(whole, rel=1e-5)

@@ -1,4 +1,4 @@
-"""AP3D against a literal reading of COCO's evaluation as Omni3D uses it; ground scores against plain loops."""
+"""AP3D equals a literal version of COCO's evaluation as used by Omni3D; ground scores equal plain loops."""
 
 import dataclasses
 from itertools import permutations
@@ -118,7 +118,7 @@ def random_dataset(rng, num_scenes=6):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("max_detections", [3, 100])
-def test_ap3d_equals_the_literal_version(seed, max_detections):
+def test_ap3d_equals_literal_version(seed, max_detections):
     truths, predictions = random_dataset(np.random.default_rng(seed))
     got = scores(truths, predictions, max_detections=max_detections)
     for t, threshold in enumerate(THRESHOLDS):
@@ -129,7 +129,7 @@ def test_ap3d_equals_the_literal_version(seed, max_detections):
     assert 0 < got.ap3d_50 < got.ap3d < 1
 
 
-def test_records_may_be_joined_in_any_grouping():
+def test_ap3d_records_join_in_any_grouping():
     truths, predictions = random_dataset(np.random.default_rng(7))
     parts = [match_scene(t, p) for t, p in zip(truths, predictions, strict=True)]
     grouped = join_matches([join_matches(parts[:2]), parts[2], join_matches(parts[3:])])
@@ -142,14 +142,14 @@ def test_records_may_be_joined_in_any_grouping():
 CENTERS = [[0, 0, 0], [10, 0, 0], [20, 0, 0], [30, 0, 0]]
 
 
-def test_perfect_is_one_and_empty_is_zero():
+def test_ap3d_of_perfect_is_one_and_of_empty_is_zero():
     truth, nothing = scene([CAR, CAR, POLE, TREE], CENTERS), scene([], [])
     assert scores([truth], [truth]).ap3d == 1
     assert scores([truth], [nothing]).ap3d == 0
     assert scores([truth, nothing], [truth, nothing]).ap3d == 1
 
 
-def test_a_worse_duplicate_behind_all_truths_costs_nothing_and_before_them_half():
+def test_ap3d_penalizes_duplicates_by_rank():
     truth = scene([CAR, CAR], CENTERS[:2])
     behind = scene([CAR] * 3, [*CENTERS[:2], CENTERS[0]], existence=[0.9, 0.8, 0.1])
     assert scores([truth], [behind]).ap3d == 1
@@ -158,12 +158,12 @@ def test_a_worse_duplicate_behind_all_truths_costs_nothing_and_before_them_half(
     assert scores([truth], [between]).ap3d == pytest.approx((51 + 50 * 2 / 3) / 101)
 
 
-def test_half_the_truths_found_gives_51_of_101_points():
+def test_ap3d_of_half_the_truths_is_51_of_101_points():
     truth = scene([CAR, CAR], CENTERS[:2])
     assert scores([truth], [truth.select(np.array([0]))]).ap3d == pytest.approx(51 / 101)
 
 
-def test_a_shifted_box_counts_up_to_its_own_iou():
+def test_ap3d_counts_shifted_box_up_to_its_iou():
     truth = scene([CAR], CENTERS[:1])
     shifted = scene([CAR], [[0.5, 0, 0]])  # IoU3D 1/3: true at .05 ... .30, false at .35 ... .50
     got = scores([truth], [shifted])
@@ -171,7 +171,7 @@ def test_a_shifted_box_counts_up_to_its_own_iou():
     assert got.ap3d_50 == 0
 
 
-def test_categories_without_truths_are_left_out_and_ellipsoids_never_count():
+def test_ap3d_ignores_ellipsoids_and_absent_categories():
     truth = scene([CAR, ELLIPSOID], CENTERS[:2])
     got = scores([truth], [scene([CAR, POLE], CENTERS[:2])])
     assert set(got.table) == {"vehicle_small"} and got.ap3d == 1
@@ -179,22 +179,22 @@ def test_categories_without_truths_are_left_out_and_ellipsoids_never_count():
         scores([scene([ELLIPSOID], CENTERS[:1])], [scene([], [])])
 
 
-def test_truncation_is_per_scene_and_category():
+def test_ap3d_truncates_per_scene_and_category():
     cars = scene([CAR] * 150, [[10 * i, 0, 0] for i in range(150)])
     assert scores([cars], [cars]).ap3d == 1
     assert scores([cars], [cars], max_detections=100).ap3d == pytest.approx(67 / 101)  # recall 100/150
 
 
-def test_a_score_threshold_equals_dropping_the_detections():
+def test_ap3d_score_threshold_equals_dropping_detections():
     truths, predictions = random_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as scene_from_layout does
+    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as returned by scene_from_layout
     got = scores(truths, predictions, min_score=0.375)
     assert got == scores(truths, dropped)
     assert list(got.at_threshold) == [f"{t:.2f}" for t in THRESHOLDS]
     assert np.mean(list(got.at_threshold.values())) == pytest.approx(got.ap3d)
 
 
-def test_greedy_matching_takes_the_best_free_truth_and_the_later_of_equals():
+def test_ap3d_matches_best_free_truth_and_later_of_ties():
     iou = np.array([[0.4, 0.6, 0.0], [0.5, 0.7, 0.0], [0.5, 0.0, 0.5], [0.5, 0.0, 0.5]])
     hit = match_greedily(iou, np.array([0.3, 0.55]))
     np.testing.assert_array_equal(hit[:, 0], [True, True, True, False])
@@ -205,7 +205,7 @@ def test_greedy_matching_takes_the_best_free_truth_and_the_later_of_equals():
     assert average_precision(np.zeros((0, 10), bool), 3).tolist() == [0] * 10
 
 
-def test_existence_that_is_not_a_number_is_refused():
+def test_ap3d_rejects_nan_existence():
     with pytest.raises(ValueError, match="existence"):
         match_scene(scene([CAR], CENTERS[:1]), scene([CAR], CENTERS[:1], existence=[np.nan]))
 
@@ -247,7 +247,7 @@ def test_ground_scores_equal_plain_loops():
     assert got.height_mse == pytest.approx(np.mean(normalised))
 
 
-def test_ground_sums_of_scenes_add_up_to_those_of_the_stack():
+def test_ground_sums_of_scenes_equal_those_of_stack():
     rasters = random_rasters(np.random.default_rng(1))
     one_by_one = [ground_sums(*(part[s] for part in rasters)) for s in range(3)]
     total, stacked = one_by_one[0] + one_by_one[1] + one_by_one[2], ground_sums(*rasters)
@@ -255,7 +255,7 @@ def test_ground_sums_of_scenes_add_up_to_those_of_the_stack():
         np.testing.assert_allclose(getattr(total, field.name), getattr(stacked, field.name), rtol=1e-12)
 
 
-def test_perfect_ground_and_a_class_that_never_occurs():
+def test_ground_scores_of_perfect_ground_and_absent_class():
     true_occupied, true_height_m, _, _ = random_rasters(np.random.default_rng(2))
     true_occupied[:, 1] = False
     got = ground_scores(
@@ -264,7 +264,7 @@ def test_perfect_ground_and_a_class_that_never_occurs():
     assert got.class_iou == {"road": 1.0} and got.mean_iou == got.iou == 1 and got.height_mse == 0
 
 
-def test_ground_without_truth_bad_bounds_and_nan_are_refused():
+def test_ground_scores_reject_missing_truth_bad_bounds_and_nan():
     rasters = random_rasters(np.random.default_rng(3))
     empty = ground_sums(np.zeros_like(rasters[0]), *rasters[1:])
     with pytest.raises(ValueError, match="at least one truly occupied pixel"):
@@ -282,7 +282,7 @@ def test_ground_without_truth_bad_bounds_and_nan_are_refused():
 
 
 def best_pairs(iou: np.ndarray) -> tuple[int, float]:
-    """Number and sum of IoU of the best one-to-one pairs, by trying all of them."""
+    """Number and summed IoU of the best one-to-one pairs, by exhaustive search."""
     if iou.shape[0] > iou.shape[1]:
         iou = iou.T
     ways = [iou[np.arange(iou.shape[0]), list(way)] for way in permutations(range(iou.shape[1]), iou.shape[0])]
@@ -291,7 +291,7 @@ def best_pairs(iou: np.ndarray) -> tuple[int, float]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_pairs_are_the_best_of_all_assignments(seed):
+def test_pairs_equal_best_assignment(seed):
     rng = np.random.default_rng(seed)
     category = np.repeat([CAR, POLE, ELLIPSOID], 5)
     truth = scene(category, rng.uniform(-3, 3, (15, 3)), rng.uniform(1, 4, (15, 3)), yaw_rad=rng.uniform(-1, 1, 15))
@@ -308,7 +308,7 @@ def test_pairs_are_the_best_of_all_assignments(seed):
         assert (got.truths[c], got.predictions[c]) == (len(iou.T), len(iou))
 
 
-def test_pair_scores_by_hand():
+def test_pair_scores_equal_hand_computed():
     truth = scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
     found = scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D 1/3, nothing, 1
     sums = pair_sums(truth, found)
@@ -320,7 +320,7 @@ def test_pair_scores_by_hand():
     assert got.category_right == pytest.approx({"vehicle_small": 0.5, "vegetation_ellipsoid": 1})
 
 
-def test_without_a_pair_the_mean_is_undefined_and_without_a_truth_so_is_all():
+def test_pair_scores_without_pairs_or_truths_are_undefined():
     nothing = scene([], [])
     got = pair_scores(pair_sums(scene([CAR], CENTERS[:1]), nothing))
     assert got.mean_iou3d is None and got.right is None and got.found == got.truth_iou3d == 0
@@ -346,7 +346,7 @@ def test_voxel_scores_equal_plain_counting():
     assert got.miou == pytest.approx(np.mean(list(literal.values())))
 
 
-def test_equal_voxels_score_one_and_air_is_not_scored():
+def test_voxel_scores_of_equal_voxels_are_one_and_ignore_air():
     space = VoxelGrid(GRID, -2, 2, 8)
     voxels = voxelise(scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
     got = voxel_scores(voxel_confusion(voxels, voxels))
@@ -362,7 +362,7 @@ def test_equal_voxels_score_one_and_air_is_not_scored():
 # ------------------------------------------------------------------------------------------ memory
 
 
-def test_memory_is_the_papers_for_the_papers_layout():
+def test_layout_memory_equals_paper():
     """2.50 MB of rasters, 0.02 MB of primitives; voxels of four bytes 8.00 MB (paper, Sec. 4.2 and Tab. 1)."""
     truth, spec = random_scene(0, n=40), LayoutSpec()
     latent = np.zeros((64, 32, 32), np.float32)

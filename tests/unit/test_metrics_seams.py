@@ -1,4 +1,4 @@
-"""Seams by hand, and on scenes whose seams are known to show or not to."""
+"""Seam scores on hand-computed cases and on scenes with known visible or invisible seams."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
 
 def speckled(seed: int, block_px: int = 8):
-    """Ground classes drawn per block of pixels, heights per pixel: no line differs from another."""
+    """Random ground classes per block of pixels and random heights per pixel: all lines are alike."""
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, 0)
     blocks = 256 // block_px
@@ -51,15 +51,15 @@ def ratios(scenes, **lines) -> dict:
     return seam_ratios(np.stack([seam_record(scene, **lines) for scene in scenes]))
 
 
-def test_a_line_that_does_not_show_has_ratio_one():
+def test_seam_ratio_of_invisible_seam_is_one():
     got = ratios([speckled(seed, block_px=1) for seed in range(60)], rows=[64, 130], cols=[100])
     for name in ("class_changes", "height_step"):
         assert got[name].low < 1.02 and got[name].high > 0.98
         assert got[name].high - got[name].low < 0.1
-    assert got["cut_objects"] is None  # no objects, nothing to judge
+    assert got["cut_objects"] is None  # no objects, so no score
 
 
-def test_a_line_where_another_scene_begins_shows():
+def test_seam_ratio_shows_change_of_scene():
     scenes = []
     for seed in range(20):
         near, far = speckled(seed), speckled(seed + 100)
@@ -75,7 +75,7 @@ def test_a_line_where_another_scene_begins_shows():
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_objects_that_end_at_a_line_or_come_twice(axis):
+def test_seam_scores_count_cut_and_duplicate_objects(axis):
     def placed(offset_m, along_m=0.0):
         at = np.array([32.0, 0.0])
         at[axis] += offset_m
@@ -94,7 +94,7 @@ def test_objects_that_end_at_a_line_or_come_twice(axis):
     assert seam_record(same_side, **lines)[3, 0].tolist() == [0, 2]
 
 
-def test_footprints_of_turned_boxes_hold_their_corners():
+def test_footprint_of_rotated_box_contains_corners():
     scene = random_scene(3, 50)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = scene.center_m[:, None] + (0.5 * signs[None] * scene.size_m[:, None]) @ scene.rotation.transpose(0, 2, 1)
@@ -103,14 +103,14 @@ def test_footprints_of_turned_boxes_hold_their_corners():
     np.testing.assert_allclose(ranges[:, :, 1], corners.max(axis=1)[:, :2], atol=1e-4)
 
 
-def test_neighbouring_lines_keep_away_from_every_seam():
+def test_reference_lines_avoid_every_seam():
     near = neighbours([100, 130], 256, 0.25)  # 7.5 m apart
     assert 115 not in near[100] and 84 in near[100] and 85 not in near[100] and 146 in near[100]
     assert min(abs(line - seam) for line in near[130] for seam in (100, 130)) == 16
     assert near[100].min() == 36
 
 
-def test_a_seam_on_the_edge_is_refused_and_an_empty_scene_judges_nothing():
+def test_seam_scores_reject_edge_seam_and_skip_empty_scene():
     with pytest.raises(ValueError, match="seam before pixel 256, expected 1 to 255"):
         seam_record(speckled(0), rows=[256])
     empty = replace(speckled(0), occupied=np.zeros((5, 256, 256), bool))
@@ -118,7 +118,7 @@ def test_a_seam_on_the_edge_is_refused_and_an_empty_scene_judges_nothing():
     assert len(MEASURES) == 4
 
 
-def test_a_row_of_the_sweep_says_what_a_setting_costs_and_shows():
+def test_seam_sweep_row_has_cost_and_visibility():
     ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
     cars = with_cars(speckled(0), [(10, 0), (20, 3)])
     assert objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice

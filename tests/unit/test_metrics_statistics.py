@@ -1,4 +1,4 @@
-"""Layout statistics by hand; the Frechet distance of layouts in closed form."""
+"""Layout statistics equal hand-computed values; the Frechet distance of layouts equals its closed form."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def scene(category, size_m) -> Scene:
     )  # fmt: skip
 
 
-def test_statistics_by_hand():
+def test_layout_statistics_equal_hand_computed():
     names = statistic_names(("road", "terrain"))
     got = dict(zip(names, layout_statistics(scene([CAR, POLE, CAR], [[4, 2, 1], [1, 1, 6], [5, 2, 2]])), strict=True))
     assert got["num_vehicle_small"] == 2 and got["num_pole"] == 1 and got["num_human"] == 0
@@ -38,7 +38,7 @@ def test_statistics_by_hand():
     assert got["road_share"] == 0.5 and got["terrain_share"] == 0
 
 
-def test_an_empty_scene_has_statistics_too():
+def test_layout_statistics_of_empty_scene():
     got = layout_statistics(scene([], []))
     assert (got[: len(CATEGORIES)] == 0).all() and got[-2] == 0.5
 
@@ -47,7 +47,7 @@ def layout_frechet(reference, other) -> float:
     return frechet_distance(*map(moments, standardised(reference, other)))
 
 
-def test_frechet_of_a_shift_counts_in_deviations_of_the_reference():
+def test_layout_frechet_is_in_reference_deviations():
     rng = np.random.default_rng(0)
     reference = rng.normal(5, [0.1, 10, 3], (4000, 3))
     assert layout_frechet(reference, reference) == pytest.approx(0, abs=1e-9)
@@ -58,22 +58,22 @@ def test_frechet_of_a_shift_counts_in_deviations_of_the_reference():
     assert layout_frechet(reference, centre + 2 * (reference - centre)) == pytest.approx(3 * n / (n - 1), rel=1e-9)
 
 
-def test_units_do_not_matter():
+def test_layout_frechet_is_independent_of_units():
     rng = np.random.default_rng(1)
     a, b, unit = rng.normal(size=(50, 4)), rng.normal(1, 2, size=(40, 4)), np.array([1, 100, 0.01, 7])
     assert layout_frechet(a, b) == pytest.approx(layout_frechet(a * unit, b * unit), rel=1e-6)
 
 
-def test_absent_categories_and_constant_columns_stay_finite():
+def test_layout_frechet_is_finite_for_constant_columns():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
     a[:, 0], b[:, 0] = 2, 5  # constant: 3 units apart
     a[::2, 1] = np.nan
-    b[:, 2] = np.nan  # never there in the other source
+    b[:, 2] = np.nan  # absent from the other source
     assert layout_frechet(a, b) > 9 and np.isfinite(layout_frechet(a, b))
     filled = np.where(np.isnan(b), a.mean(axis=0), b)
     assert layout_frechet(a[:, [0, 2]], b[:, [0, 2]]) == pytest.approx(layout_frechet(a[:, [0, 2]], filled[:, [0, 2]]))
-    a[:, 1] = np.nan  # never there in the reference
+    a[:, 1] = np.nan  # absent from the reference
     assert np.isfinite(layout_frechet(a, b))
     with pytest.raises(ValueError, match="at least 2 scenes"):
         layout_frechet(a, b[:1])

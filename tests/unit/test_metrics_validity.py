@@ -1,4 +1,4 @@
-"""Validity measures on scenes built so that every answer is known; connectivity against a flood fill."""
+"""Validity measures on scenes with known answers; road connectivity equals a flood fill."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def measure(name: str, scene: Scene) -> tuple[float, float]:
     return tuple(scene_validity(scene, SLAB_M)[MEASURES.index(name)])
 
 
-def test_overlap_counts_both_of_a_pair_and_only_solid_ones():
+def test_validity_overlap_counts_both_solid_objects_of_a_pair():
     apart, near = (CAR, 3.0, 4.0, 0), (CAR, 4.9, 4.0, 0)  # IoU3D 0.1 / 3.9 = 0.026
     assert measure("overlapping", town([apart, near])) == (0, 2)
     assert measure("overlapping", town([apart, (CAR, 4.5, 4.0, 0)])) == (2, 2)  # 0.5 / 3.5 = 0.14
@@ -61,13 +61,13 @@ def test_overlap_counts_both_of_a_pair_and_only_solid_ones():
 
 
 @pytest.mark.parametrize(("bottom_m", "floats", "sinks"), [(0, 0, 0), (0.45, 0, 0), (0.55, 1, 0), (-0.55, 0, 1)])
-def test_floating_and_sunken_are_measured_from_the_surface_below_the_slab(bottom_m, floats, sinks):
+def test_validity_floating_is_measured_from_surface_below_slab(bottom_m, floats, sinks):
     scene = town([(POLE, 5.0, -4.5, bottom_m), (TREE, 5.0, 3.0, 9)])  # a crown may hang
     assert measure("floating", scene) == (floats, 1)
     assert measure("sunken", scene) == (sinks, 1)
 
 
-def test_a_tilted_box_stands_on_its_lowest_corner():
+def test_validity_tilted_box_stands_on_lowest_corner():
     scene = town([(POLE, 5.0, -4.5, 0)])
     cos = np.sqrt(0.5)
     tilted = np.array([[[cos, 0, cos], [0, 1, 0], [-cos, 0, cos]]], np.float32)  # lowest corner sqrt(2) below centre
@@ -77,7 +77,7 @@ def test_a_tilted_box_stands_on_its_lowest_corner():
     assert measure("sunken", scene) == (1, 1)
 
 
-def test_ground_that_is_unknown_judges_nothing_but_is_counted():
+def test_validity_counts_but_does_not_judge_unknown_ground():
     over_nothing, behind, ahead, good = (
         (CAR, 0.5, 4.0, 7),
         (CAR, -3.0, 4.0, 7),
@@ -90,7 +90,7 @@ def test_ground_that_is_unknown_judges_nothing_but_is_counted():
     assert measure("over_unknown_ground", scene) == (1, 2)
 
 
-def test_cars_belong_on_road_and_parking_and_houses_beside_the_road():
+def test_validity_expects_cars_on_road_and_houses_off_road():
     on_road, parked, on_sidewalk = (CAR, 5.0, 4.0, 0), (CAR, 15.5, -4.0, 0), (CAR, 5.0, -4.0, 0)
     houses = [(HOUSE, 9.0, 4.0, 0), (HOUSE, 9.0, -4.0, 0)]
     scene = town([on_road, parked, on_sidewalk, *houses])
@@ -116,18 +116,18 @@ def flood(mask: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_road_connectivity_equals_a_flood_fill(seed):
+def test_road_connectivity_equals_flood_fill(seed):
     road = np.random.default_rng(seed).random((16, 16)) < 0.5
     assert measure("road_connectivity", town(road=road)) == pytest.approx((flood(road), 1))
 
 
-def test_diagonal_road_is_broken_and_no_road_is_not_counted():
+def test_road_connectivity_breaks_at_diagonal_and_skips_no_road():
     assert measure("road_connectivity", town(road=np.eye(16, dtype=bool))) == (1 / 16, 1)
     assert measure("road_connectivity", town(road=np.zeros((16, 16), bool))) == (0, 0)
     assert measure("road_connectivity", town()) == (1, 1)
 
 
-def test_rates_add_up_over_scenes_and_leave_out_what_never_occurs():
+def test_validity_rates_pool_scenes_and_skip_absent_categories():
     good, bad = town([(CAR, 5.0, 4.0, 0)]), town([(CAR, 5.0, -4.0, 0), (CAR, 9.0, -4.0, 0), (CAR, 12.0, 4.0, 3)])
     rates = validity_rates([scene_validity(good, SLAB_M), scene_validity(bad, SLAB_M)])
     assert rates["off_road_vehicles"] == 0.5 and rates["floating"] == 0.25
@@ -136,7 +136,7 @@ def test_rates_add_up_over_scenes_and_leave_out_what_never_occurs():
     assert set(validity_rates([]).values()) == {None}
 
 
-def test_label_fidelity_compares_the_scenes_own_label_with_the_one_it_bears():
+def test_label_fidelity_compares_measured_and_stated_label():
     many = DensityThresholds(count_p25=1.5, count_p75=2.5, volume_p25_m3=10, volume_p75_m3=20)
     three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3: high; no car: low
     right = town(three_trees, vegetation_density="high", vehicle_density="low")

@@ -1,4 +1,4 @@
-"""The networks: sizes, masks, permutations, and that they can learn."""
+"""The networks: sizes, masks, equivariance, losses and learning."""
 
 import itertools
 
@@ -31,7 +31,7 @@ def small_lvae(seed: int = 0, **options) -> LayoutVAE:
     return LayoutVAE(layout=small_spec().to_dict(), **(LVAE_PRESETS["smoke"].architecture() | options))
 
 
-def test_paper_presets_have_the_papers_parameter_counts():
+def test_presets_have_parameter_counts_of_paper():
     with torch.device("meta"):
         row = LVAE_PRESETS["kitti360"]
         lvae = LayoutVAE(layout=LayoutSpec().with_resolution(row.raster_px).to_dict(), **row.architecture())
@@ -41,12 +41,12 @@ def test_paper_presets_have_the_papers_parameter_counts():
             assert abs(millions(DiT(**DIT_PRESETS[name].architecture())) / count - 1) < 0.005
 
 
-def test_unknown_preset_lists_the_known():
+def test_presets_error_lists_known_names():
     with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"):
         preset(LVAE_PRESETS, "tiny")
 
 
-def test_object_latent_ignores_padding_and_order():
+def test_object_encoder_ignores_padding_and_order():
     lvae, spec = small_lvae(), small_spec()
     batch = layout_batch([random_scene(0), random_scene(1, n=0)], spec)
     latent = lvae.object_encoder(batch.features, batch.real)
@@ -59,7 +59,7 @@ def test_object_latent_ignores_padding_and_order():
     assert torch.allclose(permuted, latent, atol=1e-5)
 
 
-def test_object_features_land_in_the_cell_under_their_centre():
+def test_object_encoder_writes_to_cell_under_center():
     lvae, spec = small_lvae(), small_spec()
     scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # far left corner
     batch = layout_batch([scene], spec)
@@ -67,7 +67,7 @@ def test_object_features_land_in_the_cell_under_their_centre():
     assert change[0, 0] > 0 and change.sum() == change[0, 0]
 
 
-def test_latent_stays_split():
+def test_layout_vae_latent_is_split():
     lvae, batch = small_lvae(), layout_batch([random_scene(0)], small_spec())
     latent = lvae.encode(batch).mean
     changed = latent.clone()
@@ -78,7 +78,7 @@ def test_latent_stays_split():
 
 
 def literal_total(features, logit, truth, real, columns) -> float:
-    """The paper's square matching cost of one category, term by term."""
+    """The square matching cost of the paper for one category, term by term."""
     p = torch.sigmoid(logit.double())
     total = 0.0
     for i, j in enumerate(columns):
@@ -90,7 +90,7 @@ def literal_total(features, logit, truth, real, columns) -> float:
     return total
 
 
-def test_matching_reaches_the_optimum_of_the_padded_square_problem():
+def test_matching_reaches_optimum_of_padded_square_problem():
     generator = torch.Generator().manual_seed(0)
     slots = (9, 1, 6)
     n = sum(slots)
@@ -119,8 +119,8 @@ def test_matching_reaches_the_optimum_of_the_padded_square_problem():
             start += s
 
 
-def test_matching_more_proposals_than_slots_is_optimal_too():
-    """The cell decoder offers more than there are slots: brute force over the whole rectangular cost."""
+def test_matching_of_surplus_proposals_is_optimal():
+    """The cell decoder proposes more objects than slots; compares with brute force over the rectangular cost."""
     generator = torch.Generator().manual_seed(3)
     slots, proposals, weights = (3, 2), (7, 5), MatchWeights(1.0, 24.0, 3.0)
     features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
@@ -144,7 +144,7 @@ def test_matching_more_proposals_than_slots_is_optimal_too():
         match(features * float("nan"), logit, truth, real, slots, proposals)
 
 
-def test_cell_proposals_lie_in_and_around_their_cell():
+def test_cell_decoder_proposals_lie_around_their_cell():
     decoder = small_lvae(decoder="cells").object_decoder
     features, existence = decoder(torch.randn(1, 4, 8, 8) * 10)
     assert features.shape == (1, sum(decoder.proposals), 9) and existence.shape == features.shape[:2]
@@ -154,7 +154,7 @@ def test_cell_proposals_lie_in_and_around_their_cell():
     assert (first[..., 1] - middle[None, :]).abs().max() <= 1 / 8 + 1e-6
 
 
-def test_the_object_shortcut_moves_with_its_cell():
+def test_object_shortcut_is_equivariant_to_cell_shift():
     encoder = small_lvae(shortcut=True).object_encoder
     torch.nn.init.zeros_(encoder.project_out.weight)
     features = torch.full((2, sum(small_spec().slots), 9), 0.3)
@@ -169,7 +169,7 @@ def test_the_object_shortcut_moves_with_its_cell():
     assert torch.allclose(here[:, 5, 5], there[:, 3, 6], atol=1e-5)
 
 
-def test_outputs_start_at_the_means_of_the_data():
+def test_init_from_data_starts_outputs_at_means():
     batch = layout_batch([random_scene(i) for i in range(8)], small_spec())
     for decoder in ("detr", "cells"):
         lvae = small_lvae(decoder=decoder)
@@ -184,24 +184,27 @@ def test_outputs_start_at_the_means_of_the_data():
         assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
 
 
-def test_distances_are_those_of_scipy():
+def test_distance_transform_equals_scipy():
     rng = np.random.default_rng(0)
     inside = np.stack([rng.random((40, 30)) < share for share in (0.02, 0.5, 0.9, 0.0, 1.0)])
     inside[1] = ndimage.binary_opening(inside[1], iterations=1)
     for most in (1, 3, 6):
         found = signed_distance_px(torch.from_numpy(inside), most).numpy()
         for mask, distance in zip(inside, found, strict=True):
-            border = np.pad(mask, 50, mode="edge")  # nothing is known of beyond
+            border = np.pad(mask, 50, mode="edge")  # ground beyond the crop is unknown
             to = [
                 ndimage.distance_transform_edt(side) if not side.all() else np.full(side.shape, 99.0)
                 for side in (border, ~border)
             ]
             want = np.where(border, to[0] - 0.5, 0.5 - to[1])[50:-50, 50:-50].clip(-most, most)
-            inner = (slice(most, -most), slice(most, -most))  # edge padding invents borders near a crop's own
+            inner = (
+                slice(most, -most),
+                slice(most, -most),
+            )  # edge padding creates boundaries near the border of the crop
             assert np.allclose(distance[inner], want[inner], atol=1e-5)
 
 
-def test_the_linear_start_is_the_best_of_its_rank_and_has_codes_of_unit_variance():
+def test_linear_init_is_optimal_with_unit_variance_codes():
     batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
     lvae = small_lvae(shortcut=True, latent_channels=16)
     lvae.start_at(batch)
@@ -228,7 +231,7 @@ def test_the_linear_start_is_the_best_of_its_rank_and_has_codes_of_unit_variance
     assert (deviation < 1.01).all() and deviation.max() > 0.99
 
 
-def test_what_starts_solved_learns_slower():
+def test_linear_init_lowers_learning_rate():
     lvae = small_lvae(shortcut=True, decoder="cells")
     trainer = Trainer(lvae, None, Optimisation(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
     share = {id(p): group["share"] for group in trainer.optimiser.param_groups for p in group["params"]}
@@ -242,7 +245,7 @@ def test_what_starts_solved_learns_slower():
     assert not small_lvae().learning_rates()
 
 
-def test_shortcuts_show_the_ground_before_the_first_step():
+def test_shortcuts_show_ground_before_first_step():
     batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
     iou = []
     for shortcut in (False, True):
@@ -255,7 +258,7 @@ def test_shortcuts_show_the_ground_before_the_first_step():
     assert iou[1] > 0.7 > iou[0] + 0.2
 
 
-def test_losses_are_their_equations():
+def test_losses_equal_their_equations():
     spec = small_spec(slots=3)
     generator = torch.Generator().manual_seed(1)
     n, b = spec.num_slots, 2
@@ -322,8 +325,8 @@ def test_lvae_overfits_one_batch(decoder, steps, ground):
 @pytest.mark.parametrize(
     "execution", [Execution(precision="bf16"), Execution(accumulate=2), Execution(accumulate=4, precision="bf16")]
 )
-def test_the_lvaes_step_is_the_same_in_halves_and_in_bf16(execution):
-    """First the loss of equal weights, then, after steps of its own kind, a loss that has come down as far."""
+def test_lvae_step_is_equal_in_halves_and_bf16(execution):
+    """Compares the loss at equal weights, then the decrease of the loss after separate training steps."""
     spec = small_spec()
     layouts = [compact_layout(random_scene(i, n=20), spec) for i in range(4)]
     arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
@@ -340,7 +343,7 @@ def test_the_lvaes_step_is_the_same_in_halves_and_in_bf16(execution):
     assert plain[-1] < 0.9 * plain[0] and np.isclose(other[-1], plain[-1], rtol=0.1)
 
 
-def test_noise_on_latents_is_a_samples_own_and_as_large_as_it_says():
+def test_latent_noise_is_per_sample_with_stated_scale():
     generators = [torch.Generator().manual_seed(k) for k in range(400)]
     drawn = stacked_corruption(generators, (4, 8, 8), 0.2, torch.device("cpu"))
     alone = stacked_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
@@ -359,7 +362,7 @@ def test_noise_on_latents_is_a_samples_own_and_as_large_as_it_says():
             assert torch.equal(noisy.height, plain.height) == (size == 0)
 
 
-def test_more_proposals_in_a_cell_are_trained_on_the_same_latents():
+def test_lvae_retrains_more_proposals_on_same_latents():
     old, new = (small_lvae(decoder="cells", shortcut=True, least_per_cell=least) for least in (1, 3))
     batch = layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
     new.keep_latents_of(old.state_dict())
@@ -392,7 +395,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
             prepared(latent, *other)
 
 
-def test_dit_patches_are_put_back_where_they_came_from():
+def test_dit_unpatchify_inverts_patchify():
     """With the network reduced to its patch embedding and its transpose, out = in."""
     dit = DiT(channels=3, size=8, width=12, depth=1, heads=1)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Worlds of blocks: handed the truth for every block, they end as the truth, whatever the order."""
+"""Worlds of blocks: given the truth for every block they equal the truth, in any order of blocks."""
 
 from dataclasses import replace
 from itertools import product
@@ -23,14 +23,14 @@ SIDES, CORNERS = [(1, 0), (-1, 0), (0, 1), (0, -1)], [(1, 1), (1, -1), (-1, 1), 
 
 
 def cell_occupancy(scenes) -> torch.Tensor:
-    """A stand-in encoder whose latent is the occupancy of 8 x 8 cells: what a block knows can be read off it."""
+    """A test encoder whose latent is the occupancy of 8 x 8 cells, which shows what a block knows."""
     occupied = np.stack([s.occupied for s in scenes]).astype(np.float32)
     return torch.from_numpy(occupied.reshape(len(scenes), len(KITTI_GROUND_CLASSES), 8, 4, 8, 4).mean(axis=(3, 5)))
 
 
 @pytest.fixture
 def truth():
-    """128 x 128 m on one slope, that block (0, 0) sees the middle of; no object overlaps another of its kind."""
+    """128 x 128 m on one slope with block (0, 0) in the middle; objects of a category do not overlap."""
     scene = random_scene(3, n=300, grid=LARGE)
     rng = np.random.default_rng(0)
     center = rng.uniform([-32, -64, -2], [96, 64, 6], (300, 3)).astype(np.float32)
@@ -58,7 +58,7 @@ def lattices():
 @pytest.mark.parametrize(
     "lattice", lattices(), ids=lambda lattice: f"{lattice.rank.__name__}-{lattice.step}-{lattice.last}"
 )
-def test_every_cell_is_owned_once_and_known_by_all_later_blocks(lattice):
+def test_block_grid_cells_have_one_owner_known_to_later_blocks(lattice):
     places = lattice.places() if lattice.last else list(product(range(-3, 4), repeat=2))
     owners: dict[tuple[int, int], list] = {}
     for place in places:
@@ -77,7 +77,7 @@ def test_every_cell_is_owned_once_and_known_by_all_later_blocks(lattice):
         assert np.array_equal(known, ~lattice.owned(place))
 
 
-def test_blocks_of_a_front_do_not_know_each_other_and_four_colours_need_nine_blocks():
+def test_block_grid_fronts_are_independent():
     lattice = Lattice.of(8, 0.5, last=(2, 2, 2, 2))
     fronts = lattice.fronts(lattice.places())
     assert [len(front) for front in fronts] == [1, 4, 8, 8, 4]
@@ -94,7 +94,7 @@ def test_blocks_of_a_front_do_not_know_each_other_and_four_colours_need_nine_blo
         endless.places()
 
 
-def test_wrong_overlaps_are_refused():
+def test_block_grid_rejects_wrong_overlaps():
     with pytest.raises(ValueError, match=r"overlap 0.51 is not a whole number of the 8 latent cells"):
         Lattice.of(8, 0.51)
     with pytest.raises(ValueError, match=r"overlap 0.5: four colours need less than 0.5"):
@@ -105,7 +105,7 @@ def test_wrong_overlaps_are_refused():
 
 
 @pytest.mark.parametrize("mode", ["copy", "reencode"])
-def test_blocks_know_their_neighbours_where_they_lie(truth, mode):
+def test_world_gives_blocks_their_known_neighbors(truth, mode):
     lattice = Lattice.of(8, 0.5)
     world = World(lattice, TRUTH_SPEC, cell_occupancy)
     made = {}
@@ -122,8 +122,8 @@ def test_blocks_know_their_neighbours_where_they_lie(truth, mode):
 
 
 @pytest.mark.parametrize(("overlap", "rank"), [(0.5, outward), (0.25, outward), (0.25, colour)])
-def test_blocks_of_the_truth_make_the_truth_in_one_datum(truth, overlap, rank):
-    """Each block's heights count from its own ground; the world's do not."""
+def test_world_of_true_blocks_equals_truth_in_one_datum(truth, overlap, rank):
+    """Heights of a block are relative to its own ground; heights of the world are not."""
     last = (1, 1, 1, 1) if overlap == 0.5 else (0, 0, 0, 0)
     lattice = Lattice.of(8, overlap, rank=rank, last=last if rank is outward else None)
     world = World(lattice, TRUTH_SPEC, cell_occupancy, height_near(truth, 0.0, 0.0))
@@ -150,13 +150,13 @@ def test_blocks_of_the_truth_make_the_truth_in_one_datum(truth, overlap, rank):
     assert np.array_equal(cut.occupied, want.cropped(part).occupied) and len(cut) == len(want.cropped(part))
 
 
-def test_an_object_known_already_is_not_made_again(truth):
+def test_world_does_not_repeat_known_object(truth):
     lattice = Lattice.of(8, 0.5)
     world = World(lattice, TRUTH_SPEC, cell_occupancy)
     middle = seen(truth, (0, 0))
     made = {(0, 0): Block(middle, cell_occupancy([middle])[0])}
     task = world.task((1, 0), made, EMPTY, "copy")
-    # An object just behind the border of what is known; made again just ahead of it, and once more far ahead.
+    # An object just behind the seam, generated again just ahead of the seam and once more far ahead.
     car = {"size_m": np.float32([[4, 2, 1.5]]), "rotation": np.eye(3, dtype=np.float32)[None]}
     known = replace(task.known.select([0]), center_m=np.float32([[31.9, 5, 0]]), **car)
     task = replace(task, known=known)
@@ -165,7 +165,7 @@ def test_an_object_known_already_is_not_made_again(truth):
     assert np.array_equal(world.block(task, task.latent, far).scene.center_m, far.center_m)
 
 
-def test_blocks_that_know_nothing_but_emptiness_are_told(truth):
+def test_world_marks_blocks_that_know_only_empty_ground(truth):
     lattice = Lattice.of(8, 0.5)
     world = World(lattice, TRUTH_SPEC, cell_occupancy)
     bare = replace(seen(truth, (0, 0)), occupied=np.zeros_like(EMPTY.occupied), height_m=np.zeros_like(EMPTY.height_m))
@@ -176,7 +176,7 @@ def test_blocks_that_know_nothing_but_emptiness_are_told(truth):
 # ---------------------------------------------------------------------------------------------------------- pipeline
 
 
-def test_outpainting_keeps_the_given_scene_and_takes_a_label_per_block(pipeline):
+def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
     scene = random_scene(2, n=30, grid=SPEC.grid)
     for mode, last in (("copy", (1, 1, 1, 1)), ("reencode", (1, 0, 0, 2))):
         labels = {place: "high" if place[0] else "low" for place in product(range(-1, 2), range(-2, 2))}
@@ -196,7 +196,7 @@ def test_outpainting_keeps_the_given_scene_and_takes_a_label_per_block(pipeline)
         pipeline.outpaint(replace(scene, grid=replace(scene.grid, front_m=9.0)), "low")
 
 
-def test_a_city_is_the_same_in_whatever_order_it_is_asked_for(pipeline):
+def test_city_is_independent_of_request_order(pipeline):
     places = list(product((0, 1), (-1, 0, 1)))
     cities = []
     for order in (places, places[::-1]):

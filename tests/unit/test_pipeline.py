@@ -40,8 +40,8 @@ def sampler_of(name: str):
     ("name", "steps", "off"),
     [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)],
 )
-def test_samplers_draw_from_a_gaussian_whose_noise_is_known(name, steps, off):
-    """Of data N(mean, std^2), the best prediction of the noise is known; what is drawn must have that mean and std."""
+def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, off):
+    """For data N(mean, std^2) the optimal denoiser is known; samples must have that mean and std."""
     mean, std, alpha_bar = 1.5, 0.5, torch.from_numpy(Diffusion().alpha_bar).float()
 
     def model(latent, timestep, label):
@@ -58,7 +58,7 @@ def test_samplers_draw_from_a_gaussian_whose_noise_is_known(name, steps, off):
     assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < off
 
 
-def test_every_sampler_gives_a_scene_of_its_own_whatever_stands_beside_it(pipeline):
+def test_samplers_are_independent_of_batch_composition(pipeline):
     labels, drawn = ["low", "medium", "high"], {}
     for name in SAMPLERS:
         pipeline.use_sampler(name)
@@ -66,7 +66,7 @@ def test_every_sampler_gives_a_scene_of_its_own_whatever_stands_beside_it(pipeli
         alone = torch.cat([pipeline.sample_latents([label], 3, [k], 10) for k, label in enumerate(labels)])
         assert torch.allclose(together, alone, atol=1e-4), name
         again = pipeline.sample_latents(labels, 3, range(3), 10)
-        assert torch.equal(together, again), name  # nothing is left over from the run before
+        assert torch.equal(together, again), name  # no state remains from the previous run
     assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
     pipeline.use_sampler("dpm++")  # after the one of its kind that draws noise
     assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
@@ -77,7 +77,7 @@ def test_every_sampler_gives_a_scene_of_its_own_whatever_stands_beside_it(pipeli
     pipeline.use_sampler("ddpm")
 
 
-def test_a_saved_pipeline_comes_back_with_its_sampler(pipeline, tmp_path):
+def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
     pipeline.use_sampler("dpm++")
     pipeline.save_pretrained(tmp_path)
     again = PrITTIPipeline.from_pretrained(tmp_path, low_cpu_mem_usage=False)
@@ -91,7 +91,7 @@ def test_a_saved_pipeline_comes_back_with_its_sampler(pipeline, tmp_path):
         assert same(*pair)
 
 
-def test_scaled_noise_is_the_pipelines_own_and_leaves_the_papers_sampler_alone(pipeline, tmp_path):
+def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
 
     def drawn(sampler, of=pipeline, **options):
         of.use_sampler(sampler)
@@ -112,11 +112,11 @@ def test_scaled_noise_is_the_pipelines_own_and_leaves_the_papers_sampler_alone(p
     pipeline.use_sampler("ddpm")
 
 
-def test_what_is_in_a_scene_is_what_is_more_probable_than_the_pipelines_threshold(pipeline, tmp_path):
+def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
     latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.identity("run", 0, 0, "low")]
     (everything,) = pipeline.decode(latents, identities, 1e-6)
     existence = np.sort(everything.existence)
-    gap = np.argmax(np.diff(existence))  # far from any primitive: what is saved and loaded may round otherwise
+    gap = np.argmax(np.diff(existence))  # away from any primitive, whose existence may round differently after loading
     middle = float(existence[gap : gap + 2].mean())
     (probable,) = pipeline.decode(latents, identities, middle)
     assert 0 < len(probable) < len(everything) and probable.existence.min() > middle
@@ -133,7 +133,7 @@ def test_what_is_in_a_scene_is_what_is_more_probable_than_the_pipelines_threshol
         pipeline.generate(["low"], **asked, existence_threshold=30)
 
 
-def test_guided_resampling_takes_the_pipelines_scaling_and_the_papers_none(pipeline):
+def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
     mask = torch.zeros(1, *pipeline.lvae.latent_shape)
     mask[..., :4] = 1
 
@@ -150,8 +150,8 @@ def test_guided_resampling_takes_the_pipelines_scaling_and_the_papers_none(pipel
         Resampling(eta=2)
 
 
-def test_scaling_undoes_what_a_model_says_too_much():
-    """Of Gaussian data the noise is known: a model that says 1 % more of it than there is draws too little deviation."""
+def test_noise_scaling_corrects_overestimated_noise():
+    """For Gaussian data the noise is known. A model that predicts 1 % too much noise samples too small a deviation."""
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar).float()
 
     def model(excess):
@@ -174,7 +174,7 @@ def test_scaling_undoes_what_a_model_says_too_much():
 # ------------------------------------------------------------------------------------------------------ conventions
 
 
-def test_a_generator_draws_the_seeds(pipeline):
+def test_pipeline_draws_seeds_from_generator(pipeline):
     def generate(**options):
         return pipeline.generate(["low", "high"], num_inference_steps=4, **options)
 
@@ -191,7 +191,7 @@ def test_a_generator_draws_the_seeds(pipeline):
         generate(generator=[seeded(0)] * 3)
 
 
-def test_the_callback_sees_every_step_and_may_change_latents(pipeline):
+def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
     seen = []
 
     def watch(pipe, step, timestep, inputs):
@@ -213,7 +213,7 @@ def test_the_callback_sees_every_step_and_may_change_latents(pipeline):
 # ------------------------------------------------------------------------------------------------------- inpainting
 
 
-def test_polygons_are_shapelys():
+def test_polygon_region_equals_shapely():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     for corners in ([(10, -20), (50, 0), (30, 25)], [(5, -30), (60, -30), (20, 0), (60, 30), (5, 30)]):
@@ -225,7 +225,7 @@ def test_polygons_are_shapelys():
             polygon_region(grid, bad)
 
 
-def test_half_planes_and_objects_lie_where_they_are_said_to():
+def test_half_plane_and_object_regions_lie_where_stated():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     ahead = half_plane_region(grid, (2, 0), 40)
     assert np.array_equal(ahead, np.broadcast_to(grid.x_m()[:, None] >= 40, ahead.shape))
@@ -244,7 +244,7 @@ def test_half_planes_and_objects_lie_where_they_are_said_to():
         object_region(scene, [30])
 
 
-def test_a_region_grows_to_whole_cells():
+def test_region_grows_to_whole_cells():
     region = np.zeros((32, 32), bool)
     region[5, 30] = True
     assert np.argwhere(cells_of(region, 8)).tolist() == [[1, 7]]
@@ -258,7 +258,7 @@ def test_a_region_grows_to_whole_cells():
 
 
 @pytest.mark.parametrize("contents", ["both", "ground", "objects"])
-def test_inpainting_keeps_the_rest(pipeline, contents):
+def test_inpaint_keeps_the_rest(pipeline, contents):
     scene = random_scene(2, n=30, grid=SPEC.grid)
     region = half_plane_region(SPEC.grid, (1, 0), 32.0)
     (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK)
@@ -276,8 +276,8 @@ def test_inpainting_keeps_the_rest(pipeline, contents):
     assert behind and centers == behind | ahead
 
 
-def test_given_ground_is_decoded_the_same_to_the_last_bit(pipeline):
-    """Objects on a given ground: its channels are given, and its decoder reads no others."""
+def test_inpaint_decodes_given_ground_exactly(pipeline):
+    """Inpaints objects on known ground: the ground decoder reads only the known ground channels."""
     scene = random_scene(5, n=30, grid=SPEC.grid)
     whole = np.ones((32, 32), bool)
     (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", resampling=QUICK, composite=False)
@@ -286,7 +286,7 @@ def test_given_ground_is_decoded_the_same_to_the_last_bit(pipeline):
     assert not same(raw, rebuilt)
 
 
-def test_the_known_latent_comes_back_bit_for_bit(pipeline):
+def test_inpaint_returns_known_latent_exactly(pipeline):
     scene = random_scene(6, n=30, grid=SPEC.grid)
     known = pipeline.encode([scene])
     mask = latent_mask([polygon_region(SPEC.grid, [(10, -20), (50, 0), (30, 25)])], pipeline.lvae.latent_shape, "both")
@@ -296,13 +296,13 @@ def test_the_known_latent_comes_back_bit_for_bit(pipeline):
     assert (latents[~kept] != known[~kept]).all()
 
 
-def test_scenes_off_the_models_grid_are_refused(pipeline):
+def test_inpaint_rejects_scenes_off_model_grid(pipeline):
     scene = random_scene(0, grid=replace(SPEC.grid, front_m=70.0))
     with pytest.raises(ValueError, match=r"scene test-0000 has .* the model needs"):
         pipeline.inpaint([scene], [np.ones((32, 32), bool)], ["low"])
 
 
-def test_a_mixed_latent_has_no_ground_of_its_own():
+def test_inpaint_rejects_objects_only_for_mixed_latent():
     architecture = LVAE_PRESETS["smoke"].architecture() | {"split_latent": False}
     lvae = LayoutVAE(layout=SPEC.to_dict(), **architecture)
     channels, size, _ = lvae.latent_shape
@@ -311,7 +311,7 @@ def test_a_mixed_latent_has_no_ground_of_its_own():
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
 
 
-def test_compositing_nothing_changes_nothing():
+def test_composite_of_nothing_changes_nothing():
     scene, other = random_scene(0, n=20, grid=SPEC.grid), random_scene(1, n=20, grid=SPEC.grid)
     nothing, everything = np.zeros((32, 32), bool), np.ones((32, 32), bool)
     assert same(composited(scene, other, nothing, "both"), scene)
@@ -320,7 +320,7 @@ def test_compositing_nothing_changes_nothing():
     assert same(both, other)
 
 
-def test_an_object_that_is_decoded_across_the_border_is_not_there_twice():
+def test_composite_does_not_repeat_object_across_border():
     scene = random_scene(0, n=1, grid=SPEC.grid)
     region = half_plane_region(SPEC.grid, (1, 0), 32.0)
     scene = replace(scene, center_m=np.array([[31.95, 0, 0]], np.float32))

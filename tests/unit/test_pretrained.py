@@ -7,14 +7,14 @@ import pytest
 from models.pretrained import CHECKSUMS, WEIGHTS, checksums, pipeline_path, released
 
 
-def test_a_password_in_the_tracking_uri_is_not_shown():
+def test_tracking_hides_password_of_uri():
     from jobs.support.tracking import shown
 
     assert shown("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
     assert shown("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
 
 
-def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_path, monkeypatch):
+def test_pipeline_directory_default_is_only_trained_or_released(tmp_path, monkeypatch):
     from jobs.support.options import pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
@@ -30,7 +30,7 @@ def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_
             pipeline_directory("")
 
 
-def test_a_command_is_told_without_paths_of_this_machine(monkeypatch):
+def test_provenance_command_hides_machine_paths(monkeypatch):
     from pipelines.runtime import provenance
 
     monkeypatch.setenv("PRITTI_HOME", "/data")
@@ -42,6 +42,6 @@ def test_a_command_is_told_without_paths_of_this_machine(monkeypatch):
     )
 
 
-def test_released_weights_are_what_their_checksums_say():
+def test_released_weights_match_checksums():
     for name in released():
         assert json.loads((WEIGHTS / name / CHECKSUMS).read_text()) == checksums(pipeline_path(name))

@@ -1,4 +1,4 @@
-"""The rasteriser is vertical ray casting: held against trimesh's ray caster (embree) and shapely."""
+"""The rasteriser equals vertical ray casting by trimesh (embree) and polygon filling by shapely."""
 
 import numpy as np
 import shapely
@@ -24,7 +24,7 @@ def random_triangles(rng: np.random.Generator, n: int) -> np.ndarray:
     return center + rng.normal(0, [6, 6, 0.5], (n, 3, 3))
 
 
-def test_cast_down_agrees_with_ray_casting():
+def test_cast_down_equals_ray_casting():
     rng = np.random.default_rng(0)
     grid = Grid()
     triangles = random_triangles(rng, 200)
@@ -38,7 +38,7 @@ def test_cast_down_agrees_with_ray_casting():
     assert ((hit[0] >= 0) == np.isfinite(height[0])).all()
 
 
-def test_of_equal_heights_the_last_triangle_wins():
+def test_cast_down_last_triangle_wins_ties():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     level = random_triangles(np.random.default_rng(3), 60)
     level[..., 2] = 1.5
@@ -48,7 +48,7 @@ def test_of_equal_heights_the_last_triangle_wins():
     assert np.array_equal(hit[0], np.where(alone, np.arange(60)[:, None, None], -1).max(axis=0))
 
 
-def test_layers_are_cast_apart():
+def test_cast_down_separates_layers():
     rng = np.random.default_rng(1)
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     triangles, layer = random_triangles(rng, 60), rng.integers(0, 3, 60)
@@ -60,7 +60,7 @@ def test_layers_are_cast_apart():
     assert not np.isfinite(together[3]).any()
 
 
-def test_abutting_triangles_leave_no_crack():
+def test_cast_down_leaves_no_crack_between_triangles():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     corners = np.array([[0, -32, 0], [64, -32, 0], [64, 32, 0], [0, 32, 0]], float)
     for centre in ([32.5, 0.5, 0], [10.1, 3.7, 0], [31.5, -7.5, 0]):
@@ -68,7 +68,7 @@ def test_abutting_triangles_leave_no_crack():
         assert np.isfinite(cast_down(fan, grid)[0]).all()
 
 
-def test_nothing_to_cast():
+def test_cast_down_accepts_no_triangles():
     grid = Grid(rows=8, cols=8, resolution_m=1.0)
     vertical = np.array([[[5, 0, 0], [5, 1, 0], [5, 0, 3]]], float)
     for triangles in (np.zeros((0, 3, 3)), vertical, vertical + 500):
@@ -76,7 +76,7 @@ def test_nothing_to_cast():
         assert not np.isfinite(height).any() and (hit == -1).all()
 
 
-def test_polygon_fill_agrees_with_shapely():
+def test_polygon_fill_equals_shapely():
     rng = np.random.default_rng(2)
     grid = Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")

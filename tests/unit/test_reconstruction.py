@@ -1,4 +1,4 @@
-"""Reconstruction scored scene by scene and by the Ray graph, with a model that changes nothing and one that knows nothing."""
+"""Reconstruction scores of single scenes, with a perfect decoder and with an untrained model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +32,7 @@ SPEC = replace(
 
 
 def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
-    """What a decoder without fault would say."""
+    """The output of a perfect decoder."""
     layout = compact_layout(scene, spec)
     return DecodedLayout(
         occupancy=layout["occupied"].astype(np.float32),
@@ -47,7 +47,7 @@ def record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> Scen
     return scene_record(scene, layout, LATENT, spec, voxel_grid(spec))
 
 
-def test_a_perfect_decoder_scores_one():
+def test_reconstruction_of_perfect_decoder_scores_one():
     scenes = [random_scene(k, n=60, tilt_rad=0.1) for k in range(2)]
     got = reconstruction_scores([record(s, perfect(s, SPEC)) for s in scenes], SPEC, voxel_grid(SPEC))
     assert got["ground_iou"] == got["ground_mean_iou"] == 1 and got["height_rmse_m"] < 1e-4
@@ -61,7 +61,7 @@ def test_a_perfect_decoder_scores_one():
     assert got["truths"] == {k: v for k, v in got["truths"].items() if v} and sum(got["truths"].values()) == 120
 
 
-def test_what_a_coarse_raster_costs_is_told_apart():
+def test_reconstruction_separates_cost_of_coarse_raster():
     coarse, scenes = SPEC.with_resolution(SPEC.grid.rows // 2), [random_scene(k, n=30) for k in range(2)]
     records = [record(s, perfect(s, coarse), coarse) for s in scenes]
     got = reconstruction_scores(records, coarse, voxel_grid(coarse))
@@ -69,17 +69,17 @@ def test_what_a_coarse_raster_costs_is_told_apart():
     assert got["raster_height_rmse_m"] < 1e-4
 
 
-def test_ground_errors_are_metres_over_truly_occupied_pixels():
+def test_reconstruction_ground_errors_are_in_meters():
     scene = random_scene(0, n=30)
     exact = perfect(scene, SPEC)
     raised = replace(exact, height=exact.height + 0.3 / 6.0, occupancy=np.zeros_like(exact.occupancy))
     got = reconstruction_scores([record(scene, raised)], SPEC, voxel_grid(SPEC))
-    assert got["ground_iou"] == 0  # nothing claimed, and heights count all the same
+    assert got["ground_iou"] == 0  # no occupied pixel is predicted; height errors count nevertheless
     assert got["height_rmse_m"] == pytest.approx(0.3, abs=1e-4) and got["height_mae_m"] == pytest.approx(0.3, abs=1e-4)
     assert got["height_mse_normalised"] == pytest.approx((0.3 / 6) ** 2, rel=1e-3)
 
 
-def test_primitives_without_a_slot_count_as_missed():
+def test_reconstruction_counts_primitives_without_slot_as_missed():
     scene = random_scene(1, n=60, tilt_rad=0.1)
     few = replace(SPEC, slots=(1,) * 11)
     got = reconstruction_scores([record(scene, perfect(scene, few), few)], few, voxel_grid(few))
@@ -88,7 +88,7 @@ def test_primitives_without_a_slot_count_as_missed():
     assert got["matched"]["right"] == 1
 
 
-def test_a_record_survives_its_row():
+def test_reconstruction_record_round_trips():
     scene = random_scene(2, n=20)
     one = record(scene, perfect(scene, SPEC))
     again = SceneRecord.from_row(one.to_row())
@@ -100,7 +100,7 @@ def test_a_record_survives_its_row():
     np.testing.assert_array_equal(one.memory, again.memory)
 
 
-def test_a_scene_without_anything_is_scored(tmp_path):
+def test_reconstruction_scores_empty_scene(tmp_path):
     scene = random_scene(3, n=0)
     empty = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
     full = random_scene(4, n=30)
@@ -115,20 +115,20 @@ def selection(root: Path) -> Selection:
     return Selection(str(root), "town", "test")
 
 
-def test_chunks_cover_a_selection_once(reconstruction_dataset):
+def test_reconstruction_chunks_cover_selection_once(reconstruction_dataset):
     chunks = chunks_of(selection(reconstruction_dataset), 3)
     assert [rows for _, rows in chunks] == [[0, 1, 2], [3, 4, 5], [6], [0, 1, 2], [3]]
     assert [shard.number for shard, _ in chunks] == [0, 0, 0, 1, 1]
 
 
-def test_bytes_of_tables_are_those_on_disk(reconstruction_dataset):
+def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
     files = [p for p in reconstruction_dataset.rglob("*.parquet")]
     assert table_bytes(chunks_of(selection(reconstruction_dataset), 3)) == pytest.approx(
         sum(p.stat().st_size for p in files) / 11
     )
 
 
-def test_one_mlflow_run_per_output_directory(tmp_path, monkeypatch):
+def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch):
     from jobs.support.tracking import client, publish_scores, tracking_uri
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))

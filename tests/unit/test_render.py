@@ -1,4 +1,4 @@
-"""Pictures show what trimesh's rays hit."""
+"""Rendered pictures show what rays cast by trimesh hit."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def literal(scene: Scene, view: Grid) -> np.ndarray:
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.05, np.pi])
 @pytest.mark.parametrize("rows, cols, size_px", [(32, 32, 32), (32, 32, 50), (24, 48, 30), (37, 25, 37)])
-def test_bev_equals_testing_every_primitive_at_every_pixel(tilt_rad, rows, cols, size_px):
+def test_bev_equals_brute_force(tilt_rad, rows, cols, size_px):
     for seed in range(4):
         grid = Grid(front_m=40, left_m=10, resolution_m=0.5, rows=rows, cols=cols)
         low, high = [grid.back_m, grid.right_m, -2], [grid.front_m, grid.left_m, 3]
@@ -58,7 +58,7 @@ def test_bev_equals_testing_every_primitive_at_every_pixel(tilt_rad, rows, cols,
         np.testing.assert_array_equal(bev_picture(scene, size_px, supersample=2), np.round(blocks.mean(axis=(1, 3))))
 
 
-def test_of_equal_heights_the_ground_then_the_last_box_is_shown():
+def test_bev_breaks_ties_by_ground_then_last_box():
     grid = Grid(front_m=4, left_m=4, resolution_m=0.5, rows=16, cols=16)
     car, bus, pole = (CATEGORY_INDEX[name] for name in ("vehicle_small", "vehicle_big", "pole"))
     upright = replace(random_scene(0, 5, grid), rotation=np.tile(np.eye(3, dtype=np.float32), (5, 1, 1)))
@@ -78,7 +78,7 @@ def test_of_equal_heights_the_ground_then_the_last_box_is_shown():
         return picture[row, col].tolist()
 
     ground = CLASS_COLORS[ground_ids(scene)[-2]].tolist()
-    assert shown(-2, -2) == ground and shown(-3.9, 3.9) == ground  # a car as high as the ground, and no car
+    assert shown(-2, -2) == ground and shown(-3.9, 3.9) == ground  # a car as high as the ground; the ground is shown
     assert shown(0.25, 0.25) == shown(1.25, 0.25) == CLASS_COLORS[CATEGORY_IDS[bus]].tolist()
     assert shown(-0.75, 0.25) == CLASS_COLORS[CATEGORY_IDS[car]].tolist()  # the ellipsoid's top is no higher
     assert shown(3.25, 3.25) == CLASS_COLORS[CATEGORY_IDS[pole]].tolist()
@@ -86,7 +86,7 @@ def test_of_equal_heights_the_ground_then_the_last_box_is_shown():
 
 
 @pytest.mark.parametrize("elevation_deg", [90, 38])
-def test_ellipsoids_over_a_surface_are_those_cast_above_it(elevation_deg):
+def test_bev_shows_ellipsoids_above_surface(elevation_deg):
     scene = random_scene(0, 300, tilt_rad=np.pi)
     camera = looking_at(scene.grid, 200, 150, 30, elevation_deg)
     depth, _ = cast_ellipsoids(scene, camera)
@@ -97,7 +97,7 @@ def test_ellipsoids_over_a_surface_are_those_cast_above_it(elevation_deg):
         np.testing.assert_array_equal(over, depth > surface)
 
 
-def test_bev_shows_what_vertical_rays_hit():
+def test_bev_equals_vertical_rays():
     scene = example_scene(80)
     corners, class_id, _ = scene_triangles(scene)
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
@@ -114,7 +114,7 @@ def test_bev_shows_what_vertical_rays_hit():
     assert same[objects].mean() > 0.998
 
 
-def test_bev_of_bare_ground_is_the_fused_raster():
+def test_bev_of_bare_ground_is_fused_raster():
     scene = example_scene(0)
     _, winner = scene.surface()
     assert np.array_equal(bev_picture(scene), CLASS_COLORS[ground_ids(scene)[winner]])
@@ -127,21 +127,21 @@ def test_bev_is_deterministic_and_white_where_empty():
 
 
 @pytest.mark.parametrize("rows, cols, shape", [(256, 256, (256, 256)), (512, 256, (256, 128)), (384, 512, (192, 256))])
-def test_bev_fills_the_picture_for_any_grid(rows, cols, shape):
+def test_bev_fills_picture_for_any_grid(rows, cols, shape):
     grid = Grid(front_m=64 + 32, left_m=32 + 8, rows=rows, cols=cols)
     picture = bev_picture(example_scene(150, grid))
     assert picture.shape == (*shape, 3) and picture.dtype == np.uint8
     assert (picture[[0, -1]] < 255).any(axis=(1, 2)).all()
 
 
-def test_supersampling_keeps_the_mean_colour():
+def test_bev_supersampling_keeps_mean_color():
     scene = example_scene()
     fine, coarse = bev_picture(scene, 512), bev_picture(scene, 256, supersample=2)
     assert coarse.shape == (256, 256, 3)
     assert np.abs(fine.mean(axis=(0, 1)) - coarse.mean(axis=(0, 1))).max() < 0.5
 
 
-def test_ellipsoids_are_cast_exactly():
+def test_cast_ellipsoids_is_exact():
     scene = example_scene(220)
     scene = scene.select(scene.category == ELLIPSOID)
     grid = Grid(resolution_m=0.5, rows=128, cols=128)
@@ -157,17 +157,17 @@ def test_ellipsoids_are_cast_exactly():
     assert np.allclose(own, 0.5, atol=1e-6)  # on the surface of the one hit
     homogeneous[:, 2] += 1e-3
     radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
-    assert (radius > 0.5 - 1e-6).all()  # and above every other
+    assert (radius > 0.5 - 1e-6).all()  # and above all others
 
 
-def test_nothing_round_to_cast():
+def test_cast_ellipsoids_accepts_none():
     scene = empty_scene()
     height, index = cast_ellipsoids(scene, looking_down(scene.grid))
     assert not np.isfinite(height).any() and (index == -1).all()
     assert len(cuboid_triangles(scene).corners_m) == 0
 
 
-def test_camera_turns_without_mirroring_and_frames_the_grid():
+def test_camera_does_not_mirror_and_frames_grid():
     grid = Grid()
     above = looking_at(grid, 640, 480, azimuth_deg=0, elevation_deg=90)
     assert np.allclose(above.camera_from_scene, np.eye(3), atol=1e-12)
@@ -181,7 +181,7 @@ def test_camera_turns_without_mirroring_and_frames_the_grid():
         looking_at(grid, 640, 480, 30, 0)
 
 
-def test_oblique_ellipsoids_are_where_their_meshes_are():
+def test_oblique_view_ellipsoids_match_their_meshes():
     scene = example_scene(60)
     scene = scene.select(scene.category == ELLIPSOID)
     camera = looking_at(scene.grid, 200, 150, 30, 38)
@@ -196,7 +196,7 @@ def test_oblique_ellipsoids_are_where_their_meshes_are():
     assert (np.append(primitive, -1)[first].reshape(hit.shape) == hit).mean() > 0.998
 
 
-def test_3d_picture_has_soft_light_and_is_deterministic():
+def test_picture_3d_has_soft_light_and_is_deterministic():
     scene = example_scene(40)
     picture = picture_3d(scene, 240, 180)
     assert picture.shape == (180, 240, 3) and picture.dtype == np.uint8
@@ -204,7 +204,7 @@ def test_3d_picture_has_soft_light_and_is_deterministic():
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
 
 
-def test_level_ground_in_the_sun_has_its_palette_colour():
+def test_picture_3d_sunlit_level_ground_has_palette_color():
     picture = picture_3d(example_scene(0), 240, 180).reshape(-1, 3).astype(int)
     for name in ("road", "sidewalk", "terrain"):
         color = CLASS_COLORS[{"road": 5, "sidewalk": 3, "terrain": 2}[name]].astype(int)
@@ -212,14 +212,14 @@ def test_level_ground_in_the_sun_has_its_palette_colour():
 
 
 @pytest.mark.parametrize("rows, cols", [(256, 256), (384, 512)])
-def test_3d_picture_of_empty_and_of_stitched_scenes(rows, cols):
+def test_picture_3d_accepts_empty_and_stitched_scenes(rows, cols):
     grid = Grid(front_m=96, left_m=cols / 8, rows=rows, cols=cols)
     for n in (0, 30):
         assert picture_3d(example_scene(n, grid), 160, 120).std() > 5
     assert picture_3d(empty_scene(), 160, 120).shape == (120, 160, 3)
 
 
-def test_contact_sheet():
+def test_contact_sheet_arranges_pictures():
     pictures = [np.full((40, 60, 3), value, np.uint8) for value in (0, 80, 160)]
     sheet = contact_sheet(pictures, 2)
     assert sheet.shape == (2 * 40 + 3 * 12, 2 * 60 + 3 * 12, 3)

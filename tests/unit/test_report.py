@@ -1,4 +1,4 @@
-"""A report is one well-formed page with everything inside."""
+"""A report is one well-formed, self-contained page."""
 
 import base64
 import io
@@ -40,7 +40,7 @@ def sections():
     ]
 
 
-def test_page_is_well_formed_and_escaped(sections):
+def test_report_page_is_well_formed_and_escaped(sections):
     page = Page(report_html("A & B <demo>", sections, "sub < title"))
     assert not page.all("script") and not page.all("link") and not page.all("i") and not page.all("b")
     for text in (
@@ -57,13 +57,13 @@ def test_page_is_well_formed_and_escaped(sections):
     assert {attrs["href"][1:] for attrs in page.all("a")} == anchors and len(anchors) == len(sections)
 
 
-def test_nothing_is_fetched(sections):
+def test_report_page_is_self_contained(sections):
     html = report_html("Demo", sections)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
     assert all(url.startswith("data:") for url in re.findall(r'src="([^"]+)"', html))
 
 
-def test_pictures_survive(sections):
+def test_report_keeps_pictures(sections):
     flat, shaded = (picture.image for picture in sections[2].pictures)
     sources = [attrs["src"] for attrs in Page(report_html("Demo", sections)).all("img")]
     assert sources[0].startswith("data:image/png;") and sources[1].startswith("data:image/webp;")
@@ -74,13 +74,13 @@ def test_pictures_survive(sections):
     assert decoded[1].shape == shaded.shape and np.abs(decoded[1].astype(int) - shaded).mean() < 4
 
 
-def test_report_is_written_whole(tmp_path, sections):
+def test_write_report_is_atomic(tmp_path, sections):
     write_report(tmp_path / "report.html", "Demo", sections)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text("utf-8") == report_html("Demo", sections)
 
 
-def test_table_that_does_not_fit_is_refused():
+def test_report_rejects_table_of_wrong_shape():
     with pytest.raises(ValueError, match="2 columns, a row has 1"):
         report_html("Demo", [Table("T", ["a", "b"], [["x"]])])
     with pytest.raises(ValueError, match="1 rows and 2 meanings"):
@@ -94,7 +94,7 @@ def polylines(svg):
     ]
 
 
-def test_chart_draws_lines_where_the_values_are():
+def test_chart_draws_lines_at_values():
     (line,) = polylines(chart_svg(Chart("c", {"a": ([0, 1, 2], [0, 5, 10])})))
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
     assert (np.diff(line[:, 1]) < 0).all()
@@ -102,7 +102,7 @@ def test_chart_draws_lines_where_the_values_are():
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
 
 
-def test_chart_leaves_out_what_cannot_be_drawn():
+def test_chart_omits_undrawable_values():
     chart = Chart("c", {"a": ([0, 1, 2, 3, 4], [1, np.nan, 0, -1, 10])}, log_y=True)
     (line,) = polylines(chart_svg(chart))
     assert len(line) == 2
@@ -113,7 +113,7 @@ def test_chart_leaves_out_what_cannot_be_drawn():
         chart_svg(Chart("c", {"a": ([1, 2], [1])}))
 
 
-def test_long_series_are_thinned_and_smoothed():
+def test_chart_thins_and_smooths_long_series():
     y = np.sin(np.arange(10_000) / 2000)
     faint, mean = polylines(chart_svg(Chart("c", {"a": (np.arange(10_000), y)})))
     assert len(faint) <= 600 and len(mean) <= 600
@@ -121,14 +121,14 @@ def test_long_series_are_thinned_and_smoothed():
 
 
 @pytest.mark.parametrize("low, high", [(0, 1), (-3, 17), (5, 5), (0, 0), (1e-7, 3e-7), (0.99, 123456)])
-def test_ticks_enclose_the_data(low, high):
+def test_ticks_enclose_data(low, high):
     values = ticks(low, high)
     assert values[0] <= low and values[-1] >= high and 2 <= len(values) <= 8
     assert np.allclose(np.diff(values), values[1] - values[0])
 
 
 @pytest.mark.parametrize("low, high", [(0.1, 10), (0.0023, 0.9), (3, 3), (1, 1), (1e-9, 1e6), (2.1, 3.9)])
-def test_log_ticks_enclose_the_data(low, high):
+def test_log_ticks_enclose_data(low, high):
     values = log_ticks(low, high)
     assert values[0] <= low * (1 + 1e-9) and values[-1] >= high * (1 - 1e-9) and 2 <= len(values) <= 9
 
@@ -147,5 +147,5 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("value, written", NUMBERS.items())
-def test_numbers_are_written_short(value, written):
+def test_number_is_formatted_short(value, written):
     assert number(value) == written

@@ -1,4 +1,4 @@
-"""A run's name stands for one set of options, unless nothing has come of it."""
+"""The name of a run is bound to its options as soon as the run has written scenes."""
 
 import json
 
@@ -10,19 +10,19 @@ from pipelines.schema.run_guard import claim
 from pipelines.schema.tables import Shard, rejects_table
 
 
-def test_a_run_that_wrote_nothing_gives_its_name_free(tmp_path):
+def test_run_guard_releases_name_of_empty_run(tmp_path):
     root, first, second = str(tmp_path), {"steps": 0, "labels": ("low",)}, {"steps": 20, "labels": ("low",)}
     claim(root, "generated-a", "a", first)
     rejects = Shard(root, "generated-a", "generated", 0).path("rejects")
     storage.write_parquet(rejects_table([]), rejects)
-    claim(root, "generated-a", "a", first)  # the same again keeps all
+    claim(root, "generated-a", "a", first)  # the same options keep everything
     assert storage.exists(rejects)
     claim(root, "generated-a", "a", second)
     assert not storage.exists(rejects)
     assert json.loads((tmp_path / "generated-a.json").read_text()) == {"steps": 20, "labels": ["low"]}
 
 
-def test_a_run_with_scenes_or_parts_of_them_keeps_its_name(tmp_path):
+def test_run_guard_keeps_name_of_run_with_output(tmp_path):
     root = str(tmp_path)
     claim(root, "generated-a", "a", {"steps": 10})
     Shard(root, "generated-a", "generated", 0).write([random_scene()])

@@ -7,7 +7,7 @@ import numpy as np
 from pipelines.schema.tables import read_scenes
 
 
-def test_what_is_sampled_can_be_repaired(tmp_path):
+def test_sampler_repairs_sampled_scenes(tmp_path):
     from jobs.support.options import pipeline_directory
     from pipelines.generation.sample import Sampler, SampleRequest
     from pipelines.metrics.validity import SLAB_OFFSET_M, faults

@@ -17,7 +17,7 @@ def same_corners(a, b):
     return distance.min(axis=2).max() < 1e-6
 
 
-def test_canonical_boxes_are_the_same_boxes():
+def test_canonical_boxes_keep_corners():
     rng = np.random.default_rng(0)
     rotation, size = random_rotations(rng, 500), rng.uniform(0.1, 9, (500, 3))
     rotation[::3, :, 0] *= -1  # mirrored boxes
@@ -32,7 +32,7 @@ def test_canonical_boxes_are_the_same_boxes():
     assert np.allclose(again[0], canonical) and np.allclose(again[1], lwh)
 
 
-def test_yaw_of_exact_quarter_turns_stays_in_range():
+def test_yaw_of_quarter_turns_is_in_range():
     for quarter in range(4):
         angle = quarter * np.pi / 2
         rotation = np.round([[[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]])
@@ -40,7 +40,7 @@ def test_yaw_of_exact_quarter_turns_stays_in_range():
         assert -np.pi / 2 <= yaw[0] < np.pi / 2
 
 
-def test_scatter_matrix_round_trip():
+def test_scatter_matrix_round_trips():
     rng = np.random.default_rng(1)
     rotation, size = random_rotations(rng, 1000), rng.uniform(0.05, 30, (1000, 3))
     parameters = cholesky_parameters(rotation, size)
@@ -48,17 +48,17 @@ def test_scatter_matrix_round_trip():
     back_rotation, back_size = boxes_from_cholesky(parameters)
     assert np.allclose(scatter_matrix(back_rotation, back_size), scatter_matrix(rotation, size), atol=1e-9)
     assert np.allclose(np.linalg.det(back_rotation), 1)
-    # Unlike quaternions: the same for R and its mirrored and turned twins.
+    # Unlike quaternions, equal for R and its mirrored and rotated equivalents.
     assert np.allclose(cholesky_parameters(rotation * [-1, -1, 1], size), parameters)
 
 
-def test_any_six_numbers_are_a_box():
+def test_cholesky_decodes_any_six_numbers():
     rotation, size = boxes_from_cholesky(np.array([[0.0] * 6, [-1, 2, 0, 3, -4, 1e-9], [1, 0, 1, 0, 0, 1]]))
     assert np.isfinite(rotation).all() and (size >= 0.01).all()
     assert np.allclose(np.linalg.det(rotation), 1)
 
 
-def test_grid_pixels_and_centres_agree():
+def test_grid_pixels_and_centers_agree():
     grid = Grid()
     assert grid.x_m()[0] == 63.875 and grid.y_m()[0] == 31.875 and grid.x_m()[-1] == 0.125
     row, col = grid.pixel(grid.x_m(), grid.y_m())
@@ -66,7 +66,7 @@ def test_grid_pixels_and_centres_agree():
     assert grid.contains(np.array([64.0, 0.0, 32.0]), np.array([32.0, 0.0, -32.0])).tolist() == [True, False, False]
 
 
-def test_surface_is_the_highest_class():
+def test_surface_is_highest_class():
     scene = random_scene(3)
     height, winner = scene.surface()
     for row, col in ((0, 0), (100, 37), (200, 200)):
@@ -78,7 +78,7 @@ def test_surface_is_the_highest_class():
             assert winner[row, col] == best and height[row, col] == scene.height_m[best, row, col]
 
 
-def test_move_and_crop_invert_each_other():
+def test_move_and_crop_are_inverse():
     scene = random_scene(4)
     there = Grid(front_m=96.0, left_m=32.0)
     ahead = scene.cropped(there)
@@ -91,7 +91,7 @@ def test_move_and_crop_invert_each_other():
         scene.cropped(Grid(front_m=64.1))
 
 
-def test_merge_gives_every_pixel_and_primitive_one_owner():
+def test_merge_assigns_one_owner_per_pixel_and_primitive():
     a, b = random_scene(5), random_scene(6)
     left = np.zeros((256, 256), bool)
     left[:, :128] = True
@@ -101,7 +101,7 @@ def test_merge_gives_every_pixel_and_primitive_one_owner():
     assert len(joined) == (a.center_m[:, 1] > 0).sum() + (b.center_m[:, 1] <= 0).sum()
 
 
-def test_enlarged_cells_cover_the_grid_in_blocks():
+def test_enlarged_cells_cover_grid_in_blocks():
     grid = Grid(8.0, 3.0, 1.0, 8, 6)
     large = grid.enlarged(np.array([[1, 2, 3], [4, 5, 6]]))
     assert large.shape == (8, 6) and (large[:4, 2:4] == 2).all() and (large[4:, :2] == 4).all()

@@ -1,4 +1,4 @@
-"""Which scenes are taken: against brute force, at the borders, over several worlds."""
+"""Subsets of scenes: compared with brute force, in corner cases and over several worlds."""
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,7 @@ def test_farthest_poses_equal_brute_force():
         expected.append(int(nearest.argmax()))
     assert farthest(xy, world, 80).tolist() == expected
     assert farthest(xy, world, 7).tolist() == expected[:7]
-    assert sorted(farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all in one place
+    assert sorted(farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all at the same position
 
 
 @pytest.mark.parametrize("apart_m", [0.5, 3.0, 40.0, 1e6])
@@ -35,7 +35,7 @@ def test_poses_apart_equal_brute_force(apart_m):
 
 
 @pytest.mark.parametrize("count", range(1, 16))
-def test_labels_come_in_equal_parts_as_far_as_they_go(count):
+def test_balanced_subset_has_equal_labels_where_possible(count):
     labels = np.array(["low"] * 2 + ["medium"] * 8 + ["high"] * 5)
     chosen = balanced(labels, count)
     assert len(set(chosen.tolist())) == count
@@ -45,19 +45,19 @@ def test_labels_come_in_equal_parts_as_far_as_they_go(count):
     assert not others or max(taken.values()) - min(others) <= 1
 
 
-def test_evenly_spaced():
+def test_evenly_spreads_indices_over_range():
     assert evenly(10, 10).tolist() == list(range(10))
     assert evenly(10, 2).tolist() == [2, 7]
     assert len(evenly(5, 0)) == 0
 
 
-def test_drives_of_kitti360_share_a_world_and_others_do_not():
+def test_worlds_are_shared_by_kitti360_drives_only():
     table = pa.table({"sequence": ["a", "b"], "x_m": [0.0, 1.0], "y_m": [0.0, 0.0]})
     assert len(set(poses(table, np.array(["kitti360", "kitti360"]))[1])) == 1
     assert len(set(poses(table, np.array(["town", "town"]))[1])) == 2
 
 
-def test_a_selection_of_two_shards(tmp_path):
+def test_selection_reads_two_shards(tmp_path):
     scenes = [random_scene(seed) for seed in range(9)]
     Shard(str(tmp_path), "town", "train", 0).write(scenes[:4])
     Shard(str(tmp_path), "town", "train", 1).write(scenes[4:])
@@ -77,6 +77,6 @@ def test_a_selection_of_two_shards(tmp_path):
     ("options", "message"),
     [({"limit": 0}, "limit is 0"), ({"pick": "all"}, "pick is 'all'"), ({"pick": "apart"}, "apart_m is 0")],
 )
-def test_wrong_options_are_named(options, message):
+def test_selection_rejects_wrong_options(options, message):
     with pytest.raises(ValueError, match=message):
         Selection("nowhere", **options)

@@ -1,4 +1,4 @@
-"""New ground meets the known: edges and heights go on across the border, and far from it nothing is moved."""
+"""Generated ground is blended into known ground: edges and heights are continuous across the seam."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ REACH = round(REACH_M / GRID.resolution_m)
 
 
 def street(left_px: int, height_m: float):
-    """A road of 12 pixels from column `left_px` on, at a height; sidewalk left of it, 0.1 m higher; void right of it."""
+    """A road of 12 pixels from column `left_px`, with sidewalk on its left, 0.1 m higher, and void on its right."""
     height, occupied = np.zeros((len(KITTI_GROUND_CLASSES), 64, 64), np.float32), np.zeros((5, 64, 64), bool)
     for c, columns, up_m in ((ROAD, slice(left_px, left_px + 12), 0.0), (SIDEWALK, slice(0, left_px), 0.1)):
         occupied[c, :, columns], height[c, :, columns] = True, height_m + up_m
@@ -25,13 +25,13 @@ def street(left_px: int, height_m: float):
     return replace(scene, height_m=height, occupied=occupied)
 
 
-def test_a_street_that_was_drawn_aside_and_higher_goes_on():
+def test_blend_ground_aligns_shifted_street():
     known, made = street(20, 0.0), street(23, 0.2)
     bent = continued(made, known, NEW)
     for c in (ROAD, SIDEWALK):
         assert np.array_equal(bent.occupied[c, 31], known.occupied[c, 32])  # across the border: the same columns
         assert np.abs(bent.height_m[c, 31] - known.height_m[c, 32]).max() < 0.003
-    # Further ahead it turns into what was made, a pixel and a centimetre or two at a time.
+    # Further ahead it approaches the generated ground, by a pixel and one or two centimetres per row.
     left = bent.occupied[ROAD].argmax(axis=1)[:32]
     assert left[0] == 23 and left[31] == 20 and set(np.diff(left)) <= {0, -1}
     along = np.abs(np.diff(bent.height_m[ROAD, :32, 26]))
@@ -41,7 +41,7 @@ def test_a_street_that_was_drawn_aside_and_higher_goes_on():
     assert np.array_equal(bent.height_m[:, far], made.height_m[:, far])
 
 
-def test_a_step_that_was_drawn_at_the_border_is_left_out():
+def test_blend_ground_removes_step_at_seam():
     known, made = street(20, 0.0), street(20, 0.0)
     made.height_m[:, :32] += 0.3 * made.occupied[:, :32]
     bent = continued(made, known, NEW)
@@ -50,8 +50,8 @@ def test_a_step_that_was_drawn_at_the_border_is_left_out():
         assert np.allclose(bent.height_m[c, : 32 - REACH], made.height_m[c, : 32 - REACH])
 
 
-def test_a_class_that_begins_at_the_border_begins_at_the_height_of_the_known():
-    known, made = street(64, 0.3), street(64, 0.0)  # sidewalk all over: known 0.4 m high, drawn at 0.1
+def test_blend_ground_starts_new_class_at_known_height():
+    known, made = street(64, 0.3), street(64, 0.0)  # sidewalk everywhere: known at 0.4 m, generated at 0.1 m
     made.occupied[SIDEWALK, :32], made.occupied[ROAD, :32] = False, True
     made.height_m[SIDEWALK, :32], made.height_m[ROAD, :32] = 0, 0.1
     bent = continued(made, known, NEW)
@@ -60,7 +60,7 @@ def test_a_class_that_begins_at_the_border_begins_at_the_height_of_the_known():
     assert np.allclose(bent.height_m[ROAD, : 32 - REACH], 0.1)
 
 
-def test_known_pixels_and_those_that_agree_are_left_alone():
+def test_blend_ground_keeps_known_and_matching_pixels():
     known, made = street(20, 0.0), street(23, 0.2)
     bent = continued(made, known, NEW)
     for name in ("occupied", "height_m"):
@@ -73,24 +73,24 @@ def test_known_pixels_and_those_that_agree_are_left_alone():
 
 
 @pytest.mark.parametrize("mask", [np.zeros((64, 64), bool), np.ones((64, 64), bool)])
-def test_without_a_border_nothing_changes(mask):
+def test_blend_ground_without_seam_changes_nothing(mask):
     made = street(23, 0.2)
     assert continued(made, street(20, 0.0), mask) is made
 
 
-def test_a_road_that_ends_in_nothing_fades_out_and_leaves_no_height_behind():
+def test_blend_ground_fades_out_road_into_void():
     known, made = street(20, 0.0), street(20, 0.0)
     made = replace(made, occupied=made.occupied & False, height_m=made.height_m * 0)
     bent = continued(made, known, NEW)
     ahead = bent.occupied[ROAD, :32].any(axis=1)
     assert ahead[31] and not ahead[: 32 - REACH].any()
-    other = continued(known, made, NEW)  # the other way: void is known, a street was made
+    other = continued(known, made, NEW)  # the reverse: known void, generated street
     assert not other.occupied[:, 31].any() and np.array_equal(other.occupied[:, 0], known.occupied[:, 0])
     for scene in (bent, other):
         assert not scene.height_m[~scene.occupied].any()
 
 
-def test_objects_keep_their_height_above_the_ground():
+def test_blend_ground_keeps_object_height_above_ground():
     known, made = street(20, 0.0), street(20, 0.5)
     center = np.tile(np.float32([18.0, 3.0, 1.0]), (12, 1))
     center[6:, 0] = 31.0
@@ -101,7 +101,7 @@ def test_objects_keep_their_height_above_the_ground():
     assert (bent.center_m[:6, 2] < 0.75).all() and np.array_equal(bent.center_m[6:], made.center_m[6:])
 
 
-def test_what_is_not_known_yet_is_no_edge():
+def test_blend_ground_ignores_unknown_pixels():
     known = street(20, 0.0)
     half = replace(known, occupied=known.occupied & ~NEW, height_m=np.where(NEW, 0, known.height_m).astype(np.float32))
     for scene in (spread(half, NEW), spread(known, np.zeros_like(NEW))):

@@ -1,4 +1,4 @@
-"""The paper's split (supplement A), against a literal second telling of it and brute-force distances."""
+"""The split of the paper (supplement A) equals a literal second implementation and brute-force distances."""
 
 import logging
 
@@ -17,7 +17,7 @@ def winding_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray
 
 
 def by_the_book(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """The split as the supplement tells it, pose by pose."""
+    """The split of the supplement, computed pose by pose."""
     driven, label = 0.0, {}
     for sequence, positions in positions_by_sequence.items():
         for k in range(len(positions)):
@@ -40,7 +40,7 @@ def by_the_book(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[
     return {s: [label[s, k] for k in range(len(p))] for s, p in positions_by_sequence.items()}
 
 
-def test_split_follows_the_supplement_to_the_letter():
+def test_split_equals_literal_supplement():
     rng = np.random.default_rng(0)
     drives = {
         "0000": winding_drive(rng, 900, np.array([0.0, 0, 100])),
@@ -51,7 +51,7 @@ def test_split_follows_the_supplement_to_the_letter():
     assert {s: label.tolist() for s, label in split.items()} == by_the_book(drives)
 
 
-def test_no_train_pose_lies_within_5_m_of_a_test_pose_even_on_a_road_driven_both_ways():
+def test_split_keeps_train_poses_5_m_from_test_poses():
     there = np.column_stack([np.arange(0, 3000, 0.8), np.zeros(3750), np.zeros(3750)])
     back = there[:1500:-1] + np.array([0.3, 3.5, 0.0])
     split = split_poses({"0000": np.concatenate([there, back])})["0000"]
@@ -61,38 +61,38 @@ def test_no_train_pose_lies_within_5_m_of_a_test_pose_even_on_a_road_driven_both
     assert np.linalg.norm(train[:, None] - test[None], axis=2).min() > 5
 
 
-def test_a_straight_drive_gives_100_test_regions_of_15_m():
+def test_split_of_straight_drive_has_100_test_regions_of_15_m():
     positions = np.column_stack([np.arange(0, 20_000.0), np.zeros(20_000), np.zeros(20_000)])
     split = split_poses({"0000": positions})["0000"]
     starts = np.flatnonzero((split[1:] == "test") & (split[:-1] != "test"))
     assert len(starts) == 100
     assert abs((split == "test").sum() - 1500) <= 100
-    # 200 m segments: 5 m at their end and 5 m before the test region are nobody's, and 5 m more by removal
+    # 200 m segments: 5 m at their end and 5 m before the test region belong to no split; removal adds 5 m
     assert abs((split == "unused").sum() - 1000) <= 200
 
 
-def test_the_jump_between_sequences_counts_nothing():
+def test_split_ignores_jump_between_sequences():
     drive = np.column_stack([np.arange(0, 1000.0), np.zeros(1000), np.zeros(1000)])
     near = split_poses({"a": drive, "b": drive + np.array([1010, 0, 0])})
     far = split_poses({"a": drive, "b": drive + np.array([90_000, 0, 0])})
     assert all((near[s] == far[s]).all() for s in "ab")
 
 
-def test_a_car_that_waits_stays_in_its_segment():
+def test_split_keeps_waiting_car_in_its_segment():
     drive = np.repeat(np.column_stack([np.arange(0, 100.0), np.zeros(100), np.zeros(100)]), 3, axis=0)
     split = split_poses({"0000": drive})["0000"].reshape(100, 3)
     assert (split == split[:, :1]).all()
 
 
 @pytest.mark.parametrize(("total_m", "count"), [(10, 1), (99, 1), (100, 2), (320, 6), (5000, 100), (73_700, 100)])
-def test_short_drives_have_fewer_segments_and_say_so(total_m, count, caplog):
+def test_split_of_short_drive_has_fewer_segments_and_warns(total_m, count, caplog):
     with caplog.at_level(logging.WARNING):
         assert num_segments(total_m) == count
     assert ("instead of the paper's 100" in caplog.text) == (count < 100)
     assert ("nothing is left to train on" in caplog.text) == (total_m < 25)
 
 
-def test_no_split_trains_on_everything():
+def test_split_none_trains_on_everything():
     split = no_split({"a": np.zeros((3, 3)), "b": np.zeros((0, 3))})
     assert split["a"].tolist() == ["train"] * 3
     assert split["b"].tolist() == []
@@ -101,12 +101,12 @@ def test_no_split_trains_on_everything():
 @pytest.mark.parametrize(
     "positions", [np.zeros((0, 3)), np.zeros((1, 3)), np.zeros((5, 3)), np.array([[0, 0, 0], [1e4, 0, 0.0]])]
 )
-def test_degenerate_drives_are_labelled_all_the_same(positions):
+def test_split_labels_degenerate_drives(positions):
     split = split_poses({"a": positions, "b": np.zeros((0, 3))})
     assert len(split["a"]) == len(positions) and len(split["b"]) == 0
 
 
 @pytest.mark.parametrize("positions", [np.zeros((4, 2)), np.zeros(3), np.full((2, 3), np.nan)])
-def test_bad_positions_are_refused(positions):
+def test_split_rejects_invalid_positions(positions):
     with pytest.raises(ValueError, match="sequence 0007"):
         split_poses({"0007": positions})

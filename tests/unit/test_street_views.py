@@ -1,4 +1,4 @@
-"""Street views against rays cast at the same mesh, roads against lines that are known, OpenDRIVE against its schema."""
+"""Street views equal ray casting, centrelines equal known lines, and OpenDRIVE files follow the schema."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -39,10 +39,10 @@ def rays(camera: StreetCamera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_view_is_what_rays_meet(seed):
-    """embree on the whole mesh; ellipsoids, facets there and round here, by their own quadratic."""
+def test_street_view_equals_ray_casting(seed):
+    """Compares with embree on the whole mesh, and with the exact quadric where embree sees facets of ellipsoids."""
     scene = random_scene(seed, 60, tilt_rad=0.4)
-    # Rays are cast at outsides only, as the renderer's: a camera inside a box sees out of it.
+    # Rays hit outer faces only, as in the renderer: a camera inside a box sees out of it.
     camera = StreetCamera.at([1.0, 2.0, 3.0], 0.2, -0.1, SMALL)
     view, way = StreetRenderer(scene).view(camera), rays(camera)
     soup = scene_triangles(scene)
@@ -65,7 +65,7 @@ def test_a_view_is_what_rays_meet(seed):
         unit = (scene.rotation[index] * (2 / scene.size_m[index])).T.astype(float)
         d, p = directions @ unit.T, unit @ (scene.center_m[index] - camera.position_m)
         a, b, c = (d * d).sum(1), d @ p, p @ p - 1
-        if camera.local(scene.center_m[index])[2] < 3.5 or c < 0:  # beside the camera, or around it: left out
+        if camera.local(scene.center_m[index])[2] < 3.5 or c < 0:  # objects next to or around the camera are excluded
             continue
         inside = b * b - a * c
         near = np.where((inside > 0) & (b > 0), (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
@@ -79,7 +79,7 @@ def test_a_view_is_what_rays_meet(seed):
     assert (scene.category[view.primitive[view.primitive >= 0]] == ELLIPSOID).any()
 
 
-def test_normals_point_at_the_camera_and_every_call_is_the_same(town_scenes):
+def test_street_view_normals_face_camera_and_are_deterministic(town_scenes):
     camera = StreetCamera.at([2.0, 0.0, 1.2], 0.0, lens=SMALL)
     renderer = StreetRenderer(town_scenes[0])
     view, again = renderer.view(camera), renderer.view(camera)
@@ -91,8 +91,8 @@ def test_normals_point_at_the_camera_and_every_call_is_the_same(town_scenes):
     assert shaded(view).shape == (47, 176, 3) and len(np.unique(shaded(view).reshape(-1, 3), axis=0)) > 50
 
 
-def test_what_is_cut_by_the_near_plane_is_seen_up_to_it():
-    """A long box beside the camera, from behind it to far ahead: its side fills the picture's left half."""
+def test_street_view_clips_at_near_plane():
+    """A long box next to the camera, from behind it to far ahead: its side fills the left half of the picture."""
     scene = random_scene(0, 1, tilt_rad=0)
     box = {"category": np.array([6], np.int8), "center_m": np.array([[0, 3, 0]], np.float32), "label": None}
     box |= {"size_m": np.array([[100, 2, 8]], np.float32), "rotation": np.eye(3, dtype=np.float32)[None]}
@@ -104,10 +104,10 @@ def test_what_is_cut_by_the_near_plane_is_seen_up_to_it():
     assert np.allclose(view.depth_m[25, :48], expected[:48], rtol=1e-4) and (view.primitive[:, 50:] == GROUND).all()
 
 
-def test_half_the_pixels_show_the_same_view():
+def test_street_view_at_half_resolution_shows_same_view():
     full, half = Lens(), Lens().resized(704, 188)
     assert half.fx == pytest.approx(full.fx / 2)
-    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # borders of the picture lie in the same directions
+    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # the borders of the picture have the same directions
         there = ((corner[0] + 0.5) / 2 - 0.5 - half.cx) / half.fx, ((corner[1] + 0.5) / 2 - 0.5 - half.cy) / half.fy
         assert np.allclose(there, [(corner[0] - full.cx) / full.fx, (corner[1] - full.cy) / full.fy])
 
@@ -116,7 +116,7 @@ def test_half_the_pixels_show_the_same_view():
 
 
 def scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = None) -> Scene:
-    """A scene whose road mask is all that lies within half a width of some lines (k, 2); it climbs by 2 %."""
+    """A scene whose road covers all points within half a width of some lines (k, 2), on a slope of 2 %."""
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     road = np.zeros(x.shape, bool)
@@ -149,7 +149,7 @@ SIDE = np.array([[30.0, 3.0], [30.0, 60.0]])
 
 
 @pytest.mark.parametrize("way, width_m", [(STRAIGHT, 6.5), (OBLIQUE, 7.0), (ARC, 6.0)])
-def test_one_road_is_its_centreline(way, width_m):
+def test_centerlines_of_single_road_equal_its_axis(way, width_m):
     network = road_network(scene_of_roads([way], width_m))
     (road,) = network.roads
     assert (road.start, road.end, len(network.nodes_m)) == (-1, -1, 0)
@@ -161,7 +161,7 @@ def test_one_road_is_its_centreline(way, width_m):
     assert np.abs(steps - 1).max() < 0.3
 
 
-def test_a_side_street_makes_a_node_and_three_roads():
+def test_centerlines_split_at_side_street():
     network = road_network(scene_of_roads([STRAIGHT, SIDE], 6.5))
     assert len(network.roads) == 3 and len(network.nodes_m) == 1
     assert np.linalg.norm(network.nodes_m[0, :2] - [30, 3]) < 1.5
@@ -170,7 +170,7 @@ def test_a_side_street_makes_a_node_and_three_roads():
         assert road.end == -1 and off_m(road.xyz_m[:, :2], [STRAIGHT, SIDE]).max() < 1.2
 
 
-def test_a_crossing_is_one_node_and_rough_edges_make_no_roads():
+def test_centerlines_have_one_node_per_crossing_without_spurs():
     across = np.array([[34.0, -60.0], [34.0, 60.0]])
     scene = scene_of_roads([STRAIGHT, across], 7.0)
     network = road_network(scene)
@@ -185,7 +185,7 @@ def test_a_crossing_is_one_node_and_rough_edges_make_no_roads():
     assert road_network(replace(scene, occupied=nothing, height_m=np.zeros_like(scene.height_m))).roads == ()
 
 
-def test_a_drive_goes_straight_on_and_keeps_right():
+def test_route_goes_straight_and_keeps_right():
     network = road_network(scene_of_roads([STRAIGHT, SIDE], 6.0))
     way = drive(network)
     assert len(drive(replace(network, roads=()))) == 0
@@ -209,7 +209,7 @@ def schema() -> etree.XMLSchema:
 
 
 def sampled(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-    """(k, 3) points of a road's reference line and (k,) headings, as a reader of the standard computes them."""
+    """(k, 3) points and (k,) headings of the reference line of a road, computed as the standard defines them."""
     points, headings = [], []
     elevation = [{k: float(v) for k, v in e.attrib.items()} for e in road.iter("elevation")]
     for geometry in road.iter("geometry"):
@@ -232,7 +232,7 @@ def sampled(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(headings)
 
 
-def test_files_follow_the_schema_and_the_centrelines(town_scenes, schema):
+def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
     counted = 0
     for scene in [*town_scenes, scene_of_roads([STRAIGHT, SIDE], 12.5)]:
         content = scene_opendrive(scene)
@@ -259,7 +259,7 @@ def test_files_follow_the_schema_and_the_centrelines(town_scenes, schema):
     assert counted > 8
 
 
-def test_ways_through_a_junction_join_the_lanes_of_its_roads(schema):
+def test_opendrive_junction_connects_lanes_of_its_roads(schema):
     root = ET.fromstring(scene_opendrive(scene_of_roads([STRAIGHT, SIDE], 6.5)))
     roads = {road.get("id"): road for road in root.findall("road")}
     (junction,) = root.findall("junction")
@@ -275,7 +275,7 @@ def test_ways_through_a_junction_join_the_lanes_of_its_roads(schema):
             end = 0 if link.get("contactPoint") == "start" else -1
             assert np.abs(points[which] - other_points[end]).max() < 1e-3
             turn = headings[which] - other_headings[end]
-            assert abs(np.sin(turn)) < 0.05  # in line with it, the one way or the other
+            assert abs(np.sin(turn)) < 0.05  # parallel to it, in either direction
             leads_on = (which == 0) == (end == -1)
             assert (np.cos(turn) > 0) == leads_on
         link = connection.find("laneLink")
@@ -285,7 +285,7 @@ def test_ways_through_a_junction_join_the_lanes_of_its_roads(schema):
         assert coming.find(f"link/{'successor' if at_end else 'predecessor'}").get("elementType") == "junction"
 
 
-def test_a_scene_without_a_road_is_refused():
+def test_opendrive_rejects_scene_without_road():
     scene = random_scene(0, 4)
     nothing = np.zeros_like(scene.occupied)
     with pytest.raises(ValueError, match="test-0000 has no road to export"):

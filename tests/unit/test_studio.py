@@ -19,7 +19,7 @@ CAR = CATEGORY_INDEX["vehicle_small"]
 
 
 @pytest.mark.parametrize("side", ["ahead", "behind", "left", "right"])
-def test_a_scene_grows_to_a_side_and_what_was_there_stays(side):
+def test_extend_scene_grows_to_side_and_keeps_given_part(side):
     pipeline, scene, quick = tiny_pipeline(SPEC), studio_scene(1), Resampling(4, 2, 1)
     once = extended(pipeline, scene, side, "low", resampling=quick)
     assert once.grid == grown(scene.grid, side, SPEC.grid.rows // 2)
@@ -39,7 +39,7 @@ def test_a_scene_grows_to_a_side_and_what_was_there_stays(side):
 
 
 @pytest.mark.parametrize("contents", ["both", "objects", "ground"])
-def test_a_region_of_a_larger_scene_is_made_anew_and_nothing_else(contents):
+def test_inpaint_regenerates_only_region_of_large_scene(contents):
     pipeline, quick = tiny_pipeline(SPEC), Resampling(4, 2, 1)
     scene = extended(pipeline, studio_scene(1), "ahead", "low", resampling=quick)
     scene = extended(pipeline, scene, "left", "low", resampling=quick)
@@ -67,7 +67,7 @@ def test_a_region_of_a_larger_scene_is_made_anew_and_nothing_else(contents):
         row, col = scene.grid.pixel(*scene.center_m[:, :2].T)
         kept = scene.center_m[~inside[row, col] | (contents == "ground")]
         assert np.array_equal(new.center_m[: len(kept)], kept)
-    # On a scene of the model's own size it is the pipeline's inpainting.
+    # On a scene of the size of a block it equals the inpainting of the pipeline.
     scene = studio_scene(2)
     region = polygon_region(scene.grid, [(20, -10), (40, -10), (40, 10), (20, 10)])
     *_, last = inpainting(pipeline, scene, region, "low", contents, resampling=quick)
@@ -77,8 +77,8 @@ def test_a_region_of_a_larger_scene_is_made_anew_and_nothing_else(contents):
     )
 
 
-def test_with_a_token_nobody_enters_without_it(studio_files):
-    """The same interface without Ray, on any address."""
+def test_studio_requires_its_token(studio_files):
+    """The same interface without Ray, on any host name."""
     from starlette.testclient import TestClient
 
     from pipelines.studio.session import Studio, studio_app
@@ -87,4 +87,8 @@ def test_with_a_token_nobody_enters_without_it(studio_files):
     client = TestClient(studio_app(lambda: studio, "secret", ()), base_url="http://studio.example")
     assert client.get("/").status_code == 401 and client.get("/?token=wrong").status_code == 401
     assert client.get("/?token=secret").status_code == 200
-    assert client.get("/api/about").json()["labels"] == ["low", "medium", "high"]  # the cookie bears it from now on
+    assert client.get("/api/about").json()["labels"] == [
+        "low",
+        "medium",
+        "high",
+    ]  # the cookie holds the token from now on

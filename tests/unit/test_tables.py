@@ -1,4 +1,4 @@
-"""Tables: what goes in comes out, and other people's tools can read it."""
+"""Tables round-trip scenes, and other tools can read them."""
 
 import duckdb
 import numpy as np
@@ -33,7 +33,7 @@ def scenes():
     ]
 
 
-def test_round_trip(tmp_path, scenes):
+def test_shard_round_trips_scenes(tmp_path, scenes):
     shard = Shard(str(tmp_path), "town", "train", 7)
     shard.write(scenes)
     back = list(read_scenes(str(tmp_path)))
@@ -48,13 +48,13 @@ def test_round_trip(tmp_path, scenes):
     assert not [p for p in tmp_path.rglob("*") if p.name.startswith(storage.TEMPORARY)]
 
 
-def test_only_empty_scenes(tmp_path):
+def test_shard_round_trips_empty_scenes(tmp_path):
     shard = Shard(str(tmp_path), "town", "test", 0)
     shard.write([random_scene(0, n=0, split="test")])
     assert len(shard.scenes()[0]) == 0
 
 
-def test_the_analysts_first_query(tmp_path, scenes):
+def test_shard_is_queryable_by_duckdb(tmp_path, scenes):
     Shard(str(tmp_path), "town", "train", 0).write(scenes)
     query = f"select category, count(*), avg(length_m) from '{tmp_path}/primitives/**/*.parquet' group by 1"
     rows = {category: (count, length) for category, count, length in duckdb.sql(query).fetchall()}
@@ -72,8 +72,8 @@ def test_the_analysts_first_query(tmp_path, scenes):
     assert gap >= 0 and low >= -np.pi / 2 - 1e-6 and high < np.pi / 2
 
 
-def test_the_readmes_decoder(tmp_path, scenes):
-    """The ten lines that README gives to people without our code."""
+def test_shard_is_readable_by_decoder_of_readme(tmp_path, scenes):
+    """The ten lines of the README that decode tables without this package."""
     Shard(str(tmp_path), "town", "train", 0).write(scenes)
     readme = ROOT / "README.md"
     block = readme.read_text().split("<!-- decoder -->")[1].split("```python")[1].split("```")[0]
@@ -84,7 +84,7 @@ def test_the_readmes_decoder(tmp_path, scenes):
     assert np.array_equal(names["occupied"], scenes[0].occupied)
 
 
-def test_truncated_and_missing_files_are_named(tmp_path, scenes):
+def test_shard_names_truncated_and_missing_files(tmp_path, scenes):
     with pytest.raises(ValueError, match="scenes: no scenes there; give a directory"):
         find_shards(str(tmp_path), source="av2")
     shard = Shard(str(tmp_path), "town", "train", 0)
@@ -100,7 +100,7 @@ def test_truncated_and_missing_files_are_named(tmp_path, scenes):
         shard.scenes()
 
 
-def test_nothing_half_written(tmp_path):
+def test_shard_write_is_atomic(tmp_path):
     target = str(tmp_path / "a" / "b.json")
 
     def fails(stream):

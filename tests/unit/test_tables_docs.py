@@ -48,7 +48,7 @@ SCHEMAS = {
     "edits": EDITS,
     "latents": latents_schema((4, 8, 8)),
 }
-SETUP, COLUMNS = "Questions", "On disk"  # headings whose SQL is no question
+SETUP, COLUMNS = "Questions", "On disk"  # headings whose SQL block is no query
 
 
 # ------------------------------------------------------------------------------------------- what the page says
@@ -66,7 +66,7 @@ def column_list(schema: pa.Schema) -> str:
 
 
 def category_list() -> str:
-    """The categories as a Markdown table: what they hold, and the sources' own classes."""
+    """The categories as a Markdown table, with the classes of each source."""
     rows = ["| category | holds | kitti360 | av2 |", "|---|---|---|---|"]
     for name, meaning in CATEGORY_MEANING.items():
         # A label of vegetation becomes an ellipsoid where its mesh is a sphere.
@@ -77,7 +77,7 @@ def category_list() -> str:
 
 
 def with_lists(page: str) -> str:
-    """The page with its lists as they should be."""
+    """The page with its generated lists."""
     blocks = {f"columns {name}": column_list(schema) for name, schema in SCHEMAS.items()}
     for name, block in (blocks | {"categories": category_list()}).items():
         start, end = f"<!-- {name} -->\n", "<!-- end -->"
@@ -103,7 +103,7 @@ QUESTIONS = [heading for heading, _ in blocks("sql") if heading not in (SETUP, C
 
 
 def labelled(scenes: list[Scene]) -> list[Scene]:
-    """The scenes with the labels that the training split among them gives."""
+    """The scenes with the labels that their training split determines."""
     labels = {}
     for name, group in (("vegetation_density", VEGETATION), ("vehicle_density", VEHICLES)):
         count = np.array([np.isin(s.category, group).sum() for s in scenes])
@@ -137,7 +137,7 @@ def invented(scene: Scene, index: int) -> Scene:
 
 @pytest.fixture(scope="module")
 def town() -> list[Scene]:
-    """Two drives: the first trains and, further on, tests; the second trains."""
+    """Two drives: the first has training and then test scenes, the second training scenes only."""
     drives = [town_drive(seed) for seed in (0, 1)]
     plan = [(0, k, "train" if k < 10 else "test") for k in range(16)] + [(1, k, "train") for k in range(8)]
     return labelled([drives[d].scene(k, split) for d, k, split in plan])
@@ -179,7 +179,7 @@ def in_place(code: str, root: Path) -> str:
 
 @pytest.fixture(scope="module")
 def answers(root) -> dict[str, pd.DataFrame]:
-    """What DuckDB answers to each SQL block, by its heading."""
+    """The result of DuckDB for each SQL block, by heading."""
     connection = duckdb.connect()
     found = {}
     for heading, sql in blocks("sql"):
@@ -187,13 +187,13 @@ def answers(root) -> dict[str, pd.DataFrame]:
     return found
 
 
-def test_the_lists_on_the_page_are_the_schemas():
+def test_tables_page_lists_equal_schemas():
     page = PAGE.read_text()
     assert page == with_lists(page), "run python tests/test_tables_docs.py"
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
-def test_every_question_has_an_answer(answers, question):
+def test_tables_page_queries_return_rows(answers, question):
     answer = answers[question]
     assert len(answer) and not answer.isna().all().any()
 
@@ -202,7 +202,7 @@ def test_every_question_has_an_answer(answers, question):
 
 
 def asked(answers: dict[str, pd.DataFrame], words: str, *index: str) -> pd.DataFrame:
-    """The answer to the one question with these words, indexed by these columns."""
+    """The result of the one question with these words, indexed by these columns."""
     (question,) = [q for q in QUESTIONS if words in q]
     return answers[question].set_index(list(index)).sort_index()
 
@@ -227,7 +227,7 @@ def of(scene: Scene, *names: str) -> np.ndarray:
     return np.isin(scene.category, [CATEGORIES.index(name) for name in names])
 
 
-def test_trees_per_kilometre(answers, town):
+def test_tables_page_trees_per_kilometer(answers, town):
     answer = asked(answers, "How many trees", "sequence")
     for sequence, drive in drives_of(town).items():
         trees = {i for s in drive for i in s.instance_id[np.isin(s.category, VEGETATION) & (s.size_m[:, 2] >= 3)]}
@@ -237,7 +237,7 @@ def test_trees_per_kilometre(answers, town):
     assert len(answer) == 2
 
 
-def test_ground_shares(answers, town, fake):
+def test_tables_page_ground_shares(answers, town, fake):
     answer = asked(answers, "How is the ground", "source", "vehicle_density")
     for label in {s.vehicle_density for s in town}:
         share = np.mean([s.ground_area_m2() for s in town if s.vehicle_density == label], axis=0) / 64**2
@@ -247,7 +247,7 @@ def test_ground_shares(answers, town, fake):
     assert answer.scenes.sum() == len(town) + len(fake)
 
 
-def test_cluttered_sidewalks(answers, town):
+def test_tables_page_cluttered_sidewalks(answers, town):
     answer = asked(answers, "How cluttered", "sequence")
     for sequence, drive in drives_of(town).items():
         things = sum(of(s, "pole", "traffic_control", "object").sum() for s in drive)
@@ -255,7 +255,7 @@ def test_cluttered_sidewalks(answers, town):
         assert abs(answer.things_per_1000_m2[sequence] - 1000 * things / sidewalk_m2) <= 0.051
 
 
-def test_heights_of_poles(answers, town):
+def test_tables_page_pole_heights(answers, town):
     answer = asked(answers, "How high are poles", "label")
     heights = {
         (s.label[k], s.sequence, s.instance_id[k]): s.size_m[k, 2] for s in town for k in np.flatnonzero(of(s, "pole"))
@@ -267,7 +267,7 @@ def test_heights_of_poles(answers, town):
         assert np.allclose(answer.loc[label, ["p05_m", "p50_m", "p95_m"]].astype(float), expected, atol=0.006)
 
 
-def test_lengths_of_drives(answers, town):
+def test_tables_page_drive_lengths(answers, town):
     answer = asked(answers, "How long are the drives", "sequence")
     for sequence, drive in drives_of(town).items():
         steps = steps_m(drive)
@@ -276,7 +276,7 @@ def test_lengths_of_drives(answers, town):
         assert np.allclose(answer.loc[sequence, columns].astype(float), expected, atol=0.006)
 
 
-def test_parked_cars(answers, town):
+def test_tables_page_parked_cars(answers, town):
     lateral_m = []
     for drive in drives_of(town).values():
         seen: dict[int, list[tuple]] = {}
@@ -295,7 +295,7 @@ def test_parked_cars(answers, town):
         assert np.allclose(answer.loc[side, ["p05_m", "p50_m", "p95_m"]].astype(float), expected, atol=0.051)
 
 
-def test_objects_seen_again(answers, town):
+def test_tables_page_objects_seen_again(answers, town):
     seen_again, moved, mistaken = Counter(), Counter(), Counter()
     for drive in drives_of(town).values():
         for a, b in zip(drive, drive[1:], strict=False):
@@ -313,7 +313,7 @@ def test_objects_seen_again(answers, town):
     assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
 
 
-def test_what_is_in_a_scene(answers, town, fake):
+def test_tables_page_scene_contents(answers, town, fake):
     answer = asked(answers, "What is in a scene", "source", "category")
     assert np.isclose(answer.per_scene["town"].sum(), np.mean([len(s) for s in town]), atol=0.06)
     for source, scenes in (("town", town), ("generated-docs", fake)):
@@ -322,7 +322,7 @@ def test_what_is_in_a_scene(answers, town, fake):
         assert np.allclose(row, [len(sizes) / len(scenes), *np.median(sizes, axis=0)], atol=0.006)
 
 
-def test_generated_beside_real(answers, town, fake):
+def test_tables_page_generated_next_to_real(answers, town, fake):
     answer = asked(answers, "Do generated scenes", "category")
     for name in answer.index:
         for side, scenes in (("real", town), ("generated", fake)):
@@ -332,14 +332,14 @@ def test_generated_beside_real(answers, town, fake):
                 assert np.isclose(answer[f"{side}_height_m"][name], np.median(heights), atol=0.006)
 
 
-def test_combinations_of_labels(answers, town):
+def test_tables_page_label_combinations(answers, town):
     answer = asked(answers, "density labels", "source", "split", "vegetation_density", "vehicle_density")
     training = Counter((s.vegetation_density, s.vehicle_density) for s in town if s.split == "train")
     assert {key[2:]: n for key, n in answer.scenes.items() if key[1] == "train"} == training
     assert np.isclose(answer.percent["town", "train"].sum(), 100, atol=0.5)
 
 
-def test_nearest_training_pose(answers, town):
+def test_tables_page_nearest_training_pose(answers, town):
     answer = asked(answers, "Do test scenes", "sequence")
     place = {split: [s.world_xyz_m[:2] for s in town[:16] if s.split == split] for split in ("train", "test")}
     nearest_m = np.linalg.norm(np.array(place["test"])[:, None] - np.array(place["train"]), axis=2).min()
@@ -349,7 +349,7 @@ def test_nearest_training_pose(answers, town):
     assert len(answer) == 1
 
 
-def test_reasons_of_rejects(answers, rejects):
+def test_tables_page_reject_reasons(answers, rejects):
     answer = asked(answers, "What was left out", "reason")
     assert answer.scenes.to_dict() == Counter(row["reason"] for row in rejects)
 
@@ -357,7 +357,7 @@ def test_reasons_of_rejects(answers, rejects):
 # ------------------------------------------------------------------------------------------------------- Python
 
 
-def test_the_decoder_and_the_pandas_script(root, town, capsys):
+def test_tables_page_python_blocks_run(root, town, capsys):
     decoder, script = (code for _, code in blocks("python"))
     assert decoder.split("\n\n\n")[1].strip() in script
     names: dict = {}
@@ -387,7 +387,7 @@ def test_the_decoder_and_the_pandas_script(root, town, capsys):
 
 
 def assert_explained(path: str, schema: pa.Schema):
-    """In Arrow every field, in DuckDB the key-values."""
+    """Every field has a description in Arrow and in the key-value metadata that DuckDB reads."""
     written = pq.read_schema(path)
     assert written.names == schema.names
     for field in written:
@@ -408,14 +408,14 @@ def assert_explained(path: str, schema: pa.Schema):
 
 
 @pytest.mark.parametrize("table", SCHEMAS)
-def test_written_files_explain_themselves(root, table):
+def test_table_files_describe_their_columns(root, table):
     path = Shard(f"{root}/real", "town", "train", 0).path(table)
     assert_explained(path, SCHEMAS[table])
     names = {name for (name,) in duckdb.sql(f"select name from parquet_schema('{path}')").fetchall()}
     assert names >= set(SCHEMAS[table].names)
 
 
-def test_units_are_those_in_the_names():
+def test_table_units_match_column_names():
     for schema in SCHEMAS.values():
         for field in schema:
             suffix = re.search(r"_(m|m2|m3|rad)$", field.name)
@@ -423,7 +423,7 @@ def test_units_are_those_in_the_names():
                 assert field.metadata[b"unit"].decode() == suffix[1], field.name
 
 
-def test_labelling_keeps_the_explanations(root, tmp_path):
+def test_label_scenes_keeps_column_descriptions(root, tmp_path):
     """The last step of preprocessing rewrites the scenes tables."""
     from pipelines.schema.dataset import Statistics, label_scenes
 
@@ -434,14 +434,14 @@ def test_labelling_keeps_the_explanations(root, tmp_path):
     assert_explained(final, SCENES)
 
 
-def test_duckdb_lists_the_columns(answers):
+def test_duckdb_lists_table_columns(answers):
     listed = answers[COLUMNS].set_index("name")
     assert listed.index.tolist() == SCENES.names
     assert listed.unit["x_m"] == "m" and listed.description["x_m"].startswith("x of the scene's origin")
 
 
-def test_files_without_explanations_are_still_read(tmp_path):
-    """Files of before: the same names and types, alone or beside newer ones."""
+def test_shard_reads_files_without_descriptions(tmp_path):
+    """Older files with the same names and types, alone or next to newer ones."""
     old, new = (Shard(str(tmp_path), "town", "train", k) for k in (0, 1))
     old.write([random_scene(0)])
     new.write([random_scene(1)])

@@ -25,7 +25,7 @@ def round_trip(scene, spec):
     return scene_from_layout(decoded, spec, scene)
 
 
-def test_round_trip_keeps_every_primitive_and_pixel():
+def test_layout_round_trip_keeps_primitives_and_pixels():
     scene = random_scene(0, n=60)
     spec = LayoutSpec(slots=(20,) * len(CATEGORIES), cholesky_bounds=WIDE)
     back = round_trip(scene, spec)
@@ -41,14 +41,14 @@ def test_round_trip_keeps_every_primitive_and_pixel():
     assert (back.size_m[:, 0] >= back.size_m[:, 1]).all()
 
 
-def test_empty_scene():
+def test_layout_round_trips_empty_scene():
     scene = random_scene(0, n=0)
     layout = compact_layout(scene, small_spec(256))
     assert not layout["real"].any()
     assert len(round_trip(scene, small_spec(256))) == 0
 
 
-def test_overfull_category_keeps_the_nearest():
+def test_layout_keeps_nearest_of_overfull_category():
     scene = random_scene(1, n=100, category=np.full(100, 3, np.int8))
     layout = compact_layout(scene, small_spec(32, slots=7))
     assert layout["real"].sum() == 7 and layout["real"][21:28].all()
@@ -58,7 +58,7 @@ def test_overfull_category_keeps_the_nearest():
     assert np.allclose(np.linalg.norm(centers, axis=1), distance[:7], atol=1e-3)
 
 
-def test_coarser_ground_is_the_majority():
+def test_layout_coarse_ground_is_majority():
     scene = random_scene(2)
     height, occupied = ground_on_grid(scene, scene.ground_classes, Grid(rows=128, cols=128, resolution_m=0.5))
     count = scene.occupied.reshape(5, 128, 2, 128, 2).sum(axis=(2, 4))
@@ -70,20 +70,20 @@ def test_coarser_ground_is_the_majority():
     assert np.array_equal(mask[:, ::2, 1::2], scene.occupied) and np.array_equal(fine[:, ::2, ::2], scene.height_m)
 
 
-def test_missing_ground_class_is_empty():
+def test_layout_missing_ground_class_is_empty():
     spec = LayoutSpec(ground_classes=("road", "crossing"))
     layout = compact_layout(random_scene(3), spec)
     assert layout["occupied"][0].any() and not layout["occupied"][1].any()
 
 
-def test_batch_is_normalised():
+def test_layout_batch_is_normalized():
     batch = layout_batch([random_scene(i) for i in range(3)], small_spec())
     assert batch.height.shape == (3, 5, 32, 32) and batch.features.shape == (3, 66, 9)
     for value in (batch.height, batch.occupied, batch.features):
         assert value.dtype == torch.float32 and value.min() >= 0 and value.max() <= 1
 
 
-def test_spec_survives_json_and_names_a_difference():
+def test_layout_spec_round_trips_json_and_names_difference():
     spec = small_spec()
     assert LayoutSpec.from_dict(spec.to_dict()) == spec
     other = LayoutSpec.from_dict(spec.to_dict() | {"slots": [7] * len(CATEGORIES)})

@@ -1,4 +1,4 @@
-"""The town: held to KITTI-360's numbers, geometrically sound, and readable as KITTI-360's own files."""
+"""The town has the statistics of KITTI-360, valid geometry, and round-trips the KITTI-360 format."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def drives():
 
 @pytest.fixture(scope="module")
 def thousand():
-    """(numbers of 1,000 test scenes, relief of every tenth in metres)."""
+    """(counts of 1,000 test scenes, relief of every tenth in metres)."""
     relief = []
 
     def scenes():
@@ -49,14 +49,14 @@ def thousand():
     return sample_of(scenes()), np.array(relief)
 
 
-def test_a_thousand_scenes_have_the_target_statistics(thousand):
+def test_town_scenes_have_target_statistics(thousand):
     sample, _ = thousand
     assert len(sample.counts) == 1_000
     missed = [f"{r.what} ({r.label}): {r.measured:.2f}, target {r.target:g}" for r in measure(sample) if not r.ok]
     assert not missed, "\n".join(missed)
 
 
-def test_counts_are_over_dispersed_and_every_category_occurs(thousand):
+def test_town_counts_are_overdispersed_with_every_category(thousand):
     counts = thousand[0].counts
     dispersion = dict(zip(CATEGORIES, counts.var(axis=0) / counts.mean(axis=0), strict=True))
     assert (counts.sum(axis=0) > 0).all()
@@ -67,8 +67,8 @@ def test_counts_are_over_dispersed_and_every_category_occurs(thousand):
     assert dispersion["construction_big"] > 1, dispersion
 
 
-def test_vegetation_and_relief_are_in_the_ranges_stated(thousand):
-    """Medians lie within the stated ranges (p05..p95) of count and volume per label, tails not far outside."""
+def test_town_vegetation_and_relief_are_in_stated_ranges(thousand):
+    """Medians lie within the stated ranges (p05 to p95) of count and volume per label; tails lie close to them."""
     sample, relief = thousand
     label = sample.labels()
     for which, count_range, volume_range in (
@@ -86,7 +86,7 @@ def test_vegetation_and_relief_are_in_the_ranges_stated(thousand):
     assert 1.0 < np.median(relief) < 2.0
 
 
-def test_same_seed_same_town_and_different_seeds_differ(drives):
+def test_town_depends_on_seed(drives):
     again = town_drive(1)
     for name in ("center_m", "rotation", "size_m", "category", "timestamp", "frame", "world_from_imu", "instance_id"):
         assert np.array_equal(getattr(again, name), getattr(drives[1], name)), name
@@ -95,7 +95,7 @@ def test_same_seed_same_town_and_different_seeds_differ(drives):
     assert len({len(drive.category) for drive in drives}) == len(drives)
 
 
-def test_poses_are_ten_metres_apart_and_many(drives):
+def test_town_poses_are_ten_meters_apart(drives):
     for drive in drives:
         xy = drive.world_from_imu[:, :2, 3]
         distance = np.linalg.norm(xy[:, None] - xy[None], axis=2) + 1e9 * np.eye(len(xy))
@@ -104,7 +104,7 @@ def test_poses_are_ten_metres_apart_and_many(drives):
         assert (np.diff(drive.frame) > 0).all()
 
 
-def test_imu_rides_above_the_road_with_z_down_and_a_small_tilt(drives):
+def test_town_imu_is_above_road_with_z_down_and_small_tilt(drives):
     for drive in drives:
         rotation = drive.world_from_imu[:, :, :3]
         assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-9)
@@ -119,7 +119,7 @@ def test_imu_rides_above_the_road_with_z_down_and_a_small_tilt(drives):
             assert abs(scene.height_m[road, 128, 128] + 0.63) < 0.06
 
 
-def test_cars_stand_on_the_surface_and_near_roads(drives):
+def test_town_cars_stand_on_surface_near_roads(drives):
     gaps, near, total = [], 0, 0
     for drive in drives[:2]:
         for index in range(0, len(drive), 12):
@@ -136,10 +136,10 @@ def test_cars_stand_on_the_surface_and_near_roads(drives):
                 near += lanes[max(0, r - 12) : r + 13, max(0, c - 12) : c + 13].any()
     gaps = np.concatenate(gaps)
     assert np.percentile(np.abs(gaps), 98) < 0.12
-    assert near / total > 0.7  # the others: driveways and car parks
+    assert near / total > 0.7  # the other cars are on driveways and car parks
 
 
-def test_nothing_that_moves_drives_through_what_is_parked(drives):
+def test_town_moving_objects_avoid_parked_ones(drives):
     vehicles = [CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["vehicle_big"]]
     for drive in drives:
         is_vehicle = np.isin(drive.category, vehicles)
@@ -149,7 +149,7 @@ def test_nothing_that_moves_drives_through_what_is_parked(drives):
             assert len(near) == 0
 
 
-def test_streets_are_connected(drives):
+def test_town_streets_are_connected(drives):
     """Road slabs that touch form one piece."""
     for drive in drives:
         ground = drive.ground
@@ -170,7 +170,7 @@ def test_streets_are_connected(drives):
         assert len(reached) == len(polygons)
 
 
-def test_slabs_are_closed_simple_and_do_not_overlap(drives):
+def test_town_slabs_are_closed_simple_and_disjoint(drives):
     drive = drives[0]
     ground = drive.ground
     areas, polygons, corners = {name: [] for name in drive.ground_classes}, [], []
@@ -193,13 +193,13 @@ def test_slabs_are_closed_simple_and_do_not_overlap(drives):
         corners.append(n)
     union = shapely.union_all([polygon.buffer(-0.02) for polygon in polygons])
     total = sum(polygon.area for polygon in polygons)
-    assert union.area > 0.97 * total  # bends and rounding aside, slabs abut
+    assert union.area > 0.97 * total  # slabs abut, up to bends and rounding
     assert 120 < np.median(areas["road"]) < 320
     assert 10 < np.median(areas["sidewalk"]) < 35
     assert 0.15 < np.mean(np.array(corners) == 4) < 0.6
 
 
-def test_grade_is_at_most_three_percent(drives):
+def test_town_grade_is_at_most_three_percent(drives):
     for drive in drives:
         for slab in np.flatnonzero(drive.ground.slab_class == 0):
             top = drive.ground.vertices_m[drive.ground.vertex_slab == slab]
@@ -208,7 +208,7 @@ def test_grade_is_at_most_three_percent(drives):
             assert (np.abs(np.diff(top[:, 2])) <= 0.0301 * run + 1e-9).all()
 
 
-def test_ears_of_random_outlines_tile_them():
+def test_ear_clipping_tiles_random_outlines():
     rng = np.random.default_rng(0)
     for n in [3, 4, 5, 8, 13, 40] * 20:
         angle = np.sort(rng.uniform(0, 2 * np.pi, n))
@@ -222,7 +222,7 @@ def test_ears_of_random_outlines_tile_them():
         assert np.isclose(sum(signed), shapely.Polygon(outline).area)
 
 
-def test_outlines_of_cells_are_their_unions():
+def test_cell_outlines_equal_unions():
     rng = np.random.default_rng(1)
     s, t = [0.0, 1.0, 2.5, 4.0, 7.0], [0.0, 2.0, 3.0, 5.5]
     for _ in range(60):
@@ -238,7 +238,7 @@ def test_outlines_of_cells_are_their_unions():
             assert np.isclose(shapely.union_all(found).area, union.area)
 
 
-def test_plan_covers_exactly_what_is_asked_with_different_towns():
+def test_plan_town_covers_request_with_different_towns():
     for num_train, num_test in ((10_000, 1_000), (48, 16), (1, 1), (0, 5), (257, 0)):
         plan = town_plan(num_train, num_test)
         for split, wanted in (("train", num_train), ("test", num_test)):
@@ -252,7 +252,7 @@ def test_plan_covers_exactly_what_is_asked_with_different_towns():
         town_plan(num_train=-3)
 
 
-def test_take_spreads_over_the_drive():
+def test_take_spreads_over_drive():
     assert take(250, 250).tolist() == list(range(250))
     some = take(251, 7)
     assert len(set(some)) == 7 and some[0] < 30 and some[-1] > 220
@@ -261,7 +261,7 @@ def test_take_spreads_over_the_drive():
         take(8, 9)
 
 
-def test_small_plans_show_every_density():
+def test_plan_town_shows_every_density_when_small():
     labels = []
     for seed, split, count in town_plan(48, 0):
         drive = town_drive(seed)
@@ -270,7 +270,7 @@ def test_small_plans_show_every_density():
     assert set(DISTRICTS) == {"centre", "suburb", "green"}
 
 
-def test_written_as_kitti360_it_reads_back_the_same(tmp_path, drives):
+def test_town_round_trips_kitti360_format(tmp_path, drives):
     drive = drives[2]
     write_kitti360(drive, tmp_path, defects=True, seed=3)
     name = kitti360.sequences(tmp_path)
@@ -300,7 +300,7 @@ def test_written_as_kitti360_it_reads_back_the_same(tmp_path, drives):
         assert np.percentile(np.abs(ours.height_m - theirs.height_m)[both], 99.9) < 1e-3
 
 
-def test_without_defects_every_object_is_written_once(tmp_path, drives):
+def test_town_without_defects_writes_objects_once(tmp_path, drives):
     write_kitti360(drives[1], tmp_path, defects=False)
     read, report = kitti360.read_drive(tmp_path, "0001")
     assert report.duplicates == 0 and not report.dropped
@@ -308,7 +308,7 @@ def test_without_defects_every_object_is_written_once(tmp_path, drives):
     assert np.abs(read.size_m - drives[1].size_m).max() < 1e-5
 
 
-def test_importing_the_town_needs_numpy_only():
+def test_town_import_needs_numpy_only():
     heavy = ["ray", "pyarrow", "shapely", "trimesh", "torch", "scipy", "PIL"]
     code = f"import sys, pipelines.preprocess.sources.town.generator; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

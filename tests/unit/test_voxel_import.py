@@ -1,4 +1,4 @@
-"""Voxel files of any method: read whatever way their axes point, pictured from above, scored on the full grid."""
+"""Voxel files are read in any axis convention, drawn from above and scored on the full grid."""
 
 import io
 from dataclasses import replace
@@ -24,7 +24,7 @@ def random_voxels(shape=FULL, seed: int = 0) -> np.ndarray:
     return (rng.integers(0, 17, shape) * (rng.random(shape) < 0.05)).astype(np.uint8)
 
 
-def test_our_scenes_come_back_and_files_are_the_same_on_every_call(tmp_path, town_scenes):
+def test_read_voxels_round_trips_own_deterministic_files(tmp_path, town_scenes):
     for k, scene in enumerate((town_scenes[0], random_scene(1, n=0))):
         path = tmp_path / "deep" / f"{k}.npz"
         write_voxels(str(path), scene)
@@ -36,7 +36,7 @@ def test_our_scenes_come_back_and_files_are_the_same_on_every_call(tmp_path, tow
         write_voxels(str(path), scene, VoxelGrid(levels=16))
 
 
-def test_an_empty_scene(tmp_path):
+def test_read_voxels_round_trips_empty_scene(tmp_path):
     scene = random_scene(1, n=0)
     path = str(tmp_path / "empty.npz")
     write_voxels(path, replace(scene, occupied=np.zeros_like(scene.occupied)))
@@ -45,7 +45,7 @@ def test_an_empty_scene(tmp_path):
 
 
 @pytest.mark.parametrize("shape", SHAPES[1:])
-def test_coarse_voxels_are_repeated(tmp_path, shape):
+def test_read_voxels_repeats_coarse_voxels(tmp_path, shape):
     coarse = random_voxels(shape)
     got, factor = read_voxels(save_npz(tmp_path / "x.npz", coarse.astype(np.int64), "any")), 256 // shape[0]
     assert got.shape == FULL
@@ -53,8 +53,8 @@ def test_coarse_voxels_are_repeated(tmp_path, shape):
         assert got[tuple(at)] == coarse[tuple(at // factor)]
 
 
-def test_every_way_that_axes_can_point_is_undone(tmp_path):
-    """A voxel at x (forward), y (left), z (up) is the same one, whatever order and direction a file keeps them in."""
+def test_read_voxels_undoes_every_axis_convention(tmp_path):
+    """A voxel at x (forward), y (left), z (up) is the same in any axis order and direction of a file."""
     ours = random_voxels((64, 64, 8))
     for letters in permutations("xyz"):
         for signs in product("+-", repeat=3):
@@ -66,7 +66,7 @@ def test_every_way_that_axes_can_point_is_undone(tmp_path):
             assert np.array_equal(read_voxels(save_npz(tmp_path / "x.npz", theirs), axes)[::4, ::4, ::4], ours), axes
 
 
-def test_the_picture_shows_the_topmost_filled_voxel():
+def test_voxel_picture_shows_topmost_filled_voxel():
     voxels = random_voxels()
     picture = voxel_picture(voxels)
     for row, col in np.random.default_rng(0).integers(0, 256, (500, 2)):
@@ -75,8 +75,8 @@ def test_the_picture_shows_the_topmost_filled_voxel():
     assert picture.shape == (256, 256, 3) and picture.dtype == np.uint8
 
 
-def test_the_picture_of_a_towns_voxels_is_nearly_that_of_its_primitives(town_scenes):
-    """They differ where a primitive covers no voxel's centre."""
+def test_voxel_picture_agrees_with_picture_of_primitives(town_scenes):
+    """They differ where a primitive covers no voxel centre."""
     tall = VoxelGrid(bottom_m=-10.0, top_m=22.0, levels=64)
     for scene in town_scenes[:3]:
         same = (voxel_picture(voxelise(scene, tall)) == bev_picture(scene)).all(axis=2)
@@ -105,7 +105,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_file_that_is_no_voxel_grid_is_named_with_what_was_found(tmp_path, fault):
+def test_read_voxels_names_invalid_file_and_content(tmp_path, fault):
     make, words = FAULTS[fault]
     path = tmp_path / "theirs.npz"
     path.write_bytes(make())
@@ -113,7 +113,7 @@ def test_a_file_that_is_no_voxel_grid_is_named_with_what_was_found(tmp_path, fau
         read_voxels(str(path))
 
 
-def test_a_missing_file_and_wrong_axes_are_named(tmp_path):
+def test_read_voxels_names_missing_file_and_wrong_axes(tmp_path):
     with pytest.raises(ValueError, match=r"absent\.npz: cannot be read"):
         read_voxels(str(tmp_path / "absent.npz"))
     with pytest.raises(ValueError, match=r"axes 'x\+ y z-': name x"):

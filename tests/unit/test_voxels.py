@@ -1,4 +1,4 @@
-"""Voxels against testing every centre in every primitive, and against trimesh."""
+"""Voxelisation equals testing every centre in every primitive, and trimesh."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def objects(seed: int, n: int = 40, tilt_rad: float = np.pi, voxels: VoxelGrid =
 
 
 def place(scene: Scene, k: int, center_m, size_m, category=CAR) -> Scene:
-    """The scene with primitive k upright and aligned at a place."""
+    """The scene with primitive k upright and axis-aligned at a position."""
     parts = [scene.center_m.copy(), scene.size_m.copy(), scene.category.copy(), scene.rotation.copy()]
     for part, value in zip(parts, (center_m, size_m, category, np.eye(3)), strict=True):
         part[k] = value
@@ -47,7 +47,7 @@ def one_box(center_m, size_m, category=CAR) -> Scene:
 
 
 def literal(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
-    """Every centre in every primitive, coarse categories painted over by fine ones."""
+    """Tests every centre in every primitive; finer categories overwrite coarser ones."""
     out, at = np.zeros(voxels.shape, np.uint8), centers_m(voxels)
     for name in reversed(PRECEDENCE):
         for k in np.flatnonzero(scene.category == CATEGORY_INDEX[name]):
@@ -60,21 +60,21 @@ def literal(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.05, np.pi])
-def test_voxels_equal_testing_every_centre_in_every_primitive(seed, tilt_rad):
+def test_voxelise_equals_brute_force(seed, tilt_rad):
     scene = objects(seed, tilt_rad=tilt_rad)
     got = voxelise(scene, SMALL)
     np.testing.assert_array_equal(got, literal(scene, SMALL))
     assert got.dtype == np.uint8 and 0.05 < (got != EMPTY).mean() < 0.95
 
 
-def test_parts_make_no_difference(monkeypatch):
+def test_voxelise_is_independent_of_chunks(monkeypatch):
     scene = objects(8, n=50)
     whole = voxelise(scene, SMALL)
     monkeypatch.setattr(pipelines.geometry.voxels, "PART_COLUMNS", 100)
     np.testing.assert_array_equal(voxelise(scene, SMALL), whole)
 
 
-def test_thin_long_and_flat_primitives_too():
+def test_voxelise_equals_brute_force_for_extreme_shapes():
     rng = np.random.default_rng(0)
     scene = objects(1, n=200)
     size_m = rng.choice([0.02, 0.3, 1.0, 14.0], (200, 3)).astype(np.float32)
@@ -83,7 +83,7 @@ def test_thin_long_and_flat_primitives_too():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_boxes_agree_with_trimesh(seed):
+def test_voxelise_boxes_equal_trimesh(seed):
     scene = objects(seed, n=12).select(slice(None))
     scene = replace(scene, category=np.full(12, CAR, np.int8))
     inside = np.zeros(int(np.prod(SMALL.shape)), bool)
@@ -94,7 +94,7 @@ def test_boxes_agree_with_trimesh(seed):
     np.testing.assert_array_equal((voxelise(scene, SMALL) != EMPTY).reshape(-1), inside)
 
 
-def test_ellipsoids_agree_with_trimesh_up_to_its_facets():
+def test_voxelise_ellipsoids_equal_trimesh_up_to_facets():
     scene = objects(3, n=8)
     scene = replace(scene, category=np.full(8, ELLIPSOID, np.int8), size_m=scene.size_m * 1.5)
     got = (voxelise(scene, SMALL) != EMPTY).reshape(-1)
@@ -112,7 +112,7 @@ def test_ellipsoids_agree_with_trimesh_up_to_its_facets():
     assert not got[~inside(1.005)].any()
 
 
-def test_volumes_come_out():
+def test_voxelise_preserves_volume():
     voxels = VoxelGrid(Grid(front_m=8.0, left_m=8.0, resolution_m=0.1, rows=160, cols=160), -4.0, 4.0, 64)
     for category in (CAR, ELLIPSOID):
         scene = replace(objects(5, 1), category=np.array([category], np.int8), center_m=np.zeros((1, 3), np.float32))
@@ -120,7 +120,7 @@ def test_volumes_come_out():
         assert volume_m3 == pytest.approx(scene.volume_m3.sum(), rel=0.02)
 
 
-def test_the_order_of_primitives_does_not_matter_and_the_finer_category_wins():
+def test_voxelise_ignores_order_and_prefers_finer_category():
     scene = objects(2, n=60)
     shuffled = scene.select(np.random.default_rng(0).permutation(60))
     np.testing.assert_array_equal(voxelise(scene, SMALL), voxelise(shuffled, SMALL))
@@ -130,13 +130,13 @@ def test_the_order_of_primitives_does_not_matter_and_the_finer_category_wins():
     assert (got == CLASS_ID["construction_big"]).sum() == 8**3 - 4**3
 
 
-def test_a_centre_on_the_face_is_inside():
+def test_voxelise_counts_center_on_face_as_inside():
     x, y, z = centers_m(SMALL)[3, 5, 7]
     got = voxelise(one_box([x + 0.5, y, z], [1.0, 0.01, 0.01]), SMALL)  # from the centre of row 3 to that of row 1
     assert np.argwhere(got).tolist() == [[1, 5, 7], [2, 5, 7], [3, 5, 7]]
 
 
-def test_row_0_is_farthest_column_0_leftmost_level_0_lowest():
+def test_voxelise_index_zero_is_farthest_leftmost_lowest():
     got = voxelise(one_box([11.75, 4.75, -1.75], [0.2, 0.2, 0.2]), SMALL)
     assert np.argwhere(got).tolist() == [[0, 0, 0]] and got[0, 0, 0] == CATEGORY_IDS[CAR]
 
@@ -163,8 +163,8 @@ def literal_ground(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pixels", [12, 24, 48])
-def test_ground_is_the_voxel_its_surface_passes_through(pixels):
-    """Under rasters as fine as the voxels, coarser and finer."""
+def test_voxelise_ground_is_voxel_at_surface(pixels):
+    """Rasters as fine as the voxels, coarser and finer."""
     grid = Grid(front_m=12.0, left_m=6.0, resolution_m=12.0 / pixels, rows=pixels, cols=pixels)
     voxels = VoxelGrid(replace(SMALL.columns, left_m=6.0, cols=24), -1.0, -0.2, 8)
     scene = random_scene(4, n=0, grid=grid)
@@ -173,7 +173,7 @@ def test_ground_is_the_voxel_its_surface_passes_through(pixels):
     assert (got != EMPTY).any(axis=2).mean() > 0.3 and ((got != EMPTY).sum(axis=2) <= 1).all()
 
 
-def test_primitives_stand_over_ground():
+def test_voxelise_primitives_override_ground():
     scene = random_scene(4, n=30, grid=SMALL.columns)
     scene = replace(scene, center_m=scene.center_m * np.float32([0.2, 0.2, 0.5]))
     bare, ground = replace(scene, occupied=np.zeros_like(scene.occupied)), scene.select([])
@@ -183,7 +183,7 @@ def test_primitives_stand_over_ground():
     )
 
 
-def test_what_lies_outside_is_counted():
+def test_voxelise_counts_primitives_outside():
     scene = objects(6, n=300)
     corners = scene_from_unit(scene)[:, :3, :3] @ unit_cuboid()[0].T + scene.center_m[:, :, None]
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5).vertices
@@ -202,7 +202,7 @@ def test_what_lies_outside_is_counted():
     assert (outside(scene, SMALL) + got).objects.sum() == 2 * got.objects.sum()
 
 
-def test_ground_outside_is_counted_and_left_out():
+def test_voxelise_counts_and_drops_ground_outside():
     scene = random_scene(4, n=0, grid=SMALL.columns)
     low = replace(scene, height_m=np.where(scene.occupied, np.float32(-2.01), 0))
     high = replace(scene, height_m=np.where(scene.occupied, np.float32(6.0), 0))
@@ -214,18 +214,18 @@ def test_ground_outside_is_counted_and_left_out():
 
 
 @pytest.mark.parametrize("levels", [1, 7, 33, 64])
-def test_any_number_of_levels_up_to_64(levels):
+def test_voxelise_accepts_up_to_64_levels(levels):
     voxels = replace(SMALL, levels=levels)
     scene = objects(7)
     np.testing.assert_array_equal(voxelise(scene, voxels), literal(scene, voxels))
 
 
-def test_an_empty_scene_is_empty_and_the_defaults_are_the_papers():
+def test_voxelise_empty_scene_is_empty_with_defaults_of_paper():
     assert VoxelGrid().shape == (256, 256, 32) and VoxelGrid().step_m == 0.25
     assert not voxelise(objects(0, n=0), SMALL).any()
 
 
 @pytest.mark.parametrize("options", [{"levels": 0}, {"levels": 65}, {"bottom_m": 7.0}, {"top_m": np.nan}])
-def test_bad_grids_are_refused(options):
+def test_voxel_grid_rejects_invalid_options(options):
     with pytest.raises(ValueError, match="VoxelGrid"):
         VoxelGrid(**options)

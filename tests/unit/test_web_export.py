@@ -10,7 +10,7 @@ from pipelines.io.web_export import web_scene
 from pipelines.schema.palette import CLASS_COLORS, ground_ids
 
 
-def test_the_viewer_gets_the_scene(gallery_scenes):
+def test_web_scene_equals_scene(gallery_scenes):
     scene, content = gallery_scenes[0], web_scene(gallery_scenes[0])
     assert len(content["primitives"]) == len(scene)
     for index, primitive in enumerate(content["primitives"]):
