@@ -2,7 +2,7 @@
 
 python benchmarks/iou3d.py
 
-Cases and oracles are those of tests/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
+Cases and oracles are those of tests/unit/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
 float64 where manifold3d disagrees. CPU seconds of one thread.
 """
 

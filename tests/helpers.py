@@ -1,9 +1,10 @@
-"""Helpers for several test modules: the repository's root, scenes, a tiny pipeline, a job as a process, an HTML parser."""
+"""Helpers for several test modules: scenes, a tiny pipeline, processes and an HTML parser."""
 
 import os
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -91,8 +92,8 @@ def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
     return made
 
 
-def same(a, b) -> bool:
-    """All that decoders decide is the same."""
+def scenes_equal(a, b) -> bool:
+    """True if all fields that decoders predict are equal."""
     names = ("category", "center_m", "size_m", "rotation", "height_m", "occupied")
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
 
@@ -132,6 +133,7 @@ def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene
 
 
 def empty_scene() -> Scene:
+    """A scene without primitives and ground."""
     scene = example_scene(0)
     return Scene(
         scene_id="town-1-0000000008",
@@ -149,10 +151,24 @@ def empty_scene() -> Scene:
     )
 
 
-def command(*words: str, **environment: str) -> subprocess.CompletedProcess:
+def run_command(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    """Runs a Python script from the root of the repository, with environment variables added."""
     return subprocess.run(
         [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, env=os.environ | environment, timeout=120
     )
+
+
+def kill_ray_workers(title: str) -> list[int]:
+    """Kills all Ray workers of this process whose title contains `title`; returns their process ids."""
+    import psutil  # bundled with Ray, importable after ray
+
+    killed = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error, IndexError):
+            if title in process.cmdline()[0]:
+                process.kill()
+                killed.append(process.pid)
+    return killed
 
 
 class Page(HTMLParser):
@@ -185,6 +201,7 @@ class Page(HTMLParser):
 
 
 def assert_same_primitives(got: Scene, want: Scene, but: tuple[str, ...] = ()) -> None:
+    """Asserts that all fields of the primitives except `but` are equal."""
     for name in set(PER_PRIMITIVE) - set(but):
         assert np.array_equal(getattr(got, name), getattr(want, name), equal_nan=name == "heading_rad"), name
 
@@ -206,6 +223,7 @@ def street_class_ids(rows: int = 44, cols: int = 60) -> np.ndarray:
 
 
 def save_npz(path, voxels: np.ndarray, name: str = "voxels") -> str:
+    """Writes one array as .npz and returns the path."""
     np.savez(path, **{name: voxels})
     return str(path)
 
@@ -227,6 +245,7 @@ def studio_scene(number: int) -> Scene:
 
 
 def free_port() -> int:
+    """Returns a TCP port of this host that is free."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return listener.getsockname()[1]

@@ -5,14 +5,14 @@ import subprocess
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from helpers import ROOT, command
+from helpers import ROOT, run_command
 
 JOBS = sorted(p.name for p in (ROOT / "jobs").glob("*.py") if os.access(p, os.X_OK))
 
 
 @pytest.mark.parametrize("job", JOBS)
 def test_job_help_describes_job(job):
-    done = command(f"jobs/{job}", "--help")
+    done = run_command(f"jobs/{job}", "--help")
     assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
 
 
@@ -36,7 +36,7 @@ def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
     """The completed commands; two run concurrently, as each takes seconds to start."""
     empty = str(tmp_path_factory.mktemp("empty"))
     with ThreadPoolExecutor(2) as pool:
-        done = pool.map(lambda words: command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
+        done = pool.map(lambda words: run_command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
         return dict(zip(MISTAKES, done, strict=True))
 
 

@@ -1,12 +1,12 @@
 """jobs/evaluate_scenes.py with random Inception weights and with images instead of tables."""
 
 import json
-from contextlib import suppress
 
 import numpy as np
 import pytest
 import safetensors.numpy
 from golden.golden_recipe import random_state_dict
+from helpers import kill_ray_workers
 
 from jobs.evaluate_scenes import Config, evaluate
 from pipelines.evaluation.evaluate import compare, memorisation
@@ -66,19 +66,14 @@ def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
 
 def test_describe_is_unchanged_by_worker_kill(smoke, tmp_path):
     """The worker is killed as soon as the first part is written."""
-    import psutil
-
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     chosen = Selection(dataset.root, "town", "train")
     whole = describe(chosen, dataset, Looks(), str(tmp_path / "whole"))
     killed = []
 
     def kill(scenes: int) -> None:
-        for process in psutil.Process().children(recursive=True) if scenes and not killed else ():
-            with suppress(psutil.Error, IndexError):
-                if "describe_scenes" in process.cmdline()[0]:
-                    process.kill()
-                    killed.append(process.pid)
+        if scenes and not killed:
+            killed.extend(kill_ray_workers("describe_scenes"))
 
     again = describe(chosen, dataset, Looks(), str(tmp_path / "killed"), on_scenes=kill)
     assert len(killed) == 1 and whole.keys() == again.keys()

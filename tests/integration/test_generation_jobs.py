@@ -1,6 +1,5 @@
 """Generation jobs on Ray with the smoke presets: resuming, numbers of actors, killed processes, scores."""
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import duckdb
 import numpy as np
 import pytest
 import trimesh
+from helpers import kill_ray_workers
 
 from models.scene import DENSITIES
 from pipelines.schema.tables import find_shards, read_scenes
@@ -174,8 +174,6 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
 
 
 def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
-    import psutil
-
     from models.labels import LABELS
     from pipelines.generation.sample import SampleRequest, sample_scenes
 
@@ -184,11 +182,8 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
     killed = []
 
     def kill(row: dict) -> None:
-        for process in psutil.Process().children(recursive=True) if not killed else ():
-            with suppress(psutil.Error, IndexError):
-                if "Sampler" in process.cmdline()[0]:
-                    process.kill()
-                    killed.append(process.pid)
+        if not killed:
+            killed.extend(kill_ray_workers("Sampler"))
 
     assert sample_scenes(request, num_actors=1, batch_size=1, on_shard=kill) == 9 and len(killed) == 1
     again, before = list(read_scenes(str(tmp_path))), list(read_scenes(str(samples)))
@@ -197,8 +192,6 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
 
 
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
-    import psutil
-
     from jobs.outpaint_scenes import Config, last_blocks
     from models.pipeline import Resampling
     from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
@@ -220,11 +213,8 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
 
     def kill(blocks: int) -> None:
         counts.append(blocks)
-        for process in psutil.Process().children(recursive=True) if sum(counts) and not killed else ():
-            with suppress(psutil.Error, IndexError):
-                if "Outpainter" in process.cmdline()[0]:
-                    process.kill()
-                    killed.append(process.pid)
+        if sum(counts) and not killed:
+            killed.extend(kill_ray_workers("Outpainter"))
 
     assert outpaint_scenes(request("killed"), chosen, num_actors=3, on_blocks=kill).equals(table)
     assert killed and counts[0] == 0 and sum(counts) == 7

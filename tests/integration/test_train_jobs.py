@@ -9,7 +9,7 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
-from helpers import command
+from helpers import run_command
 from safetensors.torch import load_file
 
 from pipelines.schema.tables import find_shards
@@ -192,7 +192,7 @@ def test_encode_reports_worker_error_in_one_line(home, tmp_path):
         "--output",
         str(tmp_path / "out"),
     )
-    done = command("jobs/encode_latents.py", *words)
+    done = run_command("jobs/encode_latents.py", *words)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-2000:]
     assert path.name in lines[0] and "delete it and run the job that wrote it again" in lines[0]

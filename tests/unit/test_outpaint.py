@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from helpers import QUICK, random_scene, same, small_spec
+from helpers import QUICK, random_scene, scenes_equal, small_spec
 
 from models.composition.infinite import City
 from models.composition.outpaint import Block, Lattice, World, colour, height_near, outward
@@ -189,7 +189,7 @@ def test_outpaint_keeps_given_scene_and_takes_label_per_block(pipeline):
         assert large.occupied.any() and large.scene_id == scene.scene_id
     one = pipeline.outpaint(scene, "low", last=(1, 0, 0, 0), resampling=QUICK)
     other = pipeline.outpaint(scene, "high", last=(1, 0, 0, 0), resampling=QUICK)
-    assert not same(one, other)
+    assert not scenes_equal(one, other)
     with pytest.raises(ValueError, match="outpainting mode 'paste'"):
         pipeline.outpaint(scene, "low", mode="paste", resampling=QUICK)
     with pytest.raises(ValueError, match="the model needs"):
@@ -204,17 +204,17 @@ def test_city_is_independent_of_request_order(pipeline):
         for place in order:
             city.block(place)
         cities.append(city)
-    assert all(same(*(city.block(place).scene for city in cities)) for place in places)
+    assert all(scenes_equal(*(city.block(place).scene for city in cities)) for place in places)
     assert len({city.block(place).datum_m for city in cities for place in places}) > 1
     one = cities[0]
     before = one.block((1, 1))
     for place in list(one.made):
         one.forget(place)
-    assert same(one.block((1, 1)).scene, before.scene) and set(one.made) <= set(product(range(3), repeat=2))
+    assert scenes_equal(one.block((1, 1)).scene, before.scene) and set(one.made) <= set(product(range(3), repeat=2))
     whole = one.scene(70.0, 10.0, 20.0, 30.0)
     assert whole.grid == Grid(70.0, 20.0, 2.0, 40, 25)
     part = one.scene(40.0, -10.0, 20.0, 0.0)
-    assert same(whole.cropped(part.grid), part)
+    assert scenes_equal(whole.cropped(part.grid), part)
     with pytest.raises(ValueError, match="an empty rectangle"):
         one.scene(10.0, -10.0, 5.0, 5.0)
     with pytest.raises(ValueError, match="label 'dense' is unknown"):

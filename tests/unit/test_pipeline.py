@@ -7,7 +7,7 @@ import pytest
 import shapely
 import torch
 from diffusers import DPMSolverMultistepScheduler
-from helpers import LATENT_SHAPE, QUICK, random_scene, same, small_spec
+from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec
 
 from models.composition.inpaint import (
     cells_of,
@@ -88,7 +88,7 @@ def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
         again.use_sampler(name)
         pipeline.use_sampler(name)
         pair = [p.generate(["high"], seed=1, num_inference_steps=5)[0] for p in (pipeline, again)]
-        assert same(*pair)
+        assert scenes_equal(*pair)
 
 
 def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
@@ -125,10 +125,10 @@ def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
     pipeline.register_to_config(existence_threshold=0.3)  # the paper's
     again = PrITTIPipeline.from_pretrained(tmp_path)
     again.set_progress_bar_config(disable=True)
-    assert same(again.decode(latents, identities)[0], probable)
+    assert scenes_equal(again.decode(latents, identities)[0], probable)
     asked = {"seed": 1, "num_inference_steps": 2}
     drawn = again.generate(["low"], **asked)[0], pipeline.generate(["low"], **asked, existence_threshold=middle)[0]
-    assert same(*drawn)
+    assert scenes_equal(*drawn)
     with pytest.raises(ValueError, match="existence_threshold is 30, expected between 0 and 1"):
         pipeline.generate(["low"], **asked, existence_threshold=30)
 
@@ -183,10 +183,10 @@ def test_pipeline_draws_seeds_from_generator(pipeline):
 
     one, again, other = (generate(generator=seeded(seed)) for seed in (7, 7, 8))
     assert [s.scene_id for s in one] == [s.scene_id for s in again] != [s.scene_id for s in other]
-    assert same(one[0], again[0]) and not same(one[0], other[0])
+    assert scenes_equal(one[0], again[0]) and not scenes_equal(one[0], other[0])
     each = generate(generator=[seeded(7), seeded(8)])
     assert [s.scene_id for s in each] == [one[0].scene_id, other[1].scene_id]
-    assert same(each[0], one[0]) and same(each[1], other[1])
+    assert scenes_equal(each[0], one[0]) and scenes_equal(each[1], other[1])
     with pytest.raises(ValueError, match="3 generators for 2 scenes: expected one, or one per scene"):
         generate(generator=[seeded(0)] * 3)
 
@@ -283,7 +283,7 @@ def test_inpaint_decodes_given_ground_exactly(pipeline):
     (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", resampling=QUICK, composite=False)
     (rebuilt,) = pipeline.decode(pipeline.encode([scene]), [scene])
     assert np.array_equal(raw.height_m, rebuilt.height_m) and np.array_equal(raw.occupied, rebuilt.occupied)
-    assert not same(raw, rebuilt)
+    assert not scenes_equal(raw, rebuilt)
 
 
 def test_inpaint_returns_known_latent_exactly(pipeline):
@@ -314,10 +314,10 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
 def test_composite_of_nothing_changes_nothing():
     scene, other = random_scene(0, n=20, grid=SPEC.grid), random_scene(1, n=20, grid=SPEC.grid)
     nothing, everything = np.zeros((32, 32), bool), np.ones((32, 32), bool)
-    assert same(composited(scene, other, nothing, "both"), scene)
-    assert same(composited(scene, other, everything, "both"), other)
+    assert scenes_equal(composited(scene, other, nothing, "both"), scene)
+    assert scenes_equal(composited(scene, other, everything, "both"), other)
     both = composited(composited(scene, other, everything, "ground"), other, everything, "objects")
-    assert same(both, other)
+    assert scenes_equal(both, other)
 
 
 def test_composite_does_not_repeat_object_across_border():
