@@ -905,7 +905,7 @@ def touched_by_map(whole: bytes, broken: bytes) -> Touches:
     return lambda table, row: table == "rasters" and in_broken(row) and not same
 
 
-# ------------------------------------------------------------------------------------------------ one's own drives
+# -------------------------------------------------------------------------------------------------------- custom drives
 
 
 def write_own(root: Path, suffix: str) -> None:

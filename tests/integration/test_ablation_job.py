@@ -16,8 +16,6 @@ from pipelines.evaluation.ablation import (
     measured,
 )
 
-# ---------------------------------------------------------------------------------------------------------- job
-
 
 @pytest.fixture(scope="module")
 def empty_home(cluster, tmp_path_factory):

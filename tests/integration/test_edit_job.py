@@ -14,9 +14,6 @@ def town_scenes(town_drive_3) -> list[Scene]:
     return [town_drive_3.scene(k, split) for k, split in ((0, "train"), (20, "train"), (40, "test"), (60, "test"))]
 
 
-# ------------------------------------------------------------------------------------------------- a whole table
-
-
 @pytest.fixture(scope="module")
 def table(town_scenes, tmp_path_factory) -> str:
     root = str(tmp_path_factory.mktemp("town"))

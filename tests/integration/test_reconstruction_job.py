@@ -13,8 +13,6 @@ from pipelines.evaluation.reconstruction import (
 from pipelines.reporting.reconstruction_report import reconstruction_html
 from pipelines.schema.scene_subset import Selection
 
-# ------------------------------------------------------------------------------------------------- the Ray graph
-
 
 def selection(root: Path) -> Selection:
     return Selection(str(root), "town", "test")

@@ -21,9 +21,6 @@ def town_scenes() -> list[Scene]:
     return [town_drive(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
 
 
-# ---------------------------------------------------------------------------------------------------------- jobs
-
-
 def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
     from jobs.export_scenes import Config as ExportConfig
     from jobs.export_scenes import export

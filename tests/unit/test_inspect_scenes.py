@@ -47,7 +47,7 @@ def generated(tmp_path_factory):
     return root
 
 
-# -------------------------------------------------------------------------------------------------- which scenes
+# ----------------------------------------------------------------------------------------------------- choice of scenes
 
 
 def test_catalogue_finds_scene_by_id(town_dataset):

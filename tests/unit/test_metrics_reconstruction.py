@@ -136,7 +136,7 @@ def test_ap3d_records_join_in_any_grouping():
     assert detection_scores(grouped) == detection_scores(join_matches(parts))
 
 
-# ------------------------------------------------------------------------------------------ by hand
+# -------------------------------------------------------------------------------------------------- hand-computed cases
 
 
 CENTERS = [[0, 0, 0], [10, 0, 0], [20, 0, 0], [30, 0, 0]]

@@ -108,7 +108,7 @@ def test_reconstruction_scores_empty_scene(tmp_path):
     assert reconstruction_scores(records, SPEC, voxel_grid(SPEC))["ground_iou"] == 1
 
 
-# ------------------------------------------------------------------------------------------------- the Ray graph
+# --------------------------------------------------------------------------------------------- chunks, sizes and MLflow
 
 
 def selection(root: Path) -> Selection:

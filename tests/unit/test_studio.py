@@ -9,13 +9,8 @@ from helpers import small_spec, studio_scene, tiny_pipeline
 from models.composition.extend import extended, grown, inpainting, region_blocks, windows
 from models.composition.inpaint import polygon_region
 from models.pipeline import Resampling
-from models.scene import CATEGORY_INDEX
 
 SPEC = small_spec()
-CAR = CATEGORY_INDEX["vehicle_small"]
-
-
-# --------------------------------------------------------------------------------------------------- extended scenes
 
 
 @pytest.mark.parametrize("side", ["ahead", "behind", "left", "right"])
