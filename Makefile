@@ -1,42 +1,67 @@
-# `make demo` and `make test` set up all they need in .venv; a second call does no set-up work.
+# Each target sets up what it needs in .venv; a second call does no set-up work.
+#
+#   make demo        train, sample and report with the demo preset
+#   make lint        ruff: rules and format
+#   make test-fast   tests/unit: no Ray, no browser, about a minute
+#   make test        all tests but slow ones
+#   make test-slow   long checks, marked slow
+#   make coverage    tests/unit with line coverage
 PYTHON ?= python3
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest -q -n 2
 
-# Quiet and quick Ray on small machines; nothing calls home.
+# Quiet and quick Ray on small machines; no telemetry.
 export RAY_AUTH_MODE ?= disabled
 export RAY_USAGE_STATS_ENABLED ?= 0
 export DO_NOT_TRACK ?= true
 export MLFLOW_DISABLE_TELEMETRY ?= true
-# Threads that wait for each other give their core away: spinning ones slow torch fivefold beside a busy process.
+# Waiting threads yield their core: spinning ones slow torch fivefold next to a busy process.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-# Each of Ray's processes imports the same modules: without their bytecode each compiles them anew.
+# All processes of Ray import the same modules: without bytecode on disk each compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint clean
+TESTS := test test-fast test-slow coverage
+.PHONY: demo lint $(TESTS) browser clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
-
-test: export RAY_DATA_USE_DATASOURCE_V2 = 0
-test: export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2
-test: export RAY_worker_niceness = 0
-test: export OMP_NUM_THREADS = 1
-test: .venv/ready
-	$(BIN)/ruff check .
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+$(TESTS): export RAY_DATA_USE_DATASOURCE_V2 = 0
+$(TESTS): export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2
+$(TESTS): export RAY_worker_niceness = 0
+$(TESTS): export OMP_NUM_THREADS = 1
+
+test-fast: .venv/ready
+	$(PYTEST) tests/unit
+
+test: .venv/ready browser
+	$(PYTEST) -m "not slow"
+
+test-slow: .venv/ready
+	$(PYTEST) -m slow
+
+coverage: .venv/ready
+	$(PYTEST) tests/unit --cov
+
+# CI needs a browser, as skipped browser tests fail there. Elsewhere this does nothing.
+browser:
+	@if [ "$$CI" = true ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && \
+	    ! { command -v chromium && command -v chromedriver; } >/dev/null; then \
+	  apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y chromium chromium-driver; \
+	fi
+
 .venv/ready: pyproject.toml infra/constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	PIP_CONSTRAINT=infra/constraints.txt $(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
-	@# The schemas of OpenDRIVE, for a test; what else is in there wants an older numpy.
+	@# The OpenDRIVE schemas for a test. Its dependencies would install an older numpy.
 	$(BIN)/pip install --disable-pip-version-check -q --no-deps asam-qc-opendrive==1.0.0
-	@# Khronos' validator of glTF, for a test that is skipped without it.
+	@# The glTF validator of Khronos, for a test that is skipped without it.
 	-command -v npm >/dev/null && npm install --silent --no-fund --no-audit --prefix .venv/npm gltf-validator@2.0.0-dev.3.10
 	touch $@
 
 clean:
-	rm -rf .venv runs build *.egg-info
+	rm -rf .venv runs build *.egg-info .coverage

@@ -2,7 +2,7 @@
 
 python benchmarks/iou3d.py
 
-Cases and oracles are those of tests/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
+Cases and oracles are those of tests/unit/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
 float64 where manifold3d disagrees. CPU seconds of one thread.
 """
 
@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/unit"))
 
 import numpy as np
 from common import DENSE_SEEDS, interleaved, ratios, spread, where

@@ -1,42 +1,72 @@
 """Fixtures shared by all tests."""
 
+import json
 import os
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
-# Some virtual machines say that they have AMX and stop whoever uses it (oneDNN does, for bfloat16): illegal instruction.
+# Some virtual machines report AMX but stop oneDNN, which uses it for bfloat16, with an illegal instruction.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
-WITH_SMOKE = {f"tests/test_{name}.py" for name in ("evaluate_job", "generation_jobs", "publish", "voxel_import")}
-LONG = ("evaluate_job", "generation_jobs", "voxel_import", "faults", "jobs", "commands", "ablation", "ingest", "street")
+import numpy as np
+import pytest
+from helpers import (
+    REJECT_REASON,
+    ROOT,
+    SHARD_SIZES,
+    TOWN_SLOTS,
+    free_port,
+    random_scene,
+    small_spec,
+    studio_scene,
+    tiny_pipeline,
+)
+
+from models.layout import LayoutSpec
+from models.scene import Scene
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.runtime import storage
+from pipelines.schema.tables import Shard, rejects_table
+
+MARKERS = {"unit": (), "integration": ("ray",), "faults": ("ray", "faults"), "browser": ("ray", "browser")}  # by folder
+SMOKE_MODULES = {"test_evaluate_job", "test_generation_jobs", "test_publish_job", "test_voxel_import_job"}
+SLOW_MODULES = ("test_faults", "test_train_jobs", "test_commands", "test_ablation_job", "test_preprocess_job")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules that take minutes go first, so that none of them is left for one process at the end."""
-    order = {f"test_{name}": place for place, name in enumerate(LONG)}
-    items.sort(key=lambda item: order.get(item.path.stem, len(LONG)))
+    """Marks tests by their folder. Slow modules run first, so that none of them is left for one process at the end."""
+    for item in items:
+        folder, module = item.path.parent.name, item.path.stem
+        for marker in MARKERS[folder]:
+            item.add_marker(marker)
+        if folder == "unit" and "cluster" in item.fixturenames:
+            raise pytest.UsageError(f"{item.nodeid} needs Ray: move it to tests/integration")
+        if "smoke" in item.fixturenames and module not in SMOKE_MODULES:
+            raise pytest.UsageError(f"{item.nodeid} uses the fixture smoke: add {module} to SMOKE_MODULES")
+    order = {name: place for place, name in enumerate((*sorted(SMOKE_MODULES), *SLOW_MODULES))}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """Under `-n 2` a module stays in one process, and so do all modules that use `smoke`; in the order of collection."""
-    config.option.loadscopereorder = False
+    """With several processes, a module runs in one of them, and all SMOKE_MODULES in the same: they share `smoke`."""
     from xdist.scheduler import LoadFileScheduling
 
-    class Scheduling(LoadFileScheduling):
+    class SmokeScheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             module = super()._split_scope(nodeid)
-            return "smoke" if module in WITH_SMOKE else module
+            return "smoke" if Path(module).stem in SMOKE_MODULES else module
 
-    return Scheduling(config, log)
+    config.option.loadscopereorder = False  # keep the order of pytest_collection_modifyitems
+    return SmokeScheduling(config, log)
 
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data beside the checkout."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    path = Path(os.environ.get("PRITTI_TEST_DATA") or beside)
+    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data next to the repository."""
+    path = Path(os.environ.get("PRITTI_TEST_DATA") or ROOT.parent / "shared" / "data")
     if not path.is_dir():
         pytest.skip(f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/")
     return path
@@ -44,7 +74,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
-    """One small local Ray for all tests that need it, and a $PRITTI_HOME that is nobody's."""
+    """One small local Ray cluster for all tests, with an unused $PRITTI_HOME."""
     from jobs.support.cli import RAY_ENVIRONMENT
 
     settings = {
@@ -52,7 +82,7 @@ def cluster(tmp_path_factory):
         "RAY_AUTH_MODE": "disabled",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
-        "RAY_worker_niceness": "0",  # workers must not starve beside the tests of another process
+        "RAY_worker_niceness": "0",  # workers must not starve next to the tests of another process
         "DO_NOT_TRACK": "true",
     }
     os.environ.update(RAY_ENVIRONMENT | settings)
@@ -78,7 +108,7 @@ def cluster(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME of its own, in which the smoke presets have run once: data, models, latents."""
+    """A separate $PRITTI_HOME in which the smoke presets have run once: data, models, latents."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
     from jobs.train_dit import Config, train
@@ -89,7 +119,7 @@ def home(tmp_path_factory, cluster) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME for what comes after training: as `home`, but trained in this process, without Ray Train."""
+    """A $PRITTI_HOME for jobs after training: as `home`, but trained in this process, without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
     import torch
@@ -113,3 +143,179 @@ def smoke(tmp_path_factory, cluster) -> Path:
         monkeypatch.setattr(jobs.support.trainer, "fit", fit_here)
         train(Config(preset="smoke"))
     return path
+
+
+@pytest.fixture(scope="session")
+def town_drive_3() -> Drive:
+    return town_drive(3)
+
+
+@pytest.fixture(scope="session")
+def layout_shards(tmp_path_factory) -> tuple[Shard, ...]:
+    """Shards of SHARD_SIZES random scenes."""
+    root, scenes = str(tmp_path_factory.mktemp("shards")), iter(range(100))
+    found = tuple(Shard(root, "town", "train", k) for k in range(len(SHARD_SIZES)))
+    for shard, count in zip(found, SHARD_SIZES, strict=True):
+        shard.write([random_scene(next(scenes), n=30) for _ in range(count)])
+    return found
+
+
+@pytest.fixture(scope="session")
+def town_dataset(tmp_path_factory) -> str:
+    """A town dataset of 8 + 4 scenes in three shards, with rejects and reader reports, written without Ray."""
+    root = str(tmp_path_factory.mktemp("inspect") / "town")
+    for seed, split, number, count in ((0, "train", 0, 5), (1, "train", 1, 3), (1_000_000, "test", 0, 4)):
+        drive = town_drive(seed)
+        poses = np.linspace(0, len(drive) - 1, count).astype(int)
+        densities = ("low", "medium", "high", "medium", "medium")
+        scenes = [
+            replace(drive.scene(int(pose), split), vegetation_density=label, vehicle_density="medium")
+            for pose, label in zip(poses, densities, strict=False)
+        ]
+        Shard(root, "town", split, number).write(scenes)
+    lost = [
+        {"scene_id": f"town-00000-{k:010d}", "sequence": "00000", "frame": k, "reason": REJECT_REASON} for k in (1, 2)
+    ]
+    storage.write_parquet(rejects_table(lost), Shard(root, "town", "train", 0).path("rejects"))
+    report = {"objects": 9, "boxes": 5, "dropped": {"bridge": 2}, "duplicates": 1}
+    defects = {"defects": [{"index": 7, "label": "car", "reason": "sheared flat"}]}
+    thresholds = {"count_p25": 10.0, "count_p75": 90.0, "volume_p25_m3": 100.0, "volume_p75_m3": 9000.0}
+    description = {
+        "source": "town",
+        "options": {"num_train": 8, "seed": 0},
+        "layout": LayoutSpec(categories=tuple(TOWN_SLOTS), slots=tuple(TOWN_SLOTS.values())).to_dict(),
+        "vegetation_thresholds": thresholds,
+        "vehicle_thresholds": thresholds,
+        "reports": {"00000": report | {"defects": []}, "00001": report | defects},
+    }
+    storage.write_json(description, f"{root}/dataset.json")
+    return root
+
+
+@pytest.fixture(scope="session")
+def reconstruction_dataset(tmp_path_factory) -> Path:
+    """Two shards of 7 and 4 scenes, and an LVAE that predicts only their means."""
+    import torch
+
+    from models.lvae import LayoutVAE
+    from models.tensors import layout_batch
+
+    root = tmp_path_factory.mktemp("rebuild")
+    scenes = [random_scene(k, n=25, split="test") for k in range(11)]
+    for number, part in enumerate((scenes[:7], scenes[7:])):
+        Shard(str(root), "town", "test", number).write(part)
+    torch.manual_seed(0)
+    spec = small_spec(pixels=64)
+    model = LayoutVAE(
+        spec.to_dict(), latent_channels=4, channels=(8, 16, 16), norm_groups=4, width=32, layers=1, heads=2,
+        hidden=32, head_hidden=32,
+    )  # fmt: skip
+    model.start_at(layout_batch(scenes, spec))
+    model.save_pretrained(root / "lvae")
+    return root
+
+
+@pytest.fixture(scope="session")
+def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
+    """Directories of a Stable Diffusion pipeline and its ControlNet: 32 channels, random weights."""
+    import torch
+    from diffusers import (
+        AutoencoderKL,
+        ControlNetModel,
+        DDIMScheduler,
+        StableDiffusionPipeline,
+        UNet2DConditionModel,
+    )
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+    torch.manual_seed(0)
+    root = tmp_path_factory.mktemp("weights")
+    words = [
+        "<|startoftext|>",
+        "<|endoftext|>",
+        *"abcdefghijklmnopqrstuvwxyz",
+        *(f"{c}</w>" for c in "abcdefghijklmnopqrstuvwxyz"),
+    ]
+    (root / "vocab.json").write_text(json.dumps({word: k for k, word in enumerate(words)}))
+    (root / "merges.txt").write_text("#version: 0.2\n")
+    tokenizer = CLIPTokenizer(str(root / "vocab.json"), str(root / "merges.txt"), model_max_length=77)
+    text = CLIPTextModel(
+        CLIPTextConfig(
+            vocab_size=len(words),
+            hidden_size=32,
+            intermediate_size=37,
+            num_hidden_layers=2,
+            num_attention_heads=4,
+            bos_token_id=0,
+            eos_token_id=1,
+        )
+    )
+    common = {
+        "block_out_channels": (32, 64),
+        "layers_per_block": 1,
+        "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D"),
+        "cross_attention_dim": 32,
+        "norm_num_groups": 8,
+        "attention_head_dim": 8,
+    }
+    unet = UNet2DConditionModel(
+        sample_size=32, in_channels=4, out_channels=4, up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"), **common
+    )
+    controlnet = ControlNetModel(in_channels=4, conditioning_embedding_out_channels=(16, 32), **common)
+    embedding = controlnet.controlnet_cond_embedding.conv_out
+    for block in (*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block, embedding):
+        torch.nn.init.normal_(block.weight, std=0.5)  # initially zero: the image would have no effect
+    vae = AutoencoderKL(
+        block_out_channels=(32, 64),
+        down_block_types=("DownEncoderBlock2D",) * 2,
+        up_block_types=("UpDecoderBlock2D",) * 2,
+        latent_channels=4,
+        norm_num_groups=8,
+    )
+    pipeline = StableDiffusionPipeline(
+        vae,
+        text,
+        tokenizer,
+        unet,
+        DDIMScheduler(),
+        safety_checker=None,
+        feature_extractor=None,
+        requires_safety_checker=False,
+    )
+    pipeline.save_pretrained(root / "diffusion", safe_serialization=True)
+    controlnet.save_pretrained(root / "controlnet", safe_serialization=True)
+    return str(root / "diffusion"), str(root / "controlnet")
+
+
+@pytest.fixture(scope="session")
+def studio_files(tmp_path_factory) -> Path:
+    """`tables` with three scenes and `model`, a pipeline with random weights."""
+    root = tmp_path_factory.mktemp("studio")
+    Shard(str(root / "tables"), "town", "test", 0).write([studio_scene(k) for k in range(3)])
+    tiny_pipeline(small_spec()).save_pretrained(root / "model")
+    return root
+
+
+@pytest.fixture(scope="module")
+def studio_url(studio_files, cluster) -> Iterator[str]:
+    """URL of a studio that Ray Serve serves."""
+    from ray import serve as ray_serve
+
+    from jobs.serve_studio import Config, serve
+
+    yield serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), threads=1))
+    ray_serve.shutdown()
+
+
+@pytest.fixture(scope="session")
+def gallery_scenes(town_drive_3) -> list[Scene]:
+    return [town_drive_3.scene(k, "test") for k in (0, 20, 40)]
+
+
+@pytest.fixture(scope="session")
+def gallery_page(gallery_scenes, tmp_path_factory, cluster) -> Path:
+    from jobs.inspect_scenes import Gallery, write_gallery
+
+    root = tmp_path_factory.mktemp("gallery")
+    Shard(str(root), "town", "test", 0).write(gallery_scenes)
+    return Path(write_gallery(Gallery(dataset=str(root), title="Three <scenes>", output=str(root / "gallery.html"))))

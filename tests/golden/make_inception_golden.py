@@ -1,12 +1,12 @@
-"""Writes torch_fidelity.safetensors beside it: what torch-fidelity computes from golden_recipe.py.
+"""Writes torch_fidelity.safetensors: the results of torch-fidelity for the inputs of golden_recipe.py.
 
-Features (4 pictures) of its Inception extractor with random weights, and its FID, Inception score, KID, precision and
-recall of given features. In an environment of its own (CUDA builds, which also run on a CPU: torchvision does not import
-beside CPU torch), from the root of the repository:
+These are features of 4 images from its Inception extractor with random weights, and its FID, Inception score, KID,
+precision and recall of given features. Run it in a separate environment from the root of the repository. The packages
+are CUDA builds, which also run on a CPU, because torchvision does not import with a CPU build of torch:
 
     python3 -m venv /tmp/fidelity
     /tmp/fidelity/bin/pip install torch===2.13.0 torchvision==0.28.0 torch-fidelity==0.4.0 safetensors
-    PYTHONPATH=.:tests /tmp/fidelity/bin/python tests/golden/make_inception_golden.py
+    PYTHONPATH=. /tmp/fidelity/bin/python tests/golden/make_inception_golden.py
 """
 
 import json

@@ -1,0 +1,333 @@
+"""Generation jobs on Ray with the smoke presets: resuming, numbers of actors, killed processes, scores."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+import trimesh
+from helpers import kill_ray_workers
+
+from models.scene import DENSITIES
+from pipelines.schema.tables import find_shards, read_scenes
+
+
+@pytest.fixture(scope="session")
+def samples(smoke) -> Path:
+    from jobs.sample_scenes import Config, sample
+
+    model, output = str(smoke / "models/pritti-smoke"), smoke / "generated"
+    sample(Config(model=model, output=str(output), num_scenes=9, steps=10, batch_size=8, glb=1))
+    return output
+
+
+def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path):
+    from jobs.sample_scenes import Config, sample
+    from models.tensors import EXISTENCE_THRESHOLD
+
+    model = str(smoke / "models/pritti-smoke")
+    sample(Config(model=model, output=str(tmp_path), num_scenes=9, steps=10, batch_size=1, actors=2))
+    a, b = list(read_scenes(str(samples))), list(read_scenes(str(tmp_path)))
+    assert [s.scene_id for s in a] == [s.scene_id for s in b] and len(a) == 9
+    assert [s.vegetation_density for s in a] == [*DENSITIES] * 3
+    for one, other in zip(a, b, strict=True):
+        sure = [s.select(np.abs(s.existence - EXISTENCE_THRESHOLD) > 1e-3) for s in (one, other)]
+        assert np.array_equal(sure[0].category, sure[1].category)
+        assert np.allclose(sure[0].center_m, sure[1].center_m, atol=0.01)
+        assert (one.occupied == other.occupied).mean() > 0.999
+
+
+def test_sample_resumes_where_it_stopped(smoke, samples):
+    from jobs.sample_scenes import Config, sample
+
+    shards = find_shards(str(samples))
+    before = [s.scene_id for s in read_scenes(str(samples))]
+    kept, lost = Path(shards[0].path("scenes")), Path(shards[1].path("rasters"))
+    stamp = kept.stat().st_mtime_ns
+    lost.unlink()
+    config = Config(model=str(smoke / "models/pritti-smoke"), output=str(samples), num_scenes=9, steps=10, batch_size=8)
+    sample(config)
+    assert kept.stat().st_mtime_ns == stamp and lost.exists()
+    assert [s.scene_id for s in read_scenes(str(samples))] == before
+    with pytest.raises(ValueError, match="with seed=0, asked for 5"):
+        sample(replace(config, seed=5))
+    with pytest.raises(ValueError, match=r"with existence_threshold=0.3, asked for 0.5"):
+        sample(replace(config, existence_threshold=0.5))
+    with pytest.raises(ValueError, match="unknown to a vegetation model, expected one of: low, medium, high"):
+        sample(replace(config, run="x", labels=("dense",)))
+
+
+def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
+    from jobs.sample_scenes import Config, sample
+
+    asked = []
+    monkeypatch.setattr("pipelines.generation.sample.sample_scenes", lambda request, *_: asked.append(request))
+    for repair in (False, True):
+        sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, glb=0, repair=repair))
+    assert [request.repair for request in asked] == [False, True]
+
+
+def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
+    from jobs.sweep_samplers import Config, sweep_samplers
+
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"),
+        real=str(smoke / "datasets/smoke"),
+        samplers=("dpm++",),
+        steps=(2, 4),
+        num_scenes=6,
+        pictures=2,
+        output=str(tmp_path),
+    )
+    rows = sweep_samplers(config)
+    assert [(row["sampler"], row["steps"], row["scenes"]) for row in rows] == [("dpm++", 2, 6), ("dpm++", 4, 6)]
+    assert all(row["layout_frechet_low"] <= row["layout_frechet"] and row["seconds_per_scene"] > 0 for row in rows)
+    assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
+    assert (tmp_path / "samplers.html").read_text().count("<img") == 4
+    assert "<svg" in (tmp_path / "samplers-layout_frechet.svg").read_text()
+    assert sweep_samplers(config) == rows  # nothing is sampled or timed again
+    found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
+    assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
+    with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
+        sweep_samplers(replace(config, samplers=("euler",)))
+
+
+def test_sample_glb_has_named_node_per_primitive(samples):
+    scene = next(read_scenes(str(samples)))
+    path = samples / "glb/samples" / f"{scene.scene_id}.glb"
+    nodes = set(trimesh.load(path).graph.nodes)
+    for category in set(scene.label):
+        assert sum(node.startswith(category) for node in nodes) == (scene.label == category).sum()
+
+
+def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
+    from jobs.evaluate_scenes import Config, evaluate
+    from jobs.evaluate_seams import Config as SeamsConfig
+    from jobs.evaluate_seams import evaluate_seams
+    from jobs.outpaint_scenes import Config as OutpaintConfig
+    from jobs.outpaint_scenes import outpaint
+    from jobs.sweep_seams import Config as SweepConfig
+    from jobs.sweep_seams import sweep_seams
+
+    model = str(smoke / "models/pritti-smoke")
+    options = OutpaintConfig(
+        model=model,
+        input=str(samples),
+        source="generated-samples",
+        output=str(tmp_path),
+        steps=8,
+        jump_length=2,
+        resamplings=2,
+    )
+    outpaint(options)
+    large, small = next(read_scenes(str(tmp_path))), next(read_scenes(str(samples), "generated-samples"))
+    assert large.grid.rows == 2 * small.grid.rows and large.occupied.shape[1:] == (64, 64)
+    middle = large.cropped(small.grid)
+    assert np.array_equal(middle.occupied, small.occupied) and len(middle) == len(small)
+    assert np.allclose(middle.height_m, small.height_m, atol=0.006)
+    assert (tmp_path / "glb/outpainted").is_dir()
+
+    real = str(smoke / "datasets/smoke")
+    looked = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), actors=1)
+    seams = evaluate_seams(looked)
+    assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
+    query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
+    assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
+    assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
+
+    row, guided = sweep_seams(
+        SweepConfig(
+            model,
+            str(samples),
+            "generated-samples",
+            settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
+            output=str(tmp_path / "sweep"),
+        )
+    )
+    assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
+    assert guided["evaluations"] == 4 and guided["known_guidance"] == 1 and guided["objects_per_ha"] > 0
+    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)]
+    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 2
+
+    scores = evaluate(
+        Config(
+            real=real,
+            generated=str(samples),
+            lvae=str(smoke / "models/lvae-smoke"),
+            pictures=0,
+            actors=1,
+            output=str(tmp_path),
+        )
+    )
+    made = scores["generation"]
+    assert made["scenes"] == {"real": 9, "generated": 9}
+    assert made["layout_frechet"]["low"] < made["layout_frechet"]["value"] < made["layout_frechet"]["high"]
+    assert 0 <= scores["reconstruction"]["ground_iou"] <= 1
+    written = duckdb.sql(
+        f"select value, low, high from '{tmp_path}/metrics.parquet' where metric = 'generation.layout_frechet'"
+    ).fetchall()
+    assert written[0] == tuple(made["layout_frechet"].values())
+    assert "fid" not in made and "precision_k3" not in made
+    page = (tmp_path / "evaluation.html").read_text()
+    assert page.count("<img") >= 2 * 9 and "95 % bootstrap" in page
+
+
+def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
+    from models.labels import LABELS
+    from pipelines.generation.sample import SampleRequest, sample_scenes
+
+    model = str(smoke / "models/pritti-smoke")
+    request = SampleRequest(model, str(tmp_path), "samples", 9, LABELS["vegetation"], 0, 10, 1.0, shard_scenes=1)
+    killed = []
+
+    def kill(row: dict) -> None:
+        if not killed:
+            killed.extend(kill_ray_workers("Sampler"))
+
+    assert sample_scenes(request, num_actors=1, batch_size=1, on_shard=kill) == 9 and len(killed) == 1
+    again, before = list(read_scenes(str(tmp_path))), list(read_scenes(str(samples)))
+    assert [scene.scene_id for scene in again] == [scene.scene_id for scene in before]
+    assert all(np.array_equal(a.occupied, b.occupied) for a, b in zip(again, before, strict=True))
+
+
+def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
+    from jobs.outpaint_scenes import Config, last_blocks
+    from models.pipeline import Resampling
+    from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
+    from pipelines.schema.scene_subset import Selection
+
+    def request(name: str, **options) -> OutpaintRequest:
+        resampling = Resampling(num_steps=4, jump_length=2, resamplings=2)
+        model = str(smoke / "models/pritti-smoke")
+        made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", resampling, 1.0)
+        return replace(made, **{"last": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
+
+    chosen = Selection(str(samples), "generated-samples", None, 1, "first")
+    table = outpaint_scenes(request("whole"), chosen)
+    assert len(table) == 8 and set(table.column_names) >= {"ahead", "left", "datum_m", "known_ground"}
+    (whole,) = read_scenes(str(tmp_path / "whole"))
+    assert (whole.grid.rows, whole.grid.cols) == (32 + 3 * 24, 32 + 24)
+    assert not list((tmp_path / "whole/blocks").rglob("*.safetensors"))
+    killed, counts = [], []
+
+    def kill(blocks: int) -> None:
+        counts.append(blocks)
+        if sum(counts) and not killed:
+            killed.extend(kill_ray_workers("Outpainter"))
+
+    assert outpaint_scenes(request("killed"), chosen, num_actors=3, on_blocks=kill).equals(table)
+    assert killed and counts[0] == 0 and sum(counts) == 7
+
+    class Stop(Exception):
+        pass
+
+    def stop(blocks: int) -> None:
+        if blocks:
+            raise Stop
+
+    with pytest.raises(Stop):
+        outpaint_scenes(request("resumed"), chosen, on_blocks=stop)
+    left = []
+    assert outpaint_scenes(request("resumed"), chosen, on_blocks=left.append).equals(table) and left[0] > 0
+    for name in ("killed", "resumed"):
+        (again,) = read_scenes(str(tmp_path / name))
+        for part in ("category", "center_m", "size_m", "height_m", "occupied"):
+            assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
+    (outward,) = outpaint_scenes(request("outward", order="outward", last=(1, 0, 0, 0)), chosen).to_pylist()[1:]
+    assert outward["ahead"] == 1
+    assert last_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != last_blocks(Config(extent_m=(64.0, 65.0)))
+    for wrong in (Config(extent_m=(32.0, 64.0)), Config(ahead=0, behind=0, left=0, right=0), Config(ahead=-1)):
+        with pytest.raises(ValueError, match="expected"):
+            last_blocks(wrong)
+
+
+def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
+    from jobs.inpaint_scenes import Config, inpaint
+
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"),
+        input=str(samples),
+        source="generated-samples",
+        half_plane=(1.0, 0.0, 32.0),
+        contents="objects",
+        variants=2,
+        limit=2,
+        output=str(tmp_path),
+        steps=8,
+        jump_length=2,
+        resamplings=2,
+    )
+    drift = inpaint(config)
+    assert 0 <= drift["ground_iou"] <= 1 and 0 <= drift["objects_found"] <= 1
+    given, made = list(read_scenes(str(samples), limit=2)), list(read_scenes(str(tmp_path)))
+    assert len({scene.scene_id for scene in made}) == 4 == len(list((tmp_path / "glb/inpainted").iterdir()))
+    for k, scene in enumerate(made):
+        assert np.array_equal(scene.occupied, given[k // 2].occupied)
+        behind = [sorted(s.center_m[s.center_m[:, 0] < 32].tolist()) for s in (scene, given[k // 2])]
+        assert behind[0] == behind[1]
+    assert (tmp_path / "inpainted.html").read_text().count("<img") == 6
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
+    assert inpaint(config) == drift and times == {path: path.stat().st_mtime_ns for path in times}
+    with pytest.raises(ValueError, match="holds a run 'inpainted' with seed=0, asked for 1"):
+        inpaint(replace(config, seed=1))
+    with pytest.raises(ValueError, match="the region holds no pixel"):
+        inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
+    Path(find_shards(str(samples))[0].path("scenes")).touch()  # it may hold other scenes now
+    with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):
+        inpaint(config)
+
+
+def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
+    from models.pipeline import Resampling
+    from pipelines.generation.outpaint import OutpaintRequest
+    from pipelines.generation.sample import claim_run, load_pipeline
+
+    model = str(smoke / "models/pritti-smoke")
+    pipeline = load_pipeline(model)
+    for run, resampling in (("paper", Resampling()), ("guided", Resampling.guided())):
+        request = OutpaintRequest(model, str(tmp_path), run, None, 0, 0.5, "reencode", resampling, 1.0)
+        pipeline.register_to_config(noise_scaling=1.0)
+        claim_run(request, pipeline, [str(smoke)])
+        pipeline.register_to_config(noise_scaling=1.01)
+        if run == "paper":  # does not scale the noise
+            claim_run(request, pipeline, [str(smoke)])
+    with pytest.raises(ValueError, match=r"holds a run 'guided' with noise_scaling=1.0, asked for 1.01"):
+        claim_run(request, pipeline, [str(smoke)])
+
+
+def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
+    """Training scenes scored against themselves give the noise floor of the evaluator."""
+    from pipelines.evaluation.evaluate import compare
+    from pipelines.evaluation.features import Looks, describe
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection
+
+    dataset = Dataset.open(str(smoke / "datasets/smoke"))
+    side = describe(Selection(dataset.root, "town", "train"), dataset, Looks(), str(tmp_path / "described"))
+    scores = compare(side, side, dataset.spec.ground_classes)
+    assert abs(scores["layout_frechet"].value) < 1e-4 and abs(scores["random_frechet"].value) < 1e-4
+    assert scores["random_precision_k3"].value == scores["random_recall_k3"].value == 1.0
+    assert scores["random_coverage_k3"].value == 1.0
+    assert scores["label_fidelity"]["joint_fidelity"].value == 1.0
+    assert all(found["between"].value == 0 for found in scores["distance"].values())
+
+
+def test_describe_resumes_where_it_stopped(smoke, tmp_path, monkeypatch):
+    """Existing parts are kept, missing ones recomputed; other options or scenes start again."""
+    from pipelines.evaluation import features as module
+    from pipelines.schema.dataset import Dataset
+    from pipelines.schema.scene_subset import Selection
+
+    dataset = Dataset.open(str(smoke / "datasets/smoke"))
+    chosen, looks, directory = Selection(dataset.root, "town", "train"), module.Looks(), tmp_path / "described"
+    first = module.describe(chosen, dataset, looks, str(directory))
+    parts = sorted(directory.glob("part-*.parquet"))
+    assert len(parts) == len(chosen.shards()) > 1
+    kept, times = parts[1:], [part.stat().st_mtime_ns for part in parts[1:]]
+    parts[0].unlink()
+    again = module.describe(chosen, dataset, looks, str(directory))
+    assert [part.stat().st_mtime_ns for part in kept] == times
+    assert all(np.array_equal(first[name], again[name], equal_nan=name == "statistics") for name in first)
+    module.describe(chosen, dataset, module.Looks(supersample=2), str(directory))
+    assert all(part.stat().st_mtime_ns > time for part, time in zip(kept, times, strict=True))

@@ -1,0 +1,155 @@
+"""Publishing a model: it requires an evaluation and training records, and the model is found by every name."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from models.pretrained import CHECKSUMS, checksums
+
+
+@pytest.fixture(scope="module")
+def evaluated(smoke) -> Path:
+    """Scores of scenes and reconstructions of the smoke model."""
+    from jobs import evaluate_scenes, sample_scenes
+
+    sample_scenes.sample(
+        sample_scenes.Config(
+            num_scenes=6, run="judged", sampler="dpm++", steps=2, noise_scaling=1.01, existence_threshold=0.25
+        )
+    )
+    real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
+    config = evaluate_scenes.Config(
+        real=real, real_split="test", run="judged", lvae=lvae, limit=4, pictures=0, actors=1
+    )  # fmt: skip
+    evaluate_scenes.evaluate(config)
+    return smoke / "evaluations/judged"
+
+
+def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
+    from jobs.publish_model import Config, publish
+    from jobs.support.options import pipeline_directory
+    from pipelines.generation.sample import load_pipeline
+
+    output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
+    entry = Path(output)
+    assert reference == "models:/tiny/1" and entry == smoke / "zoo/tiny"
+    assert json.loads((entry / CHECKSUMS).read_text()) == checksums(entry)
+    card, scores = (entry / "README.md").read_text(), json.loads((evaluated / "metrics.json").read_text())
+    assert f"| {scores['generation']['random_frechet']['value']:.3g}"[:8] in card
+    assert "| steps done | 8 |" in card and "learning_rate 0.001" in card and "options" in card
+    for path in entry.rglob("*"):  # no path of this machine
+        assert path.is_dir() or b"/tmp/" not in path.read_bytes()
+    for picture in ("samples.png", "failures.png"):
+        assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
+    pipeline = load_pipeline(output)  # samples with the evaluated settings
+    assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
+    trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
+    for name in ("tiny", reference, run_id):
+        again = load_pipeline(pipeline_directory(name)).dit.state_dict()
+        assert {name: value.tolist() for name, value in again.items()} == trained
+    kept = smoke / "registry" / run_id
+    assert json.loads((kept / CHECKSUMS).read_text()) == checksums(kept) and len(list(kept.parent.iterdir())) == 1
+    second = publish(Config(name="tiny", evaluation=str(evaluated)))
+    assert second[1] == "models:/tiny/2"
+    (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
+    damaged.write_text(damaged.read_text() + " ")
+    with pytest.raises(ValueError, match=r"models:/tiny/2: its files are not those of its checksums.json"):
+        pipeline_directory(second[1])
+    assert not (smoke / "registry" / second[2]).exists()
+    assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
+
+
+def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path):
+    from jobs.publish_model import Config, publish
+
+    with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
+        publish(Config(name="none", evaluation=str(tmp_path)))
+    about, scores = (json.loads((evaluated / f"{name}.json").read_text()) for name in ("evaluation", "metrics"))
+    other = about | {"sampling": about["sampling"] | {"weights": "aa-bb"}}
+    elsewhere = tmp_path / "town"
+    elsewhere.mkdir()
+    (elsewhere / "dataset.json").write_text((Path(about["real"]) / "dataset.json").read_text())
+    inpainted = about | {"sampling": {"weights": about["sampling"]["weights"]}}
+    repaired = about | {"sampling": about["sampling"] | {"repair": True}}
+    for spoilt, less, message in (
+        (repaired, {}, "of repaired scenes; sample without --repair"),
+        (other, {}, r"of other weights \(aa-bb\)"),
+        (about | {"sampling": None}, {}, "of other weights"),
+        (inpainted, {}, "not of scenes that jobs/sample_scenes.py made"),
+        (
+            about | {"real": str(elsewhere)},
+            {},
+            r"against .*/town, but the Layout VAE was trained on .*; run .* --real",
+        ),
+        (about, {"reconstruction"}, "no scores of reconstruction"),
+    ):
+        (tmp_path / "evaluation.json").write_text(json.dumps(spoilt))
+        (tmp_path / "metrics.json").write_text(json.dumps({k: v for k, v in scores.items() if k not in less}))
+        with pytest.raises(ValueError, match=message):
+            publish(Config(name="none", evaluation=str(tmp_path)))
+    assert not (smoke / "zoo/none").exists()
+
+
+def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatch, tmp_path):
+    from jobs.publish_model import Config, publish
+
+    first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
+    monkeypatch.setattr("jobs.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"), evaluation=str(evaluated), output=str(tmp_path / "second"), register=False
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="made these weights"):
+        publish(config)
+    (tmp_path / "zoo").mkdir()
+    first.rename(tmp_path / "zoo/first")  # without access to MLflow, training.json of the entry is used
+    publish(config)
+    cards = [tmp_path / place / "README.md" for place in ("zoo/first", "second")]
+    assert cards[0].read_text() == cards[1].read_text()
+
+
+def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
+    import torch
+
+    from jobs.publish_model import history
+    from jobs.support.trainer import as_tensors, tag_weights
+    from jobs.train_dit import Config, prepare
+    from pipelines.generation.sample import load_pipeline
+    from pipelines.training.data_loader import batches
+    from pipelines.training.latents import weights_digest
+
+    start, more = str(tmp_path / "start"), tmp_path / "more"
+    pipeline = load_pipeline(str(smoke / "models/pritti-smoke"))
+    pipeline.register_to_config(noise_scaling=1.01, existence_threshold=0.25)
+    pipeline.save_pretrained(start)
+    options = {"final_learning_rate": 1e-5, "warmup_steps": 1, "steps": 2}
+    run, complete = prepare(Config(preset="smoke", name="more", start_from=start, **options))
+    trainer = run.build(torch.device("cpu"), lambda model: model)
+    first = load_pipeline(start).dit
+    assert weights_digest(trainer.model) == weights_digest(first) == run.identity["start_from"]
+    assert [run.settings.at(step)[0] for step in (0, 1)] == [pytest.approx(1e-3), pytest.approx(1e-5)]
+    for batch in batches(run.stream, run.reader, 0, run.settings.steps):
+        trainer.step(as_tensors(batch), range(run.stream.batch_size))
+    tag_weights(run.tracker, trainer.averaged(), trainer.steps_done)
+    told = history("pritti-dit", "Transformer", trainer.averaged())
+    assert [(run.name, run.stage, run.steps) for run in told] == [
+        ("dit", "Transformer", 8),
+        ("dit-2", "Transformer, run 2", 2),
+    ]
+    assert told[1].options["start_from"] == told[0].weights == weights_digest(first)
+    first.save_pretrained(more / "dit")
+    sampling = load_pipeline(complete(str(more))).config
+    assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights
+    with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
+        prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
+    with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
+        prepare(Config(preset="smoke", name="other", start_from="town"))
+
+
+def test_pipeline_directory_rejects_unknown_model(smoke, tmp_path):
+    from jobs.support.options import pipeline_directory
+
+    for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
+        with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
+            pipeline_directory(name)

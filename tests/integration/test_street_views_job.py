@@ -1,0 +1,68 @@
+"""Street views and exports of a table of scenes, on Ray."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from models.scene import Scene
+from pipelines.io.mesh_export import scene_triangles
+from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.schema.palette import CATEGORY_IDS
+from pipelines.schema.tables import Shard
+
+
+@pytest.fixture(scope="module")
+def town_scenes() -> list[Scene]:
+    return [town_drive(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
+
+
+def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
+    from jobs.export_scenes import Config as ExportConfig
+    from jobs.export_scenes import export
+    from jobs.render_streets import Config, render
+
+    nothing = np.zeros_like(town_scenes[1].occupied)
+    bare = replace(town_scenes[1], scene_id="bare", occupied=nothing, height_m=np.zeros(nothing.shape, np.float32))
+    Shard(str(tmp_path), "town", "test", 0).write([town_scenes[0], bare])
+    options = Config(input=str(tmp_path), limit=2, spacing_m=8.0, width=176, height=47)
+    frames = render(options)
+    assert frames["bare"] == 0 and frames[town_scenes[0].scene_id] > 5
+    where = tmp_path / "streets" / "drive" / town_scenes[0].scene_id
+    about = json.loads((where / "cameras.json").read_text())
+    assert len(about["frames"]) == len(list((where / "depth").glob("*.png"))) == frames[town_scenes[0].scene_id]
+    first = about["frames"][0]
+    camera_m = np.array(first["scene_from_camera"])[:3, 3]
+    position = town_scenes[0].select(np.zeros(1, int))
+    ground_m, _ = replace(position, center_m=camera_m[None].astype(np.float32)).ground_under()
+    assert camera_m[2] - ground_m[0] == pytest.approx(1.55, abs=0.1)
+    depth_m = np.asarray(Image.open(where / "depth" / "000000.png")) / about["depth_per_m"]
+    ids = np.asarray(Image.open(where / "class_id" / "000000.png"))
+    instances = np.asarray(Image.open(where / "instance" / "000000.png")).astype(int)
+    assert depth_m.shape == ids.shape == (47, 176) and depth_m.max() > 20 and instances.max() <= len(town_scenes[0])
+    assert (ids[instances > 0] == CATEGORY_IDS[town_scenes[0].category[instances[instances > 0] - 1]]).all()
+    written = (where / "sheet.png").stat().st_mtime_ns
+    assert render(options) == frames and (where / "sheet.png").stat().st_mtime_ns == written
+    with pytest.raises(ValueError, match=r"run 'drive' with spacing_m=8.0, asked for 2.0; choose another --run"):
+        render(replace(options, spacing_m=2.0))
+
+    output, counts, refused = export(ExportConfig(str(tmp_path), formats=("glb", "ply", "npz", "xodr")))
+    assert counts == {"glb": 2, "ply": 2, "npz": 2, "xodr": 1}
+    assert list(refused) == ["bare"] and refused["bare"].startswith("xodr: scene bare has no road")
+    path = Path(output)
+    mesh = trimesh.load(path / "ply" / f"{town_scenes[0].scene_id}.ply", process=False)
+    soup = scene_triangles(town_scenes[0])
+    assert len(mesh.faces) == len(soup.corners_m)
+    assert np.allclose(
+        np.sort(mesh.area_faces),
+        np.sort(
+            trimesh.Trimesh(
+                soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False
+            ).area_faces
+        ),
+        atol=1e-3,
+    )

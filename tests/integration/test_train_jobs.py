@@ -1,0 +1,198 @@
+"""Training jobs on Ray with the smoke presets: the chain of jobs, resuming, two workers, bad input."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+from helpers import run_command
+from safetensors.torch import load_file
+
+from pipelines.schema.tables import find_shards
+
+
+def weights(directory: Path) -> dict:
+    return load_file(directory / "diffusion_pytorch_model.safetensors")
+
+
+def test_train_dit_creates_inputs_of_smoke_preset(home):
+    assert (home / "datasets/smoke/dataset.json").exists()
+    rows = duckdb.sql(
+        f"select split, count(*), count(distinct vegetation_density) from '{home}/datasets/smoke/scenes/**/*.parquet' group by 1"
+    ).fetchall()
+    assert {split: count for split, count, _ in rows} == {"train": 32, "test": 16}
+    latents = json.loads((home / "datasets/smoke/latents.json").read_text())
+    assert latents["complete"] and latents["scenes"] == {"train": 32, "test": 16}
+    assert (home / "models/pritti-smoke/model_index.json").exists()
+    assert not list(home.rglob("*.pkl")) and not list(home.rglob("*.pt"))
+
+
+def test_encode_latents_match_lvae_and_scene_order(home):
+    from models.tensors import layout_batch
+    from pipelines.training.latents import load_lvae
+
+    shard = find_shards(str(home / "datasets/smoke"), split="test")[0]
+    table, scenes = shard.read("latents"), shard.scenes()
+    assert table["scene_id"].to_pylist() == [s.scene_id for s in scenes]
+    lvae = load_lvae(str(home / "models/lvae-smoke"))
+    want = lvae.encode(layout_batch(scenes, lvae.spec)).mean.numpy()
+    got = table["mean"].combine_chunks().to_numpy_ndarray()
+    assert got.dtype == np.float16 and np.allclose(got, want, atol=2e-3 * np.abs(want).max())
+
+
+def test_train_logs_run_and_model_to_mlflow(home):
+    from jobs.support.tracking import client
+
+    api = client(f"sqlite:///{home}/mlflow.db")
+    for experiment in ("pritti-lvae", "pritti-dit"):
+        run = api.search_runs([api.get_experiment_by_name(experiment).experiment_id])[0]
+        assert run.info.status == "FINISHED" and run.data.params["preset"] == "smoke"
+        assert {"loss", "learning_rate", "scenes_per_second", "validation_loss"} <= set(run.data.metrics)
+        assert len(api.get_metric_history(run.info.run_id, "loss")) == 8
+        artifacts = {a.path for a in api.list_artifacts(run.info.run_id)}
+        assert "model" in artifacts and artifacts & {"reconstruction", "samples"}
+
+
+def test_train_lvae_leaves_finished_run_unchanged(home):
+    from jobs.train_lvae import Config, train
+
+    before = weights(home / "models/lvae-smoke")
+    train(Config(preset="smoke"))
+    after = weights(home / "models/lvae-smoke")
+    assert all((before[k] == after[k]).all() for k in before)
+    with pytest.raises(ValueError, match=r"run 'lvae-smoke' was started with learning_rate=0.001, asked for 0.5"):
+        train(Config(preset="smoke", learning_rate=0.5))
+
+
+def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
+    """A worker is killed during training; Ray Train starts another from the last checkpoint."""
+    from jobs.support.trainer import fit
+    from jobs.train_lvae import Config, prepare
+
+    marker, seen = str(tmp_path / "died"), tmp_path / "validated"
+    run = prepare(Config(preset="smoke", name="lvae-killed", checkpoint_every=3))
+    first = run.reader
+
+    class DieOnce:
+        def __call__(self, trainer):
+            with seen.open("a") as file:
+                print(trainer.steps_done, file=file)
+            if trainer.steps_done >= 6 and not os.path.exists(marker):
+                open(marker, "w").close()
+                os.kill(os.getpid(), 9)
+            return {}, {}
+
+    output = fit(replace(run, validate=DieOnce(), reader=first), 1, str(home / "models/lvae-killed"))
+    assert seen.read_text().split() == ["3", "6", "6", "8"]  # killed at step 6, resumes from the checkpoint at step 3
+    whole, resumed = weights(home / "models/lvae-smoke"), weights(Path(output))
+    assert all((whole[k] == resumed[k]).all() for k in whole)
+
+
+def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
+    import jobs.support.trainer
+    from jobs.support.trainer import fit
+    from jobs.train_dit import Config, prepare, train
+
+    seen = tmp_path / "validated"
+
+    def note(trainer):
+        with seen.open("a") as file:
+            print(trainer.steps_done, file=file)
+        return {}, {}
+
+    def stop_at_four(trainer):
+        if trainer.steps_done == 4:
+            raise KeyError("stopped")
+        return {}, {}
+
+    monkeypatch.setattr(jobs.support.trainer, "RETRIES", 0)
+    run, _ = prepare(Config(preset="smoke", name="dit-two", workers=2, checkpoint_every=2))
+    assert run.stream.batch_size == 8
+    with pytest.raises(Exception, match="stopped"):
+        fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
+    fit(replace(run, validate=note), 2, str(home / "models/two"))
+    assert seen.read_text().split() == ["4", "6", "8"]  # from the checkpoint at step 2, not from the start
+    one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two")
+    for name in one:
+        assert np.allclose(one[name], two[name], atol=1e-4), name
+    assert not list((home / "runs").rglob("*.pkl"))
+    with pytest.raises(ValueError, match=r"--workers is 4, this cluster of 2 CPUs has room for 1 to 3"):
+        train(Config(preset="smoke", name="dit-four", workers=4))
+    with pytest.raises(ValueError, match="--batch-size 7 does not divide by --workers 2"):
+        train(Config(preset="smoke", name="dit-odd", workers=2, batch_size=7))
+
+
+def test_train_lvae_with_two_workers_matches_one(home):
+    from jobs.train_lvae import Config, train
+
+    output = train(Config(preset="smoke", name="lvae-two", workers=2))
+    one, two = weights(home / "models/lvae-smoke"), weights(Path(output))
+    distance = max(np.abs(one[name] - two[name]).max() for name in one)
+    assert distance < 1e-2, distance
+
+
+def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
+    from jobs.train_lvae import Config, train
+
+    kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
+    assert train(Config(preset="smoke", name="decoder", keep_latents_of=str(kept))) == str(output)
+    old, new = weights(kept / "lvae"), weights(output / "lvae")
+    changed = {name for name in old if (old[name] != new[name]).any()}
+    assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
+    assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
+    with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
+        train(Config(preset="smoke", name="smoke", keep_latents_of=str(kept)))
+    with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
+        train(
+            Config(
+                preset="demo",
+                name="other",
+                dataset=str(home / "datasets/smoke"),
+                keep_latents_of=str(kept),
+            )
+        )
+
+
+def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
+    from jobs.encode_latents import Config, encode
+    from jobs.preprocess_scenes import Town, main
+
+    main(Town(output=str(tmp_path), num_train=8, num_test=8, seed=5))
+    with pytest.raises(ValueError, match=r"lvae-smoke has another LayoutSpec: \w+ is .*, expected .*; use the dataset"):
+        encode(Config(dataset=str(tmp_path), lvae=str(home / "models/lvae-smoke")))
+    assert not (tmp_path / "latents").exists()
+
+
+def test_train_lvae_names_truncated_shard(home, tmp_path):
+    from jobs.train_lvae import Config, train
+
+    shutil.copytree(home / "datasets/smoke", tmp_path / "data")
+    for shard in find_shards(str(tmp_path / "data"), split="train"):
+        path = Path(shard.path("rasters"))
+        path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(ValueError, match=r"rasters/.*parquet: cannot be read as Parquet"):
+        train(Config(preset="smoke", dataset=str(tmp_path / "data"), name="lvae-truncated"))
+
+
+def test_encode_reports_worker_error_in_one_line(home, tmp_path):
+    """An actor in another process finds a truncated shard: no traceback, exit code 2."""
+    shutil.copytree(home / "datasets/smoke", tmp_path / "data")
+    (tmp_path / "data/latents.json").unlink()
+    path = Path(find_shards(str(tmp_path / "data"))[-1].path("rasters"))
+    path.write_bytes(path.read_bytes()[:-50])
+    words = (
+        "--dataset",
+        str(tmp_path / "data"),
+        "--lvae",
+        str(home / "models/lvae-smoke"),
+        "--output",
+        str(tmp_path / "out"),
+    )
+    done = run_command("jobs/encode_latents.py", *words)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 2 and len(lines) == 1, done.stderr[-2000:]
+    assert path.name in lines[0] and "delete it and run the job that wrote it again" in lines[0]

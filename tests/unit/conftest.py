@@ -1,0 +1,11 @@
+"""Fixtures of tests without Ray."""
+
+import pytest
+from helpers import small_spec, tiny_pipeline
+
+from models.pipeline import PrITTIPipeline
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> PrITTIPipeline:
+    return tiny_pipeline(small_spec())

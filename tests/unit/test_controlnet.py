@@ -1,0 +1,58 @@
+"""The ControlNet step: a real diffusers pipeline with small random weights, saved and loaded."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import street_class_ids
+
+from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, control_image
+from pipelines.schema.palette import CLASS_COLORS, CLASS_ID
+
+
+def request(controlnet_weights: tuple[str, str], **changes) -> PhotoRequest:
+    return PhotoRequest(
+        *controlnet_weights,
+        **(
+            {
+                "prompt": "a street",
+                "negative_prompt": "",
+                "steps": 2,
+                "guidance_scale": 3.0,
+                "control_scale": 1.0,
+                "seed": 0,
+            }
+            | changes
+        ),
+    )
+
+
+def test_control_image_uses_palette_and_sky():
+    image = control_image(street_class_ids())
+    assert image.dtype == np.uint8 and image[0, 0].tolist() == list(SKY)
+    assert image[-1, 0].tolist() == CLASS_COLORS[CLASS_ID["road"]].tolist()
+
+
+def test_painter_depends_on_image_prompt_and_seed(controlnet_weights):
+    painter = Painter(request(controlnet_weights))
+    first = painter.paint(street_class_ids())
+    assert first.shape == (44, 60, 3) and first.dtype == np.uint8 and first.std() > 1  # 44 is no multiple of 8
+    assert np.array_equal(first, painter.paint(street_class_ids()))
+    assert not np.array_equal(first, painter.paint(street_class_ids()[::-1].copy()))
+    for other in ({"seed": 1}, {"prompt": "xyz"}, {"control_scale": 0.0}):
+        assert not np.array_equal(first, Painter(request(controlnet_weights, **other)).paint(street_class_ids())), other
+
+
+def test_painter_names_missing_weights(controlnet_weights, tmp_path):
+    from jobs.paint_streets import Config, paint
+
+    with pytest.raises(ValueError, match="--diffusion is missing"):
+        paint(Config(controlnet=controlnet_weights[1]))
+    with pytest.raises(ValueError, match=r"--controlnet .*nowhere: no model here"):
+        paint(Config(diffusion=controlnet_weights[0], controlnet=str(tmp_path / "nowhere")))
+    for path in Path(controlnet_weights[1]).glob("*.json"):
+        (tmp_path / path.name).write_text(path.read_text())
+    with pytest.raises(ValueError, match="no Stable Diffusion and ControlNet weights"):
+        Painter(request((controlnet_weights[0], str(tmp_path))))
+    with pytest.raises(ValueError, match="no street views here; run jobs/render_streets"):
+        paint(Config(streets=str(tmp_path), diffusion=controlnet_weights[0], controlnet=controlnet_weights[1]))

@@ -1,0 +1,25 @@
+"""Conventions that the tests follow: where their modules lie and how test functions are named."""
+
+import ast
+from collections import Counter
+
+import pytest
+from helpers import ROOT
+
+FOLDERS = ("unit", "integration", "faults", "browser")
+MODULES = sorted((ROOT / "tests").rglob("test_*.py"))
+
+
+def test_modules_lie_in_known_folders_with_unique_names():
+    assert {path.parent.relative_to(ROOT / "tests").as_posix() for path in MODULES} == set(FOLDERS)
+    assert max(Counter(path.name for path in MODULES).values()) == 1  # pytest imports them by name
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_names_are_at_most_60_characters(folder):
+    paths = [path for path in MODULES if path.parent.name == folder]
+    functions = [
+        node for path in paths for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)
+    ]
+    names = [node.name for node in functions if node.name.startswith("test_")]
+    assert names and [name for name in names if len(name) > 60 or name.startswith(("test_a_", "test_the_"))] == []

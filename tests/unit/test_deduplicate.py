@@ -1,0 +1,85 @@
+"""Of two objects in nearly the same place the higher-confidence one is kept; neighbours are both kept."""
+
+from dataclasses import replace
+
+import numpy as np
+from helpers import random_scene
+
+from models.composition.deduplicate import DRAWN_IOU3D, doubles, repeated
+from models.geometry.iou3d import boxes_of, iou3d_matrix
+from models.scene import CATEGORY_INDEX, Grid
+
+SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
+
+
+def row_of_boxes(shift_m, existence, category="construction_small"):
+    """Upright boxes of 4 x 1 x 1 m in a row along x, at `shift_m` from the first."""
+    n = len(shift_m)
+    center = np.stack([20 + np.asarray(shift_m, np.float32), np.zeros(n), np.ones(n)], axis=1).astype(np.float32)
+    return replace(
+        random_scene(0, n=n, grid=SMALL),
+        center_m=center,
+        rotation=np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)),
+        size_m=np.tile(np.float32([4, 1, 1]), (n, 1)),
+        category=np.full(n, CATEGORY_INDEX[category], np.int8),
+        existence=np.asarray(existence, np.float32),
+    )
+
+
+def test_find_duplicates_finds_known_object():
+    scene = random_scene(0, n=10, grid=SMALL)
+    near = replace(scene, center_m=scene.center_m + np.float32(0.01))
+    assert doubles(near, scene).all() and not doubles(near, scene.select(slice(0, 0))).any()
+    assert not doubles(replace(near, category=(near.category + 1) % 11), scene).any()
+
+
+def test_find_duplicates_finds_shifted_copy_but_no_neighbor():
+    known = row_of_boxes([0], [0.9], "vegetation_cuboid")
+    drawn_aside, beside = [2.5, 7], [0.2, 2.5]  # IoU 1.5 / 6.5 is small; at 2.5 it is the known one or its neighbour
+    for shift_m, again in ((drawn_aside, [True, False]), (beside, [True, False]), ([3.9, 7], [False, False])):
+        assert doubles(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+
+
+def test_find_duplicates_keeps_slightly_overlapping_neighbors():
+    known = row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
+    made = row_of_boxes(
+        [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
+    )  # .053 and .039 with the two known; .046 with the first
+    overlaps = iou3d_matrix(boxes_of(made), boxes_of(known))
+    assert (
+        overlaps[0, 0] > DRAWN_IOU3D > overlaps[1, 0] > 0
+        and 0 < overlaps[0, 1] < DRAWN_IOU3D < overlaps[1, 0] + overlaps[0, 1]
+    )
+    assert doubles(made, known).tolist() == [True, False]
+
+
+def test_suppress_duplicates_keeps_higher_confidence():
+    assert repeated(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
+    assert repeated(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
+        False,
+        True,
+    ]  # the first of two with equal confidence
+    assert repeated(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [False, False]  # 1 / 7: the next part of a fence
+
+
+def test_suppress_duplicates_uses_threshold_of_category():
+    for category, both_stay in (("vehicle_small", False), ("vehicle_big", False), ("construction_big", True)):
+        assert repeated(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [False, not both_stay]  # 1 / 7
+        assert not repeated(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
+        assert repeated(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [False, True]  # 1 / 3
+        made, known = row_of_boxes([0, 3], [0.9, 0.9], category), row_of_boxes([0], [0.6], category)
+        assert doubles(made, known).tolist() == [True, not both_stay]
+
+
+def test_suppress_duplicates_ignores_suppressed_objects():
+    # The middle one overlaps both others by 1 / 3; these two do not overlap.
+    assert repeated(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
+    assert repeated(row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
+
+
+def test_suppress_duplicates_lets_plants_and_categories_overlap():
+    assert not repeated(row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
+    pair = row_of_boxes([0, 1], [0.6, 0.9])
+    mixed = replace(pair, category=np.array([pair.category[0], CATEGORY_INDEX["pole"]], np.int8))
+    assert not repeated(mixed).any()
+    assert repeated(pair.select(slice(0, 0))).shape == (0,)

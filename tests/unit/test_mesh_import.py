@@ -1,0 +1,394 @@
+"""GLB files are read as scenes: own exports exactly, files of the authors (FORMATS.md, section 4) by shape."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import random_rotations, random_scene
+
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, Grid, Scene, canonical_boxes
+from pipelines.io.mesh_export import scene_glb
+from pipelines.io.mesh_import import scene_from_glb
+from pipelines.schema.palette import COLOR_HEX, rgb
+
+SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
+Z_DOWN = np.diag([1.0, -1.0, -1.0])
+CAR = CATEGORY_INDEX["vehicle_small"]
+
+
+@pytest.fixture(scope="module")
+def town_scenes(town_drive_3) -> list[Scene]:
+    return [town_drive_3.scene(k, "test") for k in (0, len(town_drive_3) // 2)]
+
+
+def corners_m(scene: Scene) -> np.ndarray:
+    """(n, 8, 3)."""
+    return (SIGNS * scene.size_m[:, None]) @ np.swapaxes(scene.rotation, 1, 2) + scene.center_m[:, None]
+
+
+def scatter_m2(scene: Scene) -> np.ndarray:
+    """(n, 3, 3) R diag(size)^2 R^T: the shape of an ellipsoid, independent of its axis order."""
+    axes = scene.rotation.astype(float) * scene.size_m[:, None]
+    return axes @ np.swapaxes(axes, 1, 2)
+
+
+def surface_classes(scene: Scene) -> np.ndarray:
+    return np.array([*scene.ground_classes, ""])[scene.surface()[1]]
+
+
+def assert_same_ground(got: Scene, want: Scene) -> None:
+    assert np.array_equal(got.surface()[0], want.surface()[0])
+    assert np.array_equal(surface_classes(got), surface_classes(want))
+    assert np.array_equal(got.occupied.sum(axis=0), want.occupied.any(axis=0))  # one class per pixel
+
+
+def edited(glb: bytes, change) -> bytes:
+    """The GLB with its JSON changed."""
+    size = int.from_bytes(glb[12:16], "little")
+    tree = json.loads(glb[20 : 20 + size])
+    change(tree)
+    header = json.dumps(tree).encode()
+    header += b" " * (-len(header) % 4)
+    body = len(header).to_bytes(4, "little") + b"JSON" + header + glb[20 + size :]
+    return glb[:8] + (12 + len(body)).to_bytes(4, "little") + body
+
+
+# ------------------------------------------------------------------------------------------------------ our own
+
+
+def assert_same_scene(got: Scene, want: Scene) -> None:
+    assert np.abs(corners_m(got) - corners_m(want)).max(initial=0) < 1e-3
+    for name in ("category", "center_m", "size_m", "existence", "heading_rad", "instance_id", "label"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
+    for name in ("scene_id", "source", "sequence", "frame", "split", "grid", "ground_classes", "world_xyz_m"):
+        assert getattr(got, name) == getattr(want, name), name
+    for name in ("world_yaw_rad", "vegetation_density", "vehicle_density"):
+        assert getattr(got, name) == getattr(want, name), name
+    assert_same_ground(got, want)
+
+
+def test_scene_from_glb_round_trips_own_export(town_scenes):
+    labelled = replace(town_scenes[0], vegetation_density="high", vehicle_density="low")
+    for scene in (*town_scenes, labelled, random_scene(1, tilt_rad=np.pi)):
+        got = scene_from_glb(scene_glb(scene))
+        assert_same_scene(got, scene)
+        assert np.abs(got.rotation - scene.rotation).max() < 1e-6
+    assert len(scene) == 40 and sum(len(s) for s in town_scenes) > 100 and labelled.occupied.any()
+
+
+def test_scene_from_glb_keeps_fused_scene(town_scenes):
+    once = scene_from_glb(scene_glb(town_scenes[0]))
+    twice = scene_from_glb(scene_glb(once))
+    assert np.array_equal(once.height_m, twice.height_m) and np.array_equal(once.occupied, twice.occupied)
+    assert np.array_equal(once.size_m, twice.size_m)
+
+
+def test_scene_from_glb_round_trips_any_grid():
+    grid = Grid(front_m=96.5, left_m=20.0, resolution_m=0.7, rows=30, cols=50)
+    scene = replace(random_scene(2, grid=grid), ground_classes=("sidewalk", "crossing", "road", "ground", "terrain"))
+    assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
+
+
+@pytest.mark.parametrize("stride", [2, 256])
+def test_scene_from_glb_round_trips_isolated_pixels(stride):
+    scene = random_scene(3, n=2)
+    lonely = np.zeros_like(scene.occupied)
+    lonely[2, ::stride, ::stride] = True
+    scene = replace(scene, occupied=lonely, height_m=np.where(lonely, np.float32(0.37), np.float32(0)))
+    assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
+
+
+def test_scene_from_glb_round_trips_empty_scene():
+    scene = random_scene(0, n=0)
+    scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
+    got = scene_from_glb(scene_glb(scene))
+    assert len(got) == 0 and not got.occupied.any() and got.grid == scene.grid
+
+
+def test_scene_from_glb_applies_node_transform():
+    scene = replace(random_scene(4, n=3, tilt_rad=0.0), heading_rad=np.float32([0.1, 0.2, 0.3]))
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+
+    def change(tree):
+        node = next(node for node in tree["nodes"] if node["name"].endswith("_0001"))
+        matrix = np.array(node["matrix"]).reshape(4, 4).T
+        matrix[:3, :3] = turn @ matrix[:3, :3]
+        matrix[0, 3] += 1.5
+        node["matrix"] = matrix.T.ravel().tolist()
+
+    got = scene_from_glb(edited(scene_glb(scene), change), scene_id="edited")
+    box = SIGNS * scene.size_m[1] @ (turn @ scene.rotation[1]).T + scene.center_m[1] + [1.5, 0, 0]
+    apart = np.linalg.norm(corners_m(got)[1][:, None] - box[None], axis=-1)
+    assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
+    assert np.isnan(got.heading_rad[1]) and np.array_equal(got.heading_rad[[0, 2]], scene.heading_rad[[0, 2]])
+    assert got.scene_id == "edited"
+
+
+# -------------------------------------------------------------------------------------------- the authors' form
+
+
+def three_sphere() -> tuple[np.ndarray, np.ndarray]:
+    """63 vertices of radius 1, 9 columns x 7 rows, poles on y, and 80 triangles; two vertices are unused."""
+    u, v = np.meshgrid(np.arange(9) / 8 * 2 * np.pi, np.arange(7) / 6 * np.pi)
+    vertices = np.stack([-np.cos(u) * np.sin(v), np.cos(v), np.sin(u) * np.sin(v)], axis=-1).reshape(-1, 3)
+    faces = []
+    for row in range(6):
+        for col in range(8):
+            b, a = 9 * row + col, 9 * row + col + 1
+            c, d = b + 9, a + 9
+            faces += [[a, b, d]] * (row > 0) + [[b, c, d]] * (row < 5)
+    return vertices, np.array(faces)
+
+
+def three_box() -> tuple[np.ndarray, np.ndarray]:
+    """Eight vertices at ±0.5 in the order of FORMATS.md, section 1, and twelve triangles."""
+    corners = [
+        [(1 if s == "+" else -1) / 2 for s in word] for word in ["+++", "++-", "+-+", "+--", "-+-", "-++", "---", "--+"]
+    ]
+    corners, faces = np.array(corners), []
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            a, b, c, d = np.flatnonzero(corners[:, axis] == side)
+            far = max((b, c, d), key=lambda k: np.linalg.norm(corners[k] - corners[a]))
+            near = [k for k in (b, c, d) if k != far]
+            faces += [[a, near[0], far], [a, far, near[1]]]
+    return corners, np.array(faces)
+
+
+def painted(vertices, faces, name: str | np.ndarray, linear: bool) -> trimesh.Trimesh:
+    names = np.broadcast_to(name, len(vertices))
+    color = np.array([rgb(COLOR_HEX[n]) for n in names]) / 255
+    if linear:
+        color = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    rgba = np.hstack([np.round(255 * color), np.full((len(vertices), 1), 255)]).astype(np.uint8)
+    return trimesh.Trimesh(vertices, faces, vertex_colors=rgba, process=False)
+
+
+def authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
+    height, winner = scene.surface()
+    i, j = np.nonzero(winner >= 0)
+    vertices = np.stack([64 - 0.25 * i, -32 + 0.25 * j, -height[i, j].astype(float)], axis=1)
+    at = np.full((257, 257), -1)
+    at[i, j] = np.arange(len(i))
+    here, below, right, across = at[:-1, :-1], at[1:, :-1], at[:-1, 1:], at[1:, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((here, below, right), (right, below, across))])
+    names = np.array(scene.ground_classes)[winner[i, j]]
+    return painted(vertices, faces[(faces >= 0).all(axis=1)], names, linear)
+
+
+def authors_glb(
+    scene: Scene, merged: bool = False, linear: bool = False, unmerged: bool = False, faces: bool = False
+) -> bytes:
+    """The scene in the format of the published files (FORMATS.md, section 4), exported by trimesh."""
+    parts = [(authors_ground(scene, linear), np.eye(4))] if scene.occupied.any() else []
+    for k, category in enumerate(scene.category):
+        round_ = category == ELLIPSOID
+        transform = np.eye(4)
+        transform[:3, :3] = Z_DOWN @ scene.rotation[k] * scene.size_m[k] / (2 if round_ else 1)
+        transform[:3, 3] = Z_DOWN @ scene.center_m[k]
+        parts.append((painted(*(three_sphere() if round_ else three_box()), CATEGORIES[category], linear), transform))
+    if unmerged:
+        for mesh, _ in parts:
+            mesh.unmerge_vertices()
+    if merged:
+        whole = trimesh.util.concatenate([mesh.copy().apply_transform(transform) for mesh, transform in parts])
+        if faces:
+            color = whole.visual.vertex_colors[whole.faces[:, 0]]
+            whole = trimesh.Trimesh(whole.vertices, whole.faces, face_colors=color, process=False)
+        parts = [(whole, np.eye(4))]
+    out = trimesh.Scene()
+    for k, (mesh, transform) in enumerate(parts):
+        out.add_geometry(mesh, geom_name=f"mesh{k}", transform=transform)
+    return out.export(file_type="glb")
+
+
+def assert_same_primitives(got: Scene, want: Scene) -> None:
+    """Asserts a one-to-one match in any order: boxes by their corners, ellipsoids by their shape."""
+    assert np.array_equal(got.counts(), want.counts())
+    left = list(range(len(got)))
+    for k, corners in enumerate(corners_m(want)):
+        same = [i for i in left if got.category[i] == want.category[k]]
+        nearest = min(
+            same,
+            key=lambda i: (
+                np.abs(scatter_m2(got)[i] - scatter_m2(want)[k]).max()
+                + np.linalg.norm(got.center_m[i] - want.center_m[k])
+            ),
+        )
+        left.remove(nearest)
+        assert np.linalg.norm(got.center_m[nearest] - want.center_m[k]) < 1e-3
+        if want.category[k] == ELLIPSOID:
+            assert np.abs(scatter_m2(got)[nearest] - scatter_m2(want)[k]).max() < 1e-3
+        else:
+            apart = np.linalg.norm(corners_m(got)[nearest][:, None] - corners[None], axis=-1)
+            assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
+    rotation, size_m = canonical_boxes(got.rotation, got.size_m)
+    assert np.allclose(rotation, got.rotation, atol=1e-5) and np.array_equal(size_m, got.size_m)
+
+
+@pytest.mark.parametrize("merged", [False, True], ids=["instances", "merged"])
+@pytest.mark.parametrize("linear", [False, True], ids=["sRGB", "linear"])
+def test_scene_from_glb_reads_format_of_authors(town_scenes, merged, linear):
+    scene = town_scenes[1]
+    got = scene_from_glb(authors_glb(scene, merged, linear))
+    assert_same_primitives(got, scene)
+    assert_same_ground(got, scene)
+    assert got.source == "imported" and got.split == "generated" and got.grid == Grid()
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_scene_from_glb_keeps_pitch_and_roll(merged):
+    rng = np.random.default_rng(5)
+    rotation, size_m = canonical_boxes(random_rotations(rng, 60), rng.choice([0.05, 0.5, 3, 14], (60, 3)))
+    roll = trimesh.transformations.rotation_matrix(0.4, [1, 0, 0])[:3, :3]
+    rotation, size_m = canonical_boxes(rotation @ roll, size_m)
+    scene = replace(random_scene(5, n=60), rotation=rotation.astype(np.float32), size_m=size_m.astype(np.float32))
+    assert_same_primitives(scene_from_glb(authors_glb(scene, merged)), scene)
+
+
+def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
+    scene = town_scenes[1].select(np.arange(20))
+    assert {ELLIPSOID, *scene.category} > {ELLIPSOID}
+    for merged in (False, True):
+        got = scene_from_glb(authors_glb(scene, merged, unmerged=True))
+        assert_same_primitives(got, scene)
+        isolated = got.occupied.any(axis=0) != scene.occupied.any(axis=0)  # in no triangle, so absent from this file
+        assert isolated.sum() < 50
+
+
+def test_scene_from_glb_mixes_face_colors_only_on_borders(town_scenes):
+    scene = town_scenes[1]
+    got = scene_from_glb(authors_glb(scene, merged=True, faces=True))
+    assert_same_primitives(got, scene)
+    both = got.occupied.any(axis=0) & scene.occupied.any(axis=0)
+    assert both.sum() > 0.99 * scene.occupied.any(axis=0).sum()
+    assert np.array_equal(got.surface()[0][both], scene.surface()[0][both])
+    assert (surface_classes(got) == surface_classes(scene))[both].mean() > 0.97
+
+
+def test_scene_from_glb_reads_mesh_without_extras_by_shape(town_scenes):
+    """Own export without extras, as some editors write it: y up, vertices at pixel centres, linear light."""
+    scene = town_scenes[1]
+
+    def strip(tree):
+        for entry in (*tree["scenes"], *tree["nodes"], *tree["meshes"]):
+            entry.pop("extras", None)
+
+    got = scene_from_glb(edited(scene_glb(scene), strip), axes=("y+", "z+", "x+"))
+    assert_same_primitives(got, scene)
+    assert_same_ground(got, scene)
+
+
+def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
+    (tmp_path / "scene-7.glb").write_bytes(authors_glb(town_scenes[0].select([0])))
+    assert scene_from_glb(tmp_path / "scene-7.glb").scene_id == "scene-7"
+    assert scene_from_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
+
+
+# ------------------------------------------------------------------------------------------------------- faults
+
+
+def one_mesh(vertices, faces, name: str = "vehicle_small") -> bytes:
+    return trimesh.Scene(painted(np.asarray(vertices, float), faces, name, False)).export(file_type="glb")
+
+
+def welded_boxes(name: str) -> bytes:
+    """Two boxes that share a face and its vertices."""
+    boxes = trimesh.creation.box(), trimesh.creation.box(bounds=[[0.5, -0.5, -0.5], [2, 0.5, 0.5]])
+    whole = trimesh.util.concatenate(boxes)
+    whole.merge_vertices()
+    return one_mesh(whole.vertices, whole.faces, name)
+
+
+def sheared() -> bytes:
+    box = trimesh.creation.box()
+    return one_mesh(box.vertices @ np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]), box.faces)
+
+
+def with_json(change) -> bytes:
+    return edited(scene_glb(random_scene(6, n=2)), change)
+
+
+def green() -> bytes:
+    return trimesh.Trimesh(*three_box(), vertex_colors=[10, 200, 10, 255], process=False).export(file_type="glb")
+
+
+FAULTS = {
+    "text": (lambda: b"{}", "not a binary glTF"),
+    "truncated": (lambda: scene_glb(random_scene(6, n=2))[:-100], "expected a whole file"),
+    "uri": (lambda: with_json(lambda t: t["buffers"][0].update(uri="http://x/y.bin")), "buffers lie outside"),
+    "image": (lambda: with_json(lambda t: t.update(images=[{"uri": "../x.png"}])), "images lie outside"),
+    "draco": (lambda: with_json(lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"])), "draco"),
+    "cycle": (lambda: with_json(lambda t: t["nodes"][0].update(children=[0])), "two parents"),
+    "beyond": (lambda: with_json(lambda t: t["accessors"][0].update(count=10**7)), "beyond the file's"),
+    "stride": (lambda: with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond the file's"),
+    "many": (lambda: with_json(lambda t: t["accessors"][0].update(count=10**12)), "more than"),
+    "missing": (lambda: with_json(lambda t: t.pop("accessors")), "not well-formed"),
+    "number": (lambda: with_json(lambda t: t.update(nodes=7)), "not well-formed"),
+    "grid": (lambda: with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)), "its grid is"),
+    "extras": (lambda: with_json(lambda t: t["nodes"][-1]["extras"].pop("label")), "extras are incomplete"),
+    "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class's"),
+    "colour": (green, r"colour #0ac80a \(sRGB\) of 8 vertices is no class's"),
+    "sheared": (sheared, "eight vertices that are not the corners of a box|no square corners"),
+    "welded": (lambda: welded_boxes("vehicle_small"), "no box, but not vegetation"),
+    "bush": (lambda: welded_boxes("vegetation_cuboid"), "neither on a box nor an ellipsoid"),
+    "ball": (lambda: one_mesh(*three_sphere(), "vehicle_small"), "no box, but not vegetation"),
+    "flat": (lambda: one_mesh(three_box()[0] * [1, 1, 0], three_box()[1]), "thinner than 1 mm"),
+    "triangle": (lambda: one_mesh(np.eye(3), [[0, 1, 2]]), "fewer than eight"),
+    "nan": (lambda: one_mesh(np.full((8, 3), np.nan), three_box()[1]), "NaN"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_scene_from_glb_names_unknown_mesh_and_its_content(tmp_path, fault):
+    make, words = FAULTS[fault]
+    path = tmp_path / "theirs.glb"
+    path.write_bytes(make())
+    with pytest.raises(ValueError, match=rf"theirs\.glb: .*({words})"):
+        scene_from_glb(path)
+
+
+def test_scene_from_glb_rejects_wrong_frame_and_axes(town_scenes):
+    glb = authors_glb(town_scenes[0])
+    with pytest.raises(ValueError, match=r"ground vertices, x .* are not one per pixel .*check the axes"):
+        scene_from_glb(glb, axes=("y+", "x+", "z+"))
+    with pytest.raises(ValueError, match=r"axes 'x\+ x\+ z\+': name x"):
+        scene_from_glb(glb, axes=("x+", "x+", "z+"))
+
+
+def test_scene_from_glb_names_missing_file(tmp_path):
+    with pytest.raises(ValueError, match=r"absent\.glb: cannot be read"):
+        scene_from_glb(tmp_path / "absent.glb")
+
+
+def leaves(tree: dict | list) -> list[tuple]:
+    """(container, key) of every value in a JSON tree."""
+    items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
+    return [(tree, k) for k, _ in items] + [leaf for _, v in items if isinstance(v, dict | list) for leaf in leaves(v)]
+
+
+@pytest.mark.parametrize("make", [scene_glb, authors_glb], ids=["ours", "theirs"])
+def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
+    grid = Grid(front_m=64.0, left_m=32.0, resolution_m=0.25, rows=8, cols=8)
+    glb, rng = make(random_scene(7, n=4, grid=grid)), np.random.default_rng(0)
+    values = [None, -1, 0, 10**6, 10**12, 10**400, 1e300, float("nan"), 0.5, True, "x", [], {}, [[1]], {"a": 1}]
+    outcomes = {"scene": 0, "refused": 0}
+    for _ in range(300):
+
+        def change(tree):
+            inside = leaves(tree)
+            container, key = inside[rng.integers(len(inside))]
+            container[key] = values[rng.integers(len(values))]
+
+        try:
+            scene_from_glb(edited(glb, change))
+            outcomes["scene"] += 1
+        except ValueError:
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 25
+
+
+def test_scene_from_glb_of_authors_has_five_ground_classes(town_scenes):
+    assert scene_from_glb(authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]

@@ -1,0 +1,130 @@
+"""Seam scores on hand-computed cases and on scenes with known visible or invisible seams."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import random_scene
+
+from models.pipeline import Resampling
+from models.scene import CATEGORY_INDEX, Grid
+from pipelines.evaluation.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
+from pipelines.metrics.intervals import Estimate
+from pipelines.metrics.seams import MEASURES, footprint_ranges, neighbours, seam_ratios, seam_record
+
+GRID = Grid(64.0, 32.0, 0.25, 256, 256)
+
+
+def speckled(seed: int, block_px: int = 8):
+    """Random ground classes per block of pixels and random heights per pixel: all lines are alike."""
+    rng = np.random.default_rng(seed)
+    scene = random_scene(seed, 0)
+    blocks = 256 // block_px
+    winner = np.roll(
+        rng.integers(0, 5, (blocks, blocks)).repeat(block_px, 0).repeat(block_px, 1), rng.integers(0, 8, 2), (0, 1)
+    )
+    occupied = np.arange(5)[:, None, None] == winner
+    return replace(
+        scene, occupied=occupied, height_m=np.where(occupied, rng.normal(0, 0.1, (256, 256)), 0).astype(np.float32)
+    )
+
+
+def with_cars(scene, centers_xy_m, size_m=(4.0, 2.0, 1.5)):
+    n = len(centers_xy_m)
+    center = np.zeros((n, 3), np.float32)
+    center[:, :2] = centers_xy_m
+    empty = scene.select(np.zeros(len(scene), bool))
+    return replace(
+        empty,
+        category=np.full(n, CATEGORY_INDEX["vehicle_small"], np.int8),
+        center_m=center,
+        rotation=np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)),
+        size_m=np.tile(np.float32(size_m), (n, 1)),
+        existence=np.ones(n, np.float32),
+        heading_rad=np.full(n, np.nan, np.float32),
+        instance_id=np.full(n, -1),
+        label=np.full(n, "car", object),
+    )
+
+
+def ratios(scenes, **lines) -> dict:
+    return seam_ratios(np.stack([seam_record(scene, **lines) for scene in scenes]))
+
+
+def test_seam_ratio_of_invisible_seam_is_one():
+    got = ratios([speckled(seed, block_px=1) for seed in range(60)], rows=[64, 130], cols=[100])
+    for name in ("class_changes", "height_step"):
+        assert got[name].low < 1.02 and got[name].high > 0.98
+        assert got[name].high - got[name].low < 0.1
+    assert got["cut_objects"] is None  # no objects, so no score
+
+
+def test_seam_ratio_shows_change_of_scene():
+    scenes = []
+    for seed in range(20):
+        near, far = speckled(seed), speckled(seed + 100)
+        height = near.height_m.copy()
+        occupied = near.occupied.copy()
+        occupied[:, :128] = far.occupied[:, :128]
+        height[:, :128] = np.where(far.occupied[:, :128], far.height_m[:, :128] + 1, 0)  # a step of a metre
+        scenes.append(replace(near, occupied=occupied, height_m=height.astype(np.float32)))
+    got = ratios(scenes, rows=[128])
+    assert got["class_changes"].low > 3 and got["height_step"].low > 3
+    got = ratios(scenes, rows=[64])
+    assert got["class_changes"].low < 1 < got["class_changes"].high
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_seam_scores_count_cut_and_duplicate_objects(axis):
+    def placed(offset_m, along_m=0.0):
+        at = np.array([32.0, 0.0])
+        at[axis] += offset_m
+        at[1 - axis] += along_m
+        return at
+
+    size = (4.0, 2.0) if axis == 0 else (2.0, 4.0)
+    lines = {"rows": [128]} if axis == 0 else {"cols": [128]}
+    ends = with_cars(speckled(0), [placed(2.0), placed(-2.1, 3)], (*size, 1.5))  # both end within 0.25 m of the line
+    assert seam_record(ends, **lines)[2, 0].tolist() == [2, 2]
+    crosses = with_cars(speckled(0), [placed(0.5)], (*size, 1.5))
+    assert seam_record(crosses, **lines)[2, 0].tolist() == [0, 1]
+    twice = with_cars(speckled(0), [placed(0.6), placed(-0.6), placed(0.0, 8)], (*size, 1.5))
+    assert seam_record(twice, **lines)[3, 0].tolist() == [2, 3]
+    same_side = with_cars(speckled(0), [placed(0.6), placed(0.7)], (*size, 1.5))
+    assert seam_record(same_side, **lines)[3, 0].tolist() == [0, 2]
+
+
+def test_footprint_of_rotated_box_contains_corners():
+    scene = random_scene(3, 50)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    corners = scene.center_m[:, None] + (0.5 * signs[None] * scene.size_m[:, None]) @ scene.rotation.transpose(0, 2, 1)
+    ranges = footprint_ranges(scene)
+    np.testing.assert_allclose(ranges[:, :, 0], corners.min(axis=1)[:, :2], atol=1e-4)
+    np.testing.assert_allclose(ranges[:, :, 1], corners.max(axis=1)[:, :2], atol=1e-4)
+
+
+def test_reference_lines_avoid_every_seam():
+    near = neighbours([100, 130], 256, 0.25)  # 7.5 m apart
+    assert 115 not in near[100] and 84 in near[100] and 85 not in near[100] and 146 in near[100]
+    assert min(abs(line - seam) for line in near[130] for seam in (100, 130)) == 16
+    assert near[100].min() == 36
+
+
+def test_seam_scores_reject_edge_seam_and_skip_empty_scene():
+    with pytest.raises(ValueError, match="seam before pixel 256, expected 1 to 255"):
+        seam_record(speckled(0), rows=[256])
+    empty = replace(speckled(0), occupied=np.zeros((5, 256, 256), bool))
+    assert set(seam_ratios(seam_record(empty, rows=[128])[None]).values()) == {None}
+    assert len(MEASURES) == 4
+
+
+def test_seam_sweep_row_has_cost_and_visibility():
+    ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
+    cars = with_cars(speckled(0), [(10, 0), (20, 3)])
+    assert objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice
+    row = seam_row(Resampling(), 200, 12.3, ratios)
+    assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
+    (cells,) = seam_table([row]).rows
+    assert cells[:8] == (250, 10, 10, 0.0, 1.0, 2410, 12, 200)
+    assert cells[9] == "1.20 (1.00 to 1.50)" and cells[10] is None
+    assert "2410" in seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")

@@ -1,0 +1,149 @@
+"""Validity measures on scenes with known answers; road connectivity equals a flood fill."""
+
+import numpy as np
+import pytest
+
+from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene
+from pipelines.metrics.validity import (
+    LABEL_MEASURES,
+    MEASURES,
+    label_fidelity,
+    scene_validity,
+    validity_rates,
+)
+from pipelines.schema.density_labels import DensityThresholds
+
+GRID = Grid(front_m=16.0, left_m=8.0, resolution_m=1.0, rows=16, cols=16)
+CAR, POLE, HOUSE, TREE, HUMAN = (
+    CATEGORY_INDEX[name] for name in ("vehicle_small", "pole", "construction_big", "vegetation_cuboid", "human")
+)
+SLAB_M = 0.3
+ROAD, SIDEWALK, PARKING = 0, 1, 2
+
+
+def town(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
+    """Road on the left half (y > 0), sidewalk on the right but for the last row, which has no ground at all.
+
+    primitives: (category, x, y, height of the bottom above the surface); all are 2 m cubes but for houses of 4 m.
+    """
+    occupied = np.zeros((5, 16, 16), bool)
+    occupied[ROAD, :, :8] = True
+    occupied[SIDEWALK, :, 8:] = True
+    occupied[PARKING, :2, 8:] = True
+    occupied[:, 15] = False
+    if road is not None:
+        occupied[:] = False
+        occupied[ROAD] = road
+    n = len(primitives)
+    category = np.array([p[0] for p in primitives], np.int8)
+    size_m = np.where(category == HOUSE, 4.0, 2.0).astype(np.float32)[:, None] * np.ones(3, np.float32)
+    center_m = np.array([[p[1], p[2], heights_m + p[3]] for p in primitives], np.float32).reshape(n, 3)
+    center_m[:, 2] += size_m[:, 2] / 2
+    return Scene(
+        "a", "town", "0", 0, "test", category=category, center_m=center_m,
+        rotation=np.tile(np.eye(3, dtype=np.float32), (n, 1, 1)), size_m=size_m,
+        ground_classes=KITTI_GROUND_CLASSES, grid=GRID, occupied=occupied,
+        height_m=np.where(occupied, np.float32(heights_m + SLAB_M), np.float32(0)), **labels,
+    )  # fmt: skip
+
+
+def measure(name: str, scene: Scene) -> tuple[float, float]:
+    return tuple(scene_validity(scene, SLAB_M)[MEASURES.index(name)])
+
+
+def test_validity_overlap_counts_both_solid_objects_of_a_pair():
+    apart, near = (CAR, 3.0, 4.0, 0), (CAR, 4.9, 4.0, 0)  # IoU3D 0.1 / 3.9 = 0.026
+    assert measure("overlapping", town([apart, near])) == (0, 2)
+    assert measure("overlapping", town([apart, (CAR, 4.5, 4.0, 0)])) == (2, 2)  # 0.5 / 3.5 = 0.14
+    assert measure("overlapping", town([apart, (TREE, 3.0, 4.0, 0)])) == (0, 1)
+    assert measure("overlapping", town([apart, (HUMAN, 3.0, 4.0, 0), (POLE, 12.0, -4.0, 0)])) == (2, 3)
+    assert measure("overlapping", town()) == (0, 0)
+
+
+@pytest.mark.parametrize(("bottom_m", "floats", "sinks"), [(0, 0, 0), (0.45, 0, 0), (0.55, 1, 0), (-0.55, 0, 1)])
+def test_validity_floating_is_measured_from_surface_below_slab(bottom_m, floats, sinks):
+    scene = town([(POLE, 5.0, -4.5, bottom_m), (TREE, 5.0, 3.0, 9)])  # a crown may hang
+    assert measure("floating", scene) == (floats, 1)
+    assert measure("sunken", scene) == (sinks, 1)
+
+
+def test_validity_tilted_box_stands_on_lowest_corner():
+    scene = town([(POLE, 5.0, -4.5, 0)])
+    cos = np.sqrt(0.5)
+    tilted = np.array([[[cos, 0, cos], [0, 1, 0], [-cos, 0, cos]]], np.float32)  # lowest corner sqrt(2) below centre
+    object.__setattr__(scene, "rotation", tilted)
+    assert measure("sunken", scene) == (0, 1)  # sqrt(2) - 1 = 0.41 m down
+    object.__setattr__(scene, "center_m", scene.center_m - np.float32([0, 0, 0.1]))
+    assert measure("sunken", scene) == (1, 1)
+
+
+def test_validity_counts_but_does_not_judge_unknown_ground():
+    over_nothing, behind, ahead, good = (
+        (CAR, 0.5, 4.0, 7),
+        (CAR, -3.0, 4.0, 7),
+        (CAR, 20.0, -4.0, 7),
+        (CAR, 5.0, 4.0, 0),
+    )
+    scene = town([over_nothing, behind, ahead, good])
+    assert measure("floating", scene) == (0, 1)
+    assert measure("off_road_vehicles", scene) == (0, 1)
+    assert measure("over_unknown_ground", scene) == (1, 2)
+
+
+def test_validity_expects_cars_on_road_and_houses_off_road():
+    on_road, parked, on_sidewalk = (CAR, 5.0, 4.0, 0), (CAR, 15.5, -4.0, 0), (CAR, 5.0, -4.0, 0)
+    houses = [(HOUSE, 9.0, 4.0, 0), (HOUSE, 9.0, -4.0, 0)]
+    scene = town([on_road, parked, on_sidewalk, *houses])
+    assert measure("off_road_vehicles", scene) == (1, 3)
+    assert measure("buildings_on_road", scene) == (1, 2)
+
+
+def flood(mask: np.ndarray) -> float:
+    """Share of the mask's pixels in its largest 4-connected part."""
+    left, sizes = set(zip(*np.nonzero(mask), strict=True)), []
+    total = len(left)
+    while left:
+        stack, size = [left.pop()], 0
+        while stack:
+            row, col = stack.pop()
+            size += 1
+            for neighbour in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
+                if neighbour in left:
+                    left.remove(neighbour)
+                    stack.append(neighbour)
+        sizes.append(size)
+    return max(sizes) / total
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_road_connectivity_equals_flood_fill(seed):
+    road = np.random.default_rng(seed).random((16, 16)) < 0.5
+    assert measure("road_connectivity", town(road=road)) == pytest.approx((flood(road), 1))
+
+
+def test_road_connectivity_breaks_at_diagonal_and_skips_no_road():
+    assert measure("road_connectivity", town(road=np.eye(16, dtype=bool))) == (1 / 16, 1)
+    assert measure("road_connectivity", town(road=np.zeros((16, 16), bool))) == (0, 0)
+    assert measure("road_connectivity", town()) == (1, 1)
+
+
+def test_validity_rates_pool_scenes_and_skip_absent_categories():
+    good, bad = town([(CAR, 5.0, 4.0, 0)]), town([(CAR, 5.0, -4.0, 0), (CAR, 9.0, -4.0, 0), (CAR, 12.0, 4.0, 3)])
+    rates = validity_rates([scene_validity(good, SLAB_M), scene_validity(bad, SLAB_M)])
+    assert rates["off_road_vehicles"] == 0.5 and rates["floating"] == 0.25
+    assert rates["buildings_on_road"] is None
+    assert list(rates) == list(MEASURES)
+    assert set(validity_rates([]).values()) == {None}
+
+
+def test_label_fidelity_compares_measured_and_stated_label():
+    many = DensityThresholds(count_p25=1.5, count_p75=2.5, volume_p25_m3=10, volume_p75_m3=20)
+    three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3: high; no car: low
+    right = town(three_trees, vegetation_density="high", vehicle_density="low")
+    wrong = town(three_trees, vegetation_density="high", vehicle_density="medium")
+    records = [label_fidelity(scene, many, many) for scene in (right, wrong)]
+    np.testing.assert_array_equal(records[0], [[1, 1], [1, 1], [1, 1]])
+    np.testing.assert_array_equal(records[1], [[1, 1], [0, 1], [0, 1]])
+    assert validity_rates(records, LABEL_MEASURES) == dict(zip(LABEL_MEASURES, (1, 0.5, 0.5), strict=True))
+    with pytest.raises(ValueError, match="no density label"):
+        label_fidelity(town(three_trees), many, many)

@@ -1,0 +1,410 @@
+"""The networks: sizes, masks, equivariance, losses and learning."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from helpers import random_scene, small_spec
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+from torch.nn import functional as F
+
+from models.batch import LayoutBatch
+from models.dit import DiT
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE, Posterior
+from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
+from models.tensors import compact_layout, layout_batch
+from models.training import Execution, Optimisation, Trainer, lvae_trainer, stacked_corruption
+from models.vae.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
+from models.vae.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
+from models.vae.matching import MatchWeights, match
+
+
+def millions(model) -> float:
+    return sum(p.numel() for p in model.parameters()) / 1e6
+
+
+def small_lvae(seed: int = 0, **options) -> LayoutVAE:
+    torch.manual_seed(seed)
+    return LayoutVAE(layout=small_spec().to_dict(), **(LVAE_PRESETS["smoke"].architecture() | options))
+
+
+def test_presets_have_parameter_counts_of_paper():
+    with torch.device("meta"):
+        row = LVAE_PRESETS["kitti360"]
+        lvae = LayoutVAE(layout=LayoutSpec().with_resolution(row.raster_px).to_dict(), **row.architecture())
+        assert lvae.latent_shape == (64, 32, 32)
+        assert abs(millions(lvae) - 93.1) < 0.1
+        for name, count in (("kitti360", 130), ("kitti360-l", 458), ("kitti360-xl", 675)):
+            assert abs(millions(DiT(**DIT_PRESETS[name].architecture())) / count - 1) < 0.005
+
+
+def test_presets_error_lists_known_names():
+    with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"):
+        preset(LVAE_PRESETS, "tiny")
+
+
+def test_object_encoder_ignores_padding_and_order():
+    lvae, spec = small_lvae(), small_spec()
+    batch = layout_batch([random_scene(0), random_scene(1, n=0)], spec)
+    latent = lvae.object_encoder(batch.features, batch.real)
+    assert torch.isfinite(latent).all()
+    assert torch.equal(latent[1], lvae.object_encoder.grid)  # an empty scene is the learnable grid
+    noisy = torch.where(batch.real[..., None], batch.features, torch.rand_like(batch.features))
+    assert torch.allclose(lvae.object_encoder(noisy, batch.real), latent, atol=1e-5)
+    order = torch.cat([torch.randperm(6) + 6 * k for k in range(11)])
+    permuted = lvae.object_encoder(batch.features[:, order], batch.real[:, order])
+    assert torch.allclose(permuted, latent, atol=1e-5)
+
+
+def test_object_encoder_writes_to_cell_under_center():
+    lvae, spec = small_lvae(), small_spec()
+    scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # far left corner
+    batch = layout_batch([scene], spec)
+    change = (lvae.object_encoder(batch.features, batch.real)[0] - lvae.object_encoder.grid).abs().sum(0)
+    assert change[0, 0] > 0 and change.sum() == change[0, 0]
+
+
+def test_layout_vae_latent_is_split():
+    lvae, batch = small_lvae(), layout_batch([random_scene(0)], small_spec())
+    latent = lvae.encode(batch).mean
+    changed = latent.clone()
+    changed[:, latent.shape[1] // 2 :] += 1
+    a, b = lvae.decode(latent), lvae.decode(changed)
+    assert torch.equal(a.height, b.height) and torch.equal(a.occupancy_logit, b.occupancy_logit)
+    assert not torch.allclose(a.features, b.features)
+
+
+def literal_total(features, logit, truth, real, columns) -> float:
+    """The square matching cost of the paper for one category, term by term."""
+    p = torch.sigmoid(logit.double())
+    total = 0.0
+    for i, j in enumerate(columns):
+        target = 1.0 if real[i] else 0.0
+        total += MatchWeights().existence * float(-(target * p[j].log() + (1 - target) * (1 - p[j]).log()))
+        if real[i]:
+            total += MatchWeights().center * float((truth[i, :3] - features[j, :3]).abs().sum())
+            total += MatchWeights().cholesky * float((truth[i, 3:] - features[j, 3:]).abs().sum())
+    return total
+
+
+def test_matching_reaches_optimum_of_padded_square_problem():
+    generator = torch.Generator().manual_seed(0)
+    slots = (9, 1, 6)
+    n = sum(slots)
+    for trial in range(20):
+        features, truth = (torch.rand(1, n, 9, generator=generator) for _ in range(2))
+        logit = 3 * torch.randn(1, n, generator=generator)
+        counts = [int(torch.randint(0, s + 1, (), generator=generator)) for s in slots]
+        real = torch.cat([torch.arange(s) < c for s, c in zip(slots, counts, strict=True)])[None]
+        assignment = match(features, logit, truth, real, slots, slots)[0]
+        start = 0
+        for s, count in zip(slots, counts, strict=True):
+            here = slice(start, start + s)
+            part = (features[0, here], logit[0, here], truth[0, here], real[0, here])
+            square = np.array(
+                [
+                    [literal_total(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
+                    for i in range(s)
+                ]
+            )
+            rows, cols = linear_sum_assignment(square)
+            mine = assignment[here]
+            taken = [int((mine == start + i).nonzero()) for i in range(count)]
+            free = [j for j in range(s) if mine[j] < 0]
+            assert len(taken) + len(free) == s
+            assert abs(literal_total(*part, taken + free) - square[rows, cols].sum()) < 1e-5, trial
+            start += s
+
+
+def test_matching_of_surplus_proposals_is_optimal():
+    """The cell decoder proposes more objects than slots; compares with brute force over the rectangular cost."""
+    generator = torch.Generator().manual_seed(3)
+    slots, proposals, weights = (3, 2), (7, 5), MatchWeights(1.0, 24.0, 3.0)
+    features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
+    logit = torch.randn(1, 12, generator=generator)
+    real = torch.tensor([[True, True, True, True, False]])
+    assignment = match(features, logit, truth, real, slots, proposals, weights)[0]
+    scale = torch.tensor([24.0] * 3 + [3.0] * 6)
+    for mine, theirs in ((range(7), (0, 1, 2)), (range(7, 12), (3,))):
+
+        def cost(chosen, theirs=theirs):
+            return sum(
+                float(((features[0, j] - truth[0, i]).abs() * scale).sum() - logit[0, j])
+                for i, j in zip(theirs, chosen, strict=True)
+            )
+
+        best = min(itertools.permutations(mine, len(theirs)), key=cost)
+        got = [int((assignment == i).nonzero()) for i in theirs]
+        assert np.isclose(cost(got), cost(best), atol=1e-5)
+    assert (assignment >= 0).sum() == 4
+    with pytest.raises(ValueError, match="not finite"):
+        match(features * float("nan"), logit, truth, real, slots, proposals)
+
+
+def test_cell_decoder_proposals_lie_around_their_cell():
+    decoder = small_lvae(decoder="cells").object_decoder
+    features, existence = decoder(torch.randn(1, 4, 8, 8) * 10)
+    assert features.shape == (1, sum(decoder.proposals), 9) and existence.shape == features.shape[:2]
+    first = features[0, : decoder.proposals[0]].view(-1, 8, 8, 9)  # k, row, col
+    middle = 1 - (torch.arange(8) + 0.5) / 8
+    assert (first[..., 0] - middle[:, None]).abs().max() <= 1 / 8 + 1e-6
+    assert (first[..., 1] - middle[None, :]).abs().max() <= 1 / 8 + 1e-6
+
+
+def test_object_shortcut_is_equivariant_to_cell_shift():
+    encoder = small_lvae(shortcut=True).object_encoder
+    torch.nn.init.zeros_(encoder.project_out.weight)
+    features = torch.full((2, sum(small_spec().slots), 9), 0.3)
+    features[1, 0, :2] += torch.tensor(
+        [2 / 8, -1 / 8]
+    )  # two cells ahead, one to the right: to a lower row, a higher column
+    real = torch.zeros(features.shape[:2], dtype=torch.bool)
+    real[:, 0] = True
+    with torch.no_grad():
+        here, there = encoder(features, real)[:, :4] - encoder.grid[:4]
+    assert here[:, 5, 5].abs().max() > 0.01 and here.count_nonzero() == 4 == there.count_nonzero()
+    assert torch.allclose(here[:, 5, 5], there[:, 3, 6], atol=1e-5)
+
+
+def test_init_from_data_starts_outputs_at_means():
+    batch = layout_batch([random_scene(i) for i in range(8)], small_spec())
+    for decoder in ("detr", "cells"):
+        lvae = small_lvae(decoder=decoder)
+        before = lvae.decode(lvae.encode(batch).mean)
+        lvae.start_at(batch)
+        after = lvae.decode(lvae.encode(batch).mean)
+        mean = batch.occupied.mean(dim=(0, 2, 3))
+        errors = [(o.occupancy_logit.sigmoid().mean(dim=(0, 2, 3)) - mean).abs().mean() for o in (before, after)]
+        assert errors[1] < 0.5 * errors[0]
+        expected = batch.real.sum() / len(batch)
+        offered = [float(o.existence_logit.sigmoid().sum() / len(batch)) for o in (before, after)]
+        assert abs(offered[1] - expected) < 0.5 * abs(offered[0] - expected)
+
+
+def test_distance_transform_equals_scipy():
+    rng = np.random.default_rng(0)
+    inside = np.stack([rng.random((40, 30)) < share for share in (0.02, 0.5, 0.9, 0.0, 1.0)])
+    inside[1] = ndimage.binary_opening(inside[1], iterations=1)
+    for most in (1, 3, 6):
+        found = signed_distance_px(torch.from_numpy(inside), most).numpy()
+        for mask, distance in zip(inside, found, strict=True):
+            border = np.pad(mask, 50, mode="edge")  # ground beyond the crop is unknown
+            to = [
+                ndimage.distance_transform_edt(side) if not side.all() else np.full(side.shape, 99.0)
+                for side in (border, ~border)
+            ]
+            want = np.where(border, to[0] - 0.5, 0.5 - to[1])[50:-50, 50:-50].clip(-most, most)
+            inner = (
+                slice(most, -most),
+                slice(most, -most),
+            )  # edge padding creates boundaries near the border of the crop
+            assert np.allclose(distance[inner], want[inner], atol=1e-5)
+
+
+def test_linear_init_is_optimal_with_unit_variance_codes():
+    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    lvae = small_lvae(shortcut=True, latent_channels=16)
+    lvae.start_at(batch)
+    cell = lvae.ground_encoder.shortcut.stride[0]
+    maps = smooth_maps(batch.height, batch.occupied, cell)
+    with torch.no_grad():
+        code = lvae.ground_encoder.shortcut(maps)
+        rebuilt = lvae.ground_decoder.shortcut(code)
+    classes, pixels = batch.occupied.shape[1], maps.shape[1] * cell**2
+    slope = torch.linalg.lstsq(maps[:, classes:].flatten()[:, None], rebuilt[:, classes:].flatten()[:, None]).solution
+    best = min(LOGITS_PER_PX, key=lambda logit: abs(logit * reach(cell) - float(slope)))
+    assert abs(float(slope) / (best * reach(cell)) - 1) < 0.1
+    unit = torch.tensor([1.0, best * reach(cell)]).repeat_interleave(classes)[:, None, None]
+    weight = torch.tensor([HEIGHT_WEIGHT, 1.0]).repeat_interleave(classes)[:, None, None]
+    cells = (
+        F.pixel_unshuffle(m * weight, cell).permute(0, 2, 3, 1).reshape(-1, pixels) for m in (maps, rebuilt / unit)
+    )
+    truth, ours = (part.double() for part in cells)
+    centred = truth - truth.mean(dim=0)
+    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # Eckart-Young: no map of rank 16 does better
+    within = 0.02 * float((centred**2).sum())  # the decoder's bias is one per map, not per pixel
+    assert least <= float(((ours - truth) ** 2).sum()) < least + within
+    deviation = code.transpose(0, 1).flatten(1).std(dim=1)
+    assert (deviation < 1.01).all() and deviation.max() > 0.99
+
+
+def test_linear_init_lowers_learning_rate():
+    lvae = small_lvae(shortcut=True, decoder="cells")
+    trainer = Trainer(lvae, None, Optimisation(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
+    share = {id(p): group["share"] for group in trainer.optimiser.param_groups for p in group["params"]}
+    assert len(share) == len(list(lvae.parameters()))
+    names = {name: share[id(p)] for name, p in lvae.named_parameters()}
+    assert {v for n, v in names.items() if n.startswith(("ground_encoder.shortcut", "ground_decoder.shortcut"))} == {
+        0.05
+    }
+    assert {v for n, v in names.items() if n.startswith("ground_") and ".shortcut" not in n} == {0.25}
+    assert {v for n, v in names.items() if n.startswith("object_")} == {1.0}
+    assert not small_lvae().learning_rates()
+
+
+def test_shortcuts_show_ground_before_first_step():
+    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    iou = []
+    for shortcut in (False, True):
+        lvae = small_lvae(shortcut=shortcut, latent_channels=16)
+        lvae.start_at(batch)
+        with torch.no_grad():
+            seen = lvae.decode(lvae.encode(batch).mean).occupancy_logit > 0
+        truth = batch.occupied > 0.5
+        iou.append(float((seen & truth).sum() / (seen | truth).sum()))
+    assert iou[1] > 0.7 > iou[0] + 0.2
+
+
+def test_losses_equal_their_equations():
+    spec = small_spec(slots=3)
+    generator = torch.Generator().manual_seed(1)
+    n, b = spec.num_slots, 2
+    features, truth = (torch.rand(b, n, 9, generator=generator) for _ in range(2))
+    logit = torch.randn(b, n, generator=generator)
+    real = torch.cat([torch.arange(3) < c for c in (3, 0, 1, 2, 0, 1, 3, 2, 1, 0, 2)])[None].repeat(b, 1)
+    assignment = match(features, logit, truth, real, spec.slots, spec.slots)
+    got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
+
+    from models.vae.losses import OBJECT_WEIGHTS
+
+    want = np.zeros(3)
+    for sample in range(b):
+        for c, name in enumerate(spec.categories):
+            count = max(int(real[sample, 3 * c : 3 * c + 3].sum()), 1)
+            for j in range(3 * c, 3 * c + 3):
+                i = int(assignment[sample, j])
+                p = float(torch.sigmoid(logit[sample, j]))
+                terms = [-np.log(p if i >= 0 else 1 - p), 0, 0]
+                if i >= 0:
+                    gap = (features[sample, j] - truth[sample, i]).abs()
+                    terms[1:] = float(gap[:3].sum()), float(gap[3:].sum())
+                want += np.array(OBJECT_WEIGHTS[name]) * terms / count / b
+    assert np.allclose(got, want, rtol=1e-4)
+
+    occupied = (torch.rand(2, 5, 8, 8, generator=generator) < 0.5).float()
+    occupied[1] = 0  # a sample without ground must not divide by zero
+    height, true_height = (torch.rand(2, 5, 8, 8, generator=generator) for _ in range(2))
+    want = float(((height - true_height).abs()[0] * occupied[0]).sum() / occupied[0].sum()) / 2
+    assert np.isclose(float(height_loss(height, true_height, occupied)), want, rtol=1e-5)
+    p = torch.sigmoid(height)
+    want = float(-(occupied * p.log() + (1 - occupied) * (1 - p).log()).mean())
+    assert np.isclose(float(occupancy_loss(height, occupied)), want, rtol=1e-5)
+    posterior = Posterior(torch.randn(2, 4, 3, 3, generator=generator), torch.randn(2, 4, 3, 3, generator=generator))
+    normal = torch.distributions.Normal
+    sigma = (0.5 * posterior.logvar).exp()
+    want = torch.distributions.kl_divergence(normal(posterior.mean, sigma), normal(0.0, 1.0)).sum() / 2
+    assert np.isclose(float(kl_loss(posterior)), float(want), rtol=1e-5)
+
+
+@pytest.mark.parametrize("decoder, steps, ground", [("detr", 200, 0.9), ("cells", 60, 0.7)])
+def test_lvae_overfits_one_batch(decoder, steps, ground):
+    spec = small_spec()
+    lvae = small_lvae(
+        decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
+    )
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
+    generator = torch.Generator().manual_seed(0)
+    losses = []
+    for _ in range(steps):
+        noise = torch.randn(2, *lvae.latent_shape, generator=generator)
+        output, posterior = lvae(batch, noise)
+        loss = lvae_loss(output, posterior, batch, spec)
+        optimiser.zero_grad()
+        loss.total.backward()
+        optimiser.step()
+        losses.append(loss.total.item())
+    assert losses[-1] < 0.25 * losses[0]
+    right = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
+    assert right.float().mean() > ground
+
+
+@pytest.mark.parametrize(
+    "execution", [Execution(precision="bf16"), Execution(accumulate=2), Execution(accumulate=4, precision="bf16")]
+)
+def test_lvae_step_is_equal_in_halves_and_bf16(execution):
+    """Compares the loss at equal weights, then the decrease of the loss after separate training steps."""
+    spec = small_spec()
+    layouts = [compact_layout(random_scene(i, n=20), spec) for i in range(4)]
+    arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
+    losses = {}
+    for way in (Execution(precision="fp32"), execution):
+        lvae = small_lvae(decoder="cells", shortcut=True)
+        lvae.start_at(LayoutBatch.from_compact(arrays))
+        settings = Optimisation(steps=20, learning_rate=3e-3, weight_decay=0.0)
+        trainer = lvae_trainer(lvae, settings, 1e-6, torch.device("cpu"), lambda model: model, way)
+        losses[way] = [float(trainer.step(arrays, range(4))["loss"]) for _ in range(20)]
+        assert all(p.dtype == torch.float32 for p in lvae.parameters())
+    plain, other = losses.values()
+    assert np.isclose(other[0], plain[0], rtol=1e-2 if execution.precision == "bf16" else 1e-5)
+    assert plain[-1] < 0.9 * plain[0] and np.isclose(other[-1], plain[-1], rtol=0.1)
+
+
+def test_latent_noise_is_per_sample_with_stated_scale():
+    generators = [torch.Generator().manual_seed(k) for k in range(400)]
+    drawn = stacked_corruption(generators, (4, 8, 8), 0.2, torch.device("cpu"))
+    alone = stacked_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
+    assert torch.equal(drawn[7], alone[0])
+    sizes = drawn.std(dim=(1, 2, 3))
+    assert np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02  # |N(0, 0.2)|
+    lvae, spec = small_lvae(decoder="cells", shortcut=True), small_spec()
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    noise = torch.zeros(2, *lvae.latent_shape)
+    with torch.no_grad():
+        plain, posterior = lvae(batch, noise)
+        for size in (0.0, 0.5):
+            noisy, _ = lvae(batch, noise, torch.full_like(noise, size))
+            moved = posterior.mean + size * posterior.mean.std(dim=(2, 3), keepdim=True)
+            assert torch.allclose(noisy.height, lvae.decode(moved).height, atol=1e-5)
+            assert torch.equal(noisy.height, plain.height) == (size == 0)
+
+
+def test_lvae_retrains_more_proposals_on_same_latents():
+    old, new = (small_lvae(decoder="cells", shortcut=True, least_per_cell=least) for least in (1, 3))
+    batch = layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
+    new.keep_latents_of(old.state_dict())
+    with torch.no_grad():
+        latents = [lvae.encode(batch).mean for lvae in (old, new)]
+        assert torch.equal(*latents)
+        before, after = (lvae.decode(latents[0]) for lvae in (old, new))
+    assert torch.equal(before.height, after.height) and before.features.shape != after.features.shape
+    trained = {name for name, parameter in new.named_parameters() if parameter.requires_grad}
+    assert trained and all(name.startswith("object_decoder.") for name in trained)
+
+
+def test_dit_is_conditioned_and_starts_at_zero():
+    torch.manual_seed(0)
+    dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)
+    latent, time, label = torch.randn(3, 4, 8, 8), torch.tensor([0, 500, 999]), torch.tensor([0, 1, 3])
+    assert dit(latent, time, label).shape == latent.shape
+    assert (dit(latent, time, label) == 0).all()  # adaLN-Zero and a zero output layer
+    for parameter in dit.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    base = dit(latent, time, label)
+    assert not torch.allclose(base, dit(latent, time, torch.tensor([1, 2, 0])))
+    assert not torch.allclose(base, dit(latent, time.flip(0), label))
+    with pytest.raises(ValueError, match="must be whole"):
+        DiT(size=9)
+    prepared = dit.prepared([999, 500, 0, 4], [3, 1, 0, 1])
+    assert torch.allclose(prepared(latent, time, label), base, atol=1e-4)
+    for other in ((torch.tensor([0, 5, 999]), label), (time, torch.tensor([0, 2, 3])), (time + 1, label)):
+        with pytest.raises(IndexError):
+            prepared(latent, *other)
+
+
+def test_dit_unpatchify_inverts_patchify():
+    """With the network reduced to its patch embedding and its transpose, out = in."""
+    dit = DiT(channels=3, size=8, width=12, depth=1, heads=1)
+    with torch.no_grad():
+        dit.patch_in.weight.copy_(torch.eye(12).view(12, 3, 2, 2))
+        dit.positions.zero_()
+        dit.patch_out.weight.copy_(torch.eye(12).view(12, 3, 2, 2).permute(2, 3, 1, 0).reshape(12, 12))
+        dit.patch_out.bias.zero_()
+    latent = torch.randn(1, 3, 8, 8)
+    out = dit(latent, torch.tensor([1]), torch.tensor([0]))
+    tokens = torch.nn.functional.unfold(latent, 2, stride=2)  # (1, c p p, n)
+    normal = torch.nn.functional.layer_norm(tokens.transpose(1, 2), (12,), eps=1e-6).transpose(1, 2)
+    assert torch.allclose(out, torch.nn.functional.fold(normal, (8, 8), 2, stride=2), atol=1e-5)

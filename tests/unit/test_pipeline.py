@@ -1,0 +1,331 @@
+"""PrITTIPipeline without Ray: samplers, seeds, diffusers' conventions, inpainting."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from diffusers import DPMSolverMultistepScheduler
+from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec
+
+from models.composition.inpaint import (
+    cells_of,
+    composited,
+    half_plane_region,
+    latent_mask,
+    object_region,
+    polygon_region,
+)
+from models.composition.seam_blending import continued
+from models.dit import DiT
+from models.lvae import LayoutVAE
+from models.pipeline import SAMPLERS, PrITTIPipeline, Resampling, scheduler
+from models.presets import LVAE_PRESETS
+from models.sampling.diffusion import Diffusion, Known, SceneNoise, Walk, rescaled, sample, solve
+from models.scene import Grid
+
+SPEC = small_spec()
+
+
+def sampler_of(name: str):
+    kind, changes = SAMPLERS[name]
+    return kind.from_config(scheduler().config, **changes)
+
+
+# --------------------------------------------------------------------------------------------------------- samplers
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "off"),
+    [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)],
+)
+def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, off):
+    """For data N(mean, std^2) the optimal denoiser is known; samples must have that mean and std."""
+    mean, std, alpha_bar = 1.5, 0.5, torch.from_numpy(Diffusion().alpha_bar).float()
+
+    def model(latent, timestep, label):
+        a = alpha_bar[timestep][:, None, None, None]
+        return (1 - a).sqrt() * (latent - a.sqrt() * mean) / (a * std**2 + 1 - a)
+
+    noise, label = SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), torch.zeros(64, dtype=torch.long)
+    if name == "ddpm":
+        drawn = sample(model, Walk(Diffusion(), steps), noise, label)
+    else:
+        solver = sampler_of(name)
+        solver.set_timesteps(steps)
+        drawn = solve(model, solver, noise, label)
+    assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < off
+
+
+def test_samplers_are_independent_of_batch_composition(pipeline):
+    labels, drawn = ["low", "medium", "high"], {}
+    for name in SAMPLERS:
+        pipeline.use_sampler(name)
+        together = drawn[name] = pipeline.sample_latents(labels, 3, range(3), 10)
+        alone = torch.cat([pipeline.sample_latents([label], 3, [k], 10) for k, label in enumerate(labels)])
+        assert torch.allclose(together, alone, atol=1e-4), name
+        again = pipeline.sample_latents(labels, 3, range(3), 10)
+        assert torch.equal(together, again), name  # no state remains from the previous run
+    assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
+    pipeline.use_sampler("dpm++")  # after the one of its kind that draws noise
+    assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
+    with pytest.raises(ValueError, match="num_steps is 600"):
+        pipeline.sample_latents(labels, 3, range(3), 600)
+    with pytest.raises(ValueError, match="sampler 'euler' is unknown, expected one of: ddpm, ddim, dpm"):
+        pipeline.use_sampler("euler")
+    pipeline.use_sampler("ddpm")
+
+
+def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
+    pipeline.use_sampler("dpm++")
+    pipeline.save_pretrained(tmp_path)
+    again = PrITTIPipeline.from_pretrained(tmp_path, low_cpu_mem_usage=False)
+    again.set_progress_bar_config(disable=True)
+    pipeline.use_sampler("ddpm")
+    assert isinstance(again.scheduler, DPMSolverMultistepScheduler) and again.diffusion == pipeline.diffusion
+    for name in ("dpm++", "ddpm"):
+        again.use_sampler(name)
+        pipeline.use_sampler(name)
+        pair = [p.generate(["high"], seed=1, num_inference_steps=5)[0] for p in (pipeline, again)]
+        assert scenes_equal(*pair)
+
+
+def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
+
+    def drawn(sampler, of=pipeline, **options):
+        of.use_sampler(sampler)
+        return of.sample_latents(["low", "high"], 3, range(2), 10, **options)
+
+    plain = {name: drawn(name) for name in ("ddpm", "dpm++")}
+    assert torch.equal(drawn("dpm++", noise_scaling=1.0), plain["dpm++"])
+    more = drawn("dpm++", noise_scaling=1.01)
+    assert not torch.allclose(more, plain["dpm++"], rtol=1e-4)
+    pipeline.register_to_config(noise_scaling=1.01)
+    pipeline.save_pretrained(tmp_path)
+    pipeline.register_to_config(noise_scaling=1.0)
+    again = PrITTIPipeline.from_pretrained(tmp_path)
+    again.set_progress_bar_config(disable=True)
+    assert torch.equal(drawn("dpm++", again), more) and torch.equal(drawn("ddpm", again), plain["ddpm"])
+    with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 1 \(none\) or a little more"):
+        drawn("dpm++", noise_scaling=2.0)
+    pipeline.use_sampler("ddpm")
+
+
+def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
+    latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.identity("run", 0, 0, "low")]
+    (everything,) = pipeline.decode(latents, identities, 1e-6)
+    existence = np.sort(everything.existence)
+    gap = np.argmax(np.diff(existence))  # away from any primitive, whose existence may round differently after loading
+    middle = float(existence[gap : gap + 2].mean())
+    (probable,) = pipeline.decode(latents, identities, middle)
+    assert 0 < len(probable) < len(everything) and probable.existence.min() > middle
+    pipeline.register_to_config(existence_threshold=middle)
+    pipeline.save_pretrained(tmp_path)
+    pipeline.register_to_config(existence_threshold=0.3)  # the paper's
+    again = PrITTIPipeline.from_pretrained(tmp_path)
+    again.set_progress_bar_config(disable=True)
+    assert scenes_equal(again.decode(latents, identities)[0], probable)
+    asked = {"seed": 1, "num_inference_steps": 2}
+    drawn = again.generate(["low"], **asked)[0], pipeline.generate(["low"], **asked, existence_threshold=middle)[0]
+    assert scenes_equal(*drawn)
+    with pytest.raises(ValueError, match="existence_threshold is 30, expected between 0 and 1"):
+        pipeline.generate(["low"], **asked, existence_threshold=30)
+
+
+def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
+    mask = torch.zeros(1, *pipeline.lvae.latent_shape)
+    mask[..., :4] = 1
+
+    def raw(resampling, scaling):
+        pipeline.register_to_config(noise_scaling=scaling)
+        made = pipeline.complete(Known(torch.ones_like(mask), mask), ["low"], 0, [0], resampling)
+        pipeline.register_to_config(noise_scaling=1.0)
+        return made
+
+    assert torch.equal(raw(QUICK, 1.0), raw(QUICK, 1.01))
+    assert not torch.equal(raw(Resampling.guided(6), 1.0), raw(Resampling.guided(6), 1.01))
+    assert Resampling.guided().evaluations == 50
+    with pytest.raises(ValueError, match="eta is 2, expected 0"):
+        Resampling(eta=2)
+
+
+def test_noise_scaling_corrects_overestimated_noise():
+    """For Gaussian data the noise is known. A model that predicts 1 % too much noise samples too small a deviation."""
+    alpha_bar = torch.from_numpy(Diffusion().alpha_bar).float()
+
+    def model(excess):
+        def predict(latent, timestep, label):
+            a = alpha_bar[timestep][:, None, None, None]
+            return excess * (1 - a).sqrt() * latent / (a * 0.25 + 1 - a)
+
+        return predict
+
+    solver, label = sampler_of("dpm++"), torch.zeros(64, dtype=torch.long)
+
+    def deviation(denoiser):
+        solver.set_timesteps(20)
+        return float(solve(denoiser, solver, SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), label).std())
+
+    assert deviation(model(1.01)) < 0.49
+    assert abs(deviation(rescaled(model(1.01), 1.01)) - deviation(model(1.0))) < 1e-6
+
+
+# ------------------------------------------------------------------------------------------------------ conventions
+
+
+def test_pipeline_draws_seeds_from_generator(pipeline):
+    def generate(**options):
+        return pipeline.generate(["low", "high"], num_inference_steps=4, **options)
+
+    def seeded(seed):
+        return torch.Generator().manual_seed(seed)
+
+    one, again, other = (generate(generator=seeded(seed)) for seed in (7, 7, 8))
+    assert [s.scene_id for s in one] == [s.scene_id for s in again] != [s.scene_id for s in other]
+    assert scenes_equal(one[0], again[0]) and not scenes_equal(one[0], other[0])
+    each = generate(generator=[seeded(7), seeded(8)])
+    assert [s.scene_id for s in each] == [one[0].scene_id, other[1].scene_id]
+    assert scenes_equal(each[0], one[0]) and scenes_equal(each[1], other[1])
+    with pytest.raises(ValueError, match="3 generators for 2 scenes: expected one, or one per scene"):
+        generate(generator=[seeded(0)] * 3)
+
+
+def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
+    seen = []
+
+    def watch(pipe, step, timestep, inputs):
+        seen.append((step, timestep))
+        return inputs
+
+    def erase(pipe, step, timestep, inputs):
+        return {"latents": torch.zeros_like(inputs["latents"])}
+
+    pipeline.sample_latents(["low"], 0, [0], 5, callback_on_step_end=watch)
+    assert seen == [(0, 800), (1, 600), (2, 400), (3, 200), (4, 0)]
+    assert not pipeline.sample_latents(["low"], 0, [0], 5, callback_on_step_end=erase).any()
+    seen.clear()
+    whole = np.ones((32, 32), bool)
+    pipeline.inpaint([random_scene(0, grid=SPEC.grid)], [whole], ["low"], resampling=QUICK, callback_on_step_end=watch)
+    assert [step for step, _ in seen] == list(range(10))  # 6 and twice a roll-back of 2
+
+
+# ------------------------------------------------------------------------------------------------------- inpainting
+
+
+def test_polygon_region_equals_shapely():
+    grid = Grid(rows=64, cols=64, resolution_m=1.0)
+    x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
+    for corners in ([(10, -20), (50, 0), (30, 25)], [(5, -30), (60, -30), (20, 0), (60, 30), (5, 30)]):
+        want = shapely.contains_xy(shapely.Polygon(corners), x, y)
+        assert np.array_equal(polygon_region(grid, corners), want) and 0.05 < want.mean() < 0.9
+        assert np.array_equal(polygon_region(grid, corners[::-1]), want)
+    for bad in ([(0, 0), (1, 1)], [(0, 0), (1, np.nan), (2, 2)], [1, 2, 3]):
+        with pytest.raises(ValueError, match="three or more corners"):
+            polygon_region(grid, bad)
+
+
+def test_half_plane_and_object_regions_lie_where_stated():
+    grid = Grid(rows=64, cols=64, resolution_m=1.0)
+    ahead = half_plane_region(grid, (2, 0), 40)
+    assert np.array_equal(ahead, np.broadcast_to(grid.x_m()[:, None] >= 40, ahead.shape))
+    assert not (ahead & half_plane_region(grid, (-1, 0), -39.9)).any()
+    with pytest.raises(ValueError, match="length above 0"):
+        half_plane_region(grid, (0, 0), 1)
+    scene = random_scene(1, n=30, grid=grid)
+    region = object_region(scene, [4, 9], margin_m=0.5)
+    for k in (4, 9):
+        corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * scene.size_m[k]
+        rows, cols = grid.pixel(*(corners @ scene.rotation[k].T + scene.center_m[k])[:, :2].T)
+        inside = (rows >= 0) & (rows < 64) & (cols >= 0) & (cols < 64)
+        assert inside.any() and region[rows[inside], cols[inside]].all()
+    assert region.mean() < 0.1
+    with pytest.raises(IndexError):
+        object_region(scene, [30])
+
+
+def test_region_grows_to_whole_cells():
+    region = np.zeros((32, 32), bool)
+    region[5, 30] = True
+    assert np.argwhere(cells_of(region, 8)).tolist() == [[1, 7]]
+    mask = latent_mask([region], (6, 8, 8), "objects")
+    assert mask.sum() == 3 and mask[0, 3:, 1, 7].all()
+    assert latent_mask([region], (6, 8, 8), "both").sum() == 6
+    with pytest.raises(ValueError, match="does not divide into 5 x 5 cells"):
+        cells_of(region, 5)
+    with pytest.raises(ValueError, match="contents 'cars', expected one of: both, ground, objects"):
+        latent_mask([region], (6, 8, 8), "cars")
+
+
+@pytest.mark.parametrize("contents", ["both", "ground", "objects"])
+def test_inpaint_keeps_the_rest(pipeline, contents):
+    scene = random_scene(2, n=30, grid=SPEC.grid)
+    region = half_plane_region(SPEC.grid, (1, 0), 32.0)
+    (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK)
+    (raw,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK, composite=False)
+    new_ground, new_objects = (contents in ("both", what) for what in ("ground", "objects"))
+    bent = continued(raw, scene, region)
+    for name in ("height_m", "occupied"):
+        got, kept, new = (getattr(s, name) for s in (made, scene, bent))
+        assert np.array_equal(got[:, ~region], kept[:, ~region])
+        assert np.array_equal(got[:, region], (new if new_ground else kept)[:, region])
+    centers = {tuple(c) for c in made.center_m.tolist()}
+    behind = {tuple(c) for c in scene.center_m.tolist() if c[0] < 32}
+    lifted = bent if new_ground else raw
+    ahead = {tuple(c) for c in (lifted if new_objects else scene).center_m.tolist() if c[0] >= 32}
+    assert behind and centers == behind | ahead
+
+
+def test_inpaint_decodes_given_ground_exactly(pipeline):
+    """Inpaints objects on known ground: the ground decoder reads only the known ground channels."""
+    scene = random_scene(5, n=30, grid=SPEC.grid)
+    whole = np.ones((32, 32), bool)
+    (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", resampling=QUICK, composite=False)
+    (rebuilt,) = pipeline.decode(pipeline.encode([scene]), [scene])
+    assert np.array_equal(raw.height_m, rebuilt.height_m) and np.array_equal(raw.occupied, rebuilt.occupied)
+    assert not scenes_equal(raw, rebuilt)
+
+
+def test_inpaint_returns_known_latent_exactly(pipeline):
+    scene = random_scene(6, n=30, grid=SPEC.grid)
+    known = pipeline.encode([scene])
+    mask = latent_mask([polygon_region(SPEC.grid, [(10, -20), (50, 0), (30, 25)])], pipeline.lvae.latent_shape, "both")
+    latents = pipeline.complete(Known(known, mask), ["low"], 0, [0], QUICK)
+    kept = mask == 0
+    assert torch.equal(latents[kept], known[kept]) and kept.any()
+    assert (latents[~kept] != known[~kept]).all()
+
+
+def test_inpaint_rejects_scenes_off_model_grid(pipeline):
+    scene = random_scene(0, grid=replace(SPEC.grid, front_m=70.0))
+    with pytest.raises(ValueError, match=r"scene test-0000 has .* the model needs"):
+        pipeline.inpaint([scene], [np.ones((32, 32), bool)], ["low"])
+
+
+def test_inpaint_rejects_objects_only_for_mixed_latent():
+    architecture = LVAE_PRESETS["smoke"].architecture() | {"split_latent": False}
+    lvae = LayoutVAE(layout=SPEC.to_dict(), **architecture)
+    channels, size, _ = lvae.latent_shape
+    mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2), scheduler())
+    with pytest.raises(ValueError, match="mixes ground and objects: objects cannot be made anew alone"):
+        mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
+
+
+def test_composite_of_nothing_changes_nothing():
+    scene, other = random_scene(0, n=20, grid=SPEC.grid), random_scene(1, n=20, grid=SPEC.grid)
+    nothing, everything = np.zeros((32, 32), bool), np.ones((32, 32), bool)
+    assert scenes_equal(composited(scene, other, nothing, "both"), scene)
+    assert scenes_equal(composited(scene, other, everything, "both"), other)
+    both = composited(composited(scene, other, everything, "ground"), other, everything, "objects")
+    assert scenes_equal(both, other)
+
+
+def test_composite_does_not_repeat_object_across_border():
+    scene = random_scene(0, n=1, grid=SPEC.grid)
+    region = half_plane_region(SPEC.grid, (1, 0), 32.0)
+    scene = replace(scene, center_m=np.array([[31.95, 0, 0]], np.float32))
+    again = replace(scene, center_m=np.array([[32.05, 0, 0]], np.float32))
+    far = replace(scene, center_m=np.array([[50, 0, 0]], np.float32))
+    for contents in ("both", "objects"):
+        assert np.array_equal(composited(scene, again, region, contents).center_m, scene.center_m)
+        assert len(composited(scene, far, region, contents)) == 2

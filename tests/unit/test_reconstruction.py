@@ -1,0 +1,149 @@
+"""Reconstruction scores of single scenes, with a perfect decoder and with an untrained model."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from helpers import random_scene
+
+from models.layout import Bounds, LayoutSpec
+from models.scene import CATEGORIES, Scene
+from models.tensors import DecodedLayout, compact_layout
+from pipelines.evaluation.reconstruction import (
+    SceneRecord,
+    chunks_of,
+    reconstruction_scores,
+    scene_record,
+    table_bytes,
+    voxel_grid,
+)
+from pipelines.metrics.intervals import Estimate
+from pipelines.runtime import storage
+from pipelines.schema.scene_subset import Selection
+
+LATENT = np.zeros((4, 8, 8), np.float32)
+SPEC = replace(
+    LayoutSpec(slots=(30,) * len(CATEGORIES)),
+    cholesky_bounds=Bounds((0, -4, 0, -3, -3, 0), (4.0, 4.0, 4.0, 3.0, 3.0, 4.0)),
+    height_bounds_m=Bounds((-3.0,), (3.0,)),
+)
+
+
+def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
+    """The output of a perfect decoder."""
+    layout = compact_layout(scene, spec)
+    return DecodedLayout(
+        occupancy=layout["occupied"].astype(np.float32),
+        height=layout["height"].astype(np.float32) / 65535,
+        features=layout["features"],
+        existence=layout["real"].astype(np.float32),
+        category=spec.slot_category,
+    )
+
+
+def record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> SceneRecord:
+    return scene_record(scene, layout, LATENT, spec, voxel_grid(spec))
+
+
+def test_reconstruction_of_perfect_decoder_scores_one():
+    scenes = [random_scene(k, n=60, tilt_rad=0.1) for k in range(2)]
+    got = reconstruction_scores([record(s, perfect(s, SPEC)) for s in scenes], SPEC, voxel_grid(SPEC))
+    assert got["ground_iou"] == got["ground_mean_iou"] == 1 and got["height_rmse_m"] < 1e-4
+    for variant in got["detection"].values():
+        assert variant["ap3d"] > 0.99 and variant["ap3d_50"] > 0.99
+    # Equal extents leave the axes of a scatter matrix open, but random ones differ.
+    assert got["matched"]["found"] == got["matched"]["right"] == 1 and got["matched"]["mean_iou3d"] > 0.99
+    assert got["matched"]["category_mean_iou3d"]["vegetation_ellipsoid"] > 0.98
+    assert got["voxels"]["iou"] > 0.995 and got["voxels"]["miou"] > 0.99
+    assert got["height_bounds_m"] == {"low": -3.0, "high": 3.0} and got["scenes"] == 2
+    assert got["truths"] == {k: v for k, v in got["truths"].items() if v} and sum(got["truths"].values()) == 120
+
+
+def test_reconstruction_separates_cost_of_coarse_raster():
+    coarse, scenes = SPEC.with_resolution(SPEC.grid.rows // 2), [random_scene(k, n=30) for k in range(2)]
+    records = [record(s, perfect(s, coarse), coarse) for s in scenes]
+    got = reconstruction_scores(records, coarse, voxel_grid(coarse))
+    assert got["raster_px"] == coarse.grid.rows and got["raster_ground_iou"] == 1 > got["ground_iou"] > 0.5
+    assert got["raster_height_rmse_m"] < 1e-4
+
+
+def test_reconstruction_ground_errors_are_in_meters():
+    scene = random_scene(0, n=30)
+    exact = perfect(scene, SPEC)
+    raised = replace(exact, height=exact.height + 0.3 / 6.0, occupancy=np.zeros_like(exact.occupancy))
+    got = reconstruction_scores([record(scene, raised)], SPEC, voxel_grid(SPEC))
+    assert got["ground_iou"] == 0  # no occupied pixel is predicted; height errors count nevertheless
+    assert got["height_rmse_m"] == pytest.approx(0.3, abs=1e-4) and got["height_mae_m"] == pytest.approx(0.3, abs=1e-4)
+    assert got["height_mse_normalised"] == pytest.approx((0.3 / 6) ** 2, rel=1e-3)
+
+
+def test_reconstruction_counts_primitives_without_slot_as_missed():
+    scene = random_scene(1, n=60, tilt_rad=0.1)
+    few = replace(SPEC, slots=(1,) * 11)
+    got = reconstruction_scores([record(scene, perfect(scene, few), few)], few, voxel_grid(few))
+    boxes = scene.category != 1
+    assert got["matched"]["found"] == pytest.approx(len(set(scene.category[boxes])) / boxes.sum())
+    assert got["matched"]["right"] == 1
+
+
+def test_reconstruction_record_round_trips():
+    scene = random_scene(2, n=20)
+    one = record(scene, perfect(scene, SPEC))
+    again = SceneRecord.from_row(one.to_row())
+    for name in ("ground", "matches", "pairs", "outside"):
+        first, second = getattr(one, name), getattr(again, name)
+        for field in first.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
+    np.testing.assert_array_equal(one.confusion, again.confusion)
+    np.testing.assert_array_equal(one.memory, again.memory)
+
+
+def test_reconstruction_scores_empty_scene(tmp_path):
+    scene = random_scene(3, n=0)
+    empty = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
+    full = random_scene(4, n=30)
+    records = [record(s, perfect(s, SPEC)) for s in (empty, full)]
+    assert reconstruction_scores(records, SPEC, voxel_grid(SPEC))["ground_iou"] == 1
+
+
+# --------------------------------------------------------------------------------------------- chunks, sizes and MLflow
+
+
+def selection(root: Path) -> Selection:
+    return Selection(str(root), "town", "test")
+
+
+def test_reconstruction_chunks_cover_selection_once(reconstruction_dataset):
+    chunks = chunks_of(selection(reconstruction_dataset), 3)
+    assert [rows for _, rows in chunks] == [[0, 1, 2], [3, 4, 5], [6], [0, 1, 2], [3]]
+    assert [shard.number for shard, _ in chunks] == [0, 0, 0, 1, 1]
+
+
+def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
+    files = [p for p in reconstruction_dataset.rglob("*.parquet")]
+    assert table_bytes(chunks_of(selection(reconstruction_dataset), 3)) == pytest.approx(
+        sum(p.stat().st_size for p in files) / 11
+    )
+
+
+def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch):
+    from jobs.support.tracking import client, publish_scores, tracking_uri
+
+    monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    output = str(tmp_path / "scores")
+    many = {str(k): 0.5 for k in range(1200)}  # more than one call takes
+    for value, lvae in ((0.25, "one"), (0.75, "two")):
+        scores = {"reconstruction": {"ap3d": Estimate(value, 0.1, 0.9), "many": many, "absent": None}}
+        assert publish_scores(output, scores, {"lvae": lvae}) == storage.read_json(f"{output}/metrics.json")
+    rows = {row["metric"]: row for row in pq.read_table(f"{output}/metrics.parquet").to_pylist()}
+    assert rows["reconstruction.ap3d"] == {"metric": "reconstruction.ap3d", "value": 0.75, "low": 0.1, "high": 0.9}
+    assert rows["reconstruction.many.7"]["value"] == 0.5 and len(rows) == 1201
+    api = client(tracking_uri())
+    (run,) = api.search_runs([api.get_experiment_by_name("pritti-evaluation").experiment_id])
+    assert run.data.metrics["reconstruction.ap3d"] == 0.75 and len(run.data.metrics) == 1203
+    assert run.data.metrics["reconstruction.ap3d.high"] == 0.9
+    assert run.data.tags["lvae"] == "two" and run.info.status == "FINISHED"
+    assert [file.path for file in api.list_artifacts(run.info.run_id)] == ["metrics.json"]

@@ -1,0 +1,82 @@
+"""Subsets of scenes: compared with brute force, in corner cases and over several worlds."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from helpers import random_scene
+
+from pipelines.schema.scene_subset import Selection, apart, balanced, evenly, farthest, poses
+from pipelines.schema.tables import Shard
+
+
+def test_farthest_poses_equal_brute_force():
+    rng = np.random.default_rng(0)
+    xy, world = rng.uniform(0, 100, (80, 2)), rng.integers(0, 2, 80)
+    every = np.where(world[:, None] == world, np.linalg.norm(xy[:, None] - xy, axis=2), np.inf)
+    expected = [0]
+    while len(expected) < 80:
+        nearest = every[expected].min(axis=0)
+        nearest[expected] = -1
+        expected.append(int(nearest.argmax()))
+    assert farthest(xy, world, 80).tolist() == expected
+    assert farthest(xy, world, 7).tolist() == expected[:7]
+    assert sorted(farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all at the same position
+
+
+@pytest.mark.parametrize("apart_m", [0.5, 3.0, 40.0, 1e6])
+def test_poses_apart_equal_brute_force(apart_m):
+    rng = np.random.default_rng(1)
+    xy, world = rng.normal(0, 20, (300, 2)), rng.integers(0, 3, 300)
+    expected = []
+    for i in range(300):
+        if all(world[i] != world[j] or np.hypot(*(xy[i] - xy[j])) >= apart_m for j in expected):
+            expected.append(i)
+    assert apart(xy, world, apart_m).tolist() == expected
+
+
+@pytest.mark.parametrize("count", range(1, 16))
+def test_balanced_subset_has_equal_labels_where_possible(count):
+    labels = np.array(["low"] * 2 + ["medium"] * 8 + ["high"] * 5)
+    chosen = balanced(labels, count)
+    assert len(set(chosen.tolist())) == count
+    taken = {name: int((labels[chosen] == name).sum()) for name in ("low", "medium", "high")}
+    full = {name for name in taken if taken[name] == (labels == name).sum()}
+    others = [taken[name] for name in taken if name not in full]
+    assert not others or max(taken.values()) - min(others) <= 1
+
+
+def test_evenly_spreads_indices_over_range():
+    assert evenly(10, 10).tolist() == list(range(10))
+    assert evenly(10, 2).tolist() == [2, 7]
+    assert len(evenly(5, 0)) == 0
+
+
+def test_worlds_are_shared_by_kitti360_drives_only():
+    table = pa.table({"sequence": ["a", "b"], "x_m": [0.0, 1.0], "y_m": [0.0, 0.0]})
+    assert len(set(poses(table, np.array(["kitti360", "kitti360"]))[1])) == 1
+    assert len(set(poses(table, np.array(["town", "town"]))[1])) == 2
+
+
+def test_selection_reads_two_shards(tmp_path):
+    scenes = [random_scene(seed) for seed in range(9)]
+    Shard(str(tmp_path), "town", "train", 0).write(scenes[:4])
+    Shard(str(tmp_path), "town", "train", 1).write(scenes[4:])
+
+    def rows(**options) -> list[list[int]]:
+        return [r for _, r in Selection(str(tmp_path), "town", "train", **options).shards()]
+
+    assert rows() == [[0, 1, 2, 3], [0, 1, 2, 3, 4]]
+    assert rows(limit=3, pick="first") == [[0, 1, 2]]
+    assert sum(map(len, rows(limit=3))) == 3
+    assert sum(map(len, rows(limit=5, pick="farthest"))) == 5
+    assert sum(map(len, rows(limit=5, pick="balanced"))) == 5
+    assert sum(map(len, rows(pick="apart", apart_m=1e9))) <= 9
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"limit": 0}, "limit is 0"), ({"pick": "all"}, "pick is 'all'"), ({"pick": "apart"}, "apart_m is 0")],
+)
+def test_selection_rejects_wrong_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        Selection("nowhere", **options)
