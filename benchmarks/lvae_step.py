@@ -22,6 +22,7 @@ from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS, find_preset
 from models.vae import losses
+from models.vae.config import override_options
 from models.vae.losses import compute_lvae_loss
 
 
@@ -77,9 +78,11 @@ def main(config: Config) -> None:
         batch = town_batch(spec, max(4, batch_size))
         batch = type(batch)(*(getattr(batch, field)[:batch_size] for field in batch.__dataclass_fields__))
         models = {}
-        for way, decoder in (("as it is", row.decoder), ("ours", "detr"), ("plain", "detr")):
+        for way, decoder in (("as it is", row.model.objects.decoder), ("ours", "detr"), ("plain", "detr")):
             torch.manual_seed(0)
-            model = LayoutVAE(layout=spec.to_dict(), **(row.architecture() | {"decoder": decoder}))
+            model = LayoutVAE(
+                layout=spec.to_dict(), **override_options(row.architecture(), {"objects": {"decoder": decoder}})
+            )
             model.init_from_data(batch)
             models[way] = (model, torch.optim.AdamW(model.parameters(), 1e-5))
         noise = torch.randn(batch_size, *models["ours"][0].latent_shape)

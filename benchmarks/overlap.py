@@ -64,16 +64,16 @@ def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str,
         return decode_layout(lvae.decode(latent[None]).layouts()[0], spec, empty)
 
     empty = make_empty_scene(second.scene_id, second.source, second.sequence, second.frame, spec)
-    lattice = BlockGrid.of(lvae.latent_shape[-1], STEP_M / 64.0)
-    world = BlockComposer(lattice, spec, encode, find_ground_height(first, 0.0, 0.0))
-    made, found = {(0, 0): SceneBlock(first, encode([first])[0])}, {}
+    block_grid = BlockGrid.from_overlap(lvae.latent_shape[-1], STEP_M / 64.0)
+    composer = BlockComposer(block_grid, spec, encode, find_ground_height(first, 0.0, 0.0))
+    blocks, found = {(0, 0): SceneBlock(first, encode([first])[0])}, {}
     for mode in ("copy", "reencode"):
-        task = world.task((1, 0), made, empty, mode)
-        truth = second.translate(0, 0, -task.datum_m)
-        latent = torch.where(task.unknown.bool(), encode([truth])[0], task.latent)
-        found[mode] = compute_drift(truth, decoded(latent), task.new_pixels)
+        condition = composer.condition_block((1, 0), blocks, empty, mode)
+        truth = second.translate(0, 0, -condition.datum_m)
+        latent = torch.where(condition.mask.bool(), encode([truth])[0], condition.latent)
+        found[mode] = compute_drift(truth, decoded(latent), condition.new_pixels)
         if mode == "reencode":
-            found["own latent"] = compute_drift(truth, decoded(encode([truth])[0]), task.new_pixels)
+            found["own latent"] = compute_drift(truth, decoded(encode([truth])[0]), condition.new_pixels)
     return found
 
 

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
 
-from models.pipeline import SAMPLERS, scheduler
+from models.pipeline import scheduler
 from models.sampling.diffusion import Diffusion, sample_with_scheduler
+from models.sampling.schedulers import SAMPLERS
 
 DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of these
 STEPS = (10, 20, 25, 50)

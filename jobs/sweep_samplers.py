@@ -59,7 +59,8 @@ def sweep_samplers(config: Config) -> list[dict]:
     from rich.progress import Progress
 
     from models.labels import LABELS
-    from models.pipeline import SAMPLERS, require_scaling
+    from models.sampling.schedulers import SAMPLERS
+    from models.pipeline import require_scaling
     from models.sampling.diffusion import Diffusion
     from pipelines.evaluation.evaluate import compare
     from pipelines.evaluation.features import Looks, describe

@@ -12,7 +12,7 @@ from models.base import ConfiguredModel, register_to_config
 from models.batch import LayoutBatch
 from models.layout import FEATURES, LayoutSpec
 from models.vae.cell_decoder import CellDecoder
-from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, nest_flat_options
+from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, parse_options
 from models.vae.ground import GroundDecoder, GroundEncoder, init_from_data
 from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectDecoder, ObjectEncoder
@@ -50,8 +50,8 @@ class LayoutVAE(ConfiguredModel):
         self,
         layout: dict[str, Any],
         latent_channels: int = 32,
-        ground: GroundConfig | dict[str, Any] = LayoutVAEConfig.ground,
-        objects: ObjectConfig | dict[str, Any] = LayoutVAEConfig.objects,
+        ground: GroundConfig = LayoutVAEConfig.ground,
+        objects: ObjectConfig = LayoutVAEConfig.objects,
         shortcut: bool = False,
         split_latent: bool = True,
         branches: Branches = "both",
@@ -59,44 +59,41 @@ class LayoutVAE(ConfiguredModel):
         super().__init__()
         if branches not in BRANCHES:
             raise ValueError(f"LayoutVAE: branches is {branches!r}, expected one of {BRANCHES}")
-        ground_config: GroundConfig = _parse_options(GroundConfig, ground)
-        object_config: ObjectConfig = _parse_options(ObjectConfig, objects)
-        if object_config.decoder not in ("detr", "cells"):
-            raise ValueError(
-                f"LayoutVAE: decoder is {object_config.decoder!r}, expected 'detr' (the paper's) or 'cells'"
-            )
+        if objects.decoder not in ("detr", "cells"):
+            raise ValueError(f"LayoutVAE: decoder is {objects.decoder!r}, expected 'detr' (the paper's) or 'cells'")
         spec = LayoutSpec.from_dict(layout)
-        if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground_config.cell_px:
-            raise ValueError(f"LayoutVAE needs a square grid divisible by {ground_config.cell_px}, got {spec.grid}")
-        size, num_classes = spec.grid.rows // ground_config.cell_px, len(spec.ground_classes)
+        if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground.cell_px:
+            raise ValueError(f"LayoutVAE needs a square grid divisible by {ground.cell_px}, got {spec.grid}")
+        size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
         # A cell's proposals give positions as fractions of the cell; losses therefore measure metres in cells. The
         # queries of the paper's DETR search the whole crop and are trained on normalised numbers.
         self.feature_unit = (
             spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
-            if object_config.decoder == "cells"
+            if objects.decoder == "cells"
             else (1.0,) * FEATURES
         )
         self.latent_shape = (latent_channels * (2 if branches == "both" else 1), size, size)  # of the joint latent
         seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
-            self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground_config, shortcut)
-            self.ground_decoder = GroundDecoder(num_classes, seen, ground_config, shortcut)
+            self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
+            self.ground_decoder = GroundDecoder(num_classes, seen, ground, shortcut)
             with torch.no_grad():
                 logvar = SOLVED_LOGVAR if shortcut else INITIAL_LOGVAR
                 cast(Tensor, self.ground_encoder.net.conv_out.bias)[latent_channels:] = logvar
         if branches != "ground":
-            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, object_config, shortcut)
-            if object_config.decoder == "detr":
-                self.object_decoder = ObjectDecoder(spec.slots, seen, size, object_config)
+            self.object_encoder = ObjectEncoder(spec.slots, latent_channels, size, objects, shortcut)
+            if objects.decoder == "detr":
+                self.object_decoder = ObjectDecoder(spec.slots, seen, size, objects)
             else:
-                self.object_decoder = CellDecoder(spec.slots, seen, size, object_config)
+                self.object_decoder = CellDecoder(spec.slots, seen, size, objects)
             with torch.no_grad():
                 self.object_encoder.grid[latent_channels:] = INITIAL_LOGVAR
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        return nest_flat_options(config)
+        """Options of the branches as dataclasses, from a config of this version or an earlier, flat one."""
+        return parse_options(config)
 
     @torch.no_grad()
     def init_from_data(self, batch: LayoutBatch) -> None:
@@ -189,13 +186,3 @@ class LayoutVAE(ConfiguredModel):
         if corruption is not None:
             latent = latent + corruption * posterior.mean.std(dim=(2, 3), keepdim=True)
         return self.decode(latent), posterior
-
-
-def _parse_options(kind: type, options: Any) -> Any:
-    """A dataclass of options from itself or from its entries in a config."""
-    if isinstance(options, kind):
-        return options
-    try:
-        return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in options.items()})
-    except TypeError as error:
-        raise ValueError(f"LayoutVAE: not a {kind.__name__}: {error}") from error

@@ -123,23 +123,23 @@ def make_layout_loss(
     return loss
 
 
-Timesteps = Literal["even", "middle"]
-MIDDLE = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half of the timesteps lie between 196 and 552
+TimestepSampling = Literal["uniform", "logit_normal"]
+LOGIT_NORMAL = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half of the timesteps lie between 196 and 552
 
 
-def sample_timesteps(uniform: Float[Tensor, " b"], density: Timesteps, num_timesteps: int) -> Int[Tensor, " b"]:
+def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
     """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
 
     Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these. Logit-normal, as in
     SD3 (Esser et al., 2024).
     """
-    if density == "middle":
-        uniform = torch.sigmoid(MIDDLE[0] + MIDDLE[1] * torch.special.ndtri(uniform))
+    if density == "logit_normal":
+        uniform = torch.sigmoid(LOGIT_NORMAL[0] + LOGIT_NORMAL[1] * torch.special.ndtri(uniform))
     return (uniform * num_timesteps).long().clamp(max=num_timesteps - 1)
 
 
 def make_diffusion_loss(
-    dit: DiT, diffusion: Diffusion, label_dropout: float, timesteps: Timesteps = "even"
+    dit: DiT, diffusion: Diffusion, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
 ) -> LossFunction:
     """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
 
@@ -156,7 +156,7 @@ def make_diffusion_loss(
         latent = (latent - shift.to(device)) / scale.to(device)
         noise = sample_noise(generators, shape, device)
         uniform = torch.stack([torch.rand(2, generator=generator) for generator in generators]).to(device)
-        timestep = sample_timesteps(uniform[:, 0], timesteps, diffusion.num_timesteps)
+        timestep = sample_timesteps(uniform[:, 0], timestep_sampling, diffusion.num_timesteps)
         label = torch.where(uniform[:, 1] < label_dropout, dit.null_label, label)
         predicted = model(diffusion.add_noise(latent, noise, timestep), timestep, label)
         error = F.mse_loss(predicted.float(), noise, reduction="none").flatten(1).mean(1)
@@ -341,11 +341,11 @@ def make_dit_trainer(
     device: torch.device,
     wrap: Wrap = lambda m: m,
     execution: ExecutionConfig | None = None,
-    timesteps: Timesteps = "even",
+    timestep_sampling: TimestepSampling = "uniform",
 ) -> Trainer:
     execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = make_diffusion_loss(model, Diffusion(), label_dropout, timesteps)
+    loss = make_diffusion_loss(model, Diffusion(), label_dropout, timestep_sampling)
     return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
 
 

@@ -26,9 +26,9 @@ from helpers import (
 from models.layout import LayoutSpec
 from models.scene import Scene
 from pipelines.preprocess.sources.drive import Drive
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.runtime import storage
-from pipelines.schema.tables import Shard, rejects_table
+from pipelines.schema.tables import Shard, make_rejects_table
 
 MARKERS = {"unit": (), "integration": ("ray",), "faults": ("ray", "faults"), "browser": ("ray", "browser")}  # by folder
 SMOKE_MODULES = {"test_evaluate_job", "test_generation_jobs", "test_publish_job", "test_voxel_import_job"}
@@ -127,13 +127,13 @@ def smoke(tmp_path_factory, cluster) -> Path:
     import jobs.support.trainer
     from jobs.support.trainer import as_tensors
     from jobs.train_dit import Config, train
-    from pipelines.training.data_loader import batches
+    from pipelines.training.data_loader import iterate_batches
 
     def fit_here(run, num_workers: int, output: str) -> str:
         trainer = run.build(torch.device("cpu"), lambda model: model)
-        for batch in batches(run.stream, run.reader, 0, run.settings.steps):
+        for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
             trainer.step(as_tensors(batch), range(run.stream.batch_size))
-        model = trainer.averaged()
+        model = trainer.ema_model()
         jobs.support.trainer.tag_weights(run.tracker, model, trainer.steps_done)
         model.save_pretrained(output)
         run.tracker.finish("FINISHED")
@@ -147,7 +147,7 @@ def smoke(tmp_path_factory, cluster) -> Path:
 
 @pytest.fixture(scope="session")
 def town_drive_3() -> Drive:
-    return town_drive(3)
+    return generate_town(3)
 
 
 @pytest.fixture(scope="session")
@@ -165,7 +165,7 @@ def town_dataset(tmp_path_factory) -> str:
     """A town dataset of 8 + 4 scenes in three shards, with rejects and reader reports, written without Ray."""
     root = str(tmp_path_factory.mktemp("inspect") / "town")
     for seed, split, number, count in ((0, "train", 0, 5), (1, "train", 1, 3), (1_000_000, "test", 0, 4)):
-        drive = town_drive(seed)
+        drive = generate_town(seed)
         poses = np.linspace(0, len(drive) - 1, count).astype(int)
         densities = ("low", "medium", "high", "medium", "medium")
         scenes = [
@@ -176,7 +176,7 @@ def town_dataset(tmp_path_factory) -> str:
     lost = [
         {"scene_id": f"town-00000-{k:010d}", "sequence": "00000", "frame": k, "reason": REJECT_REASON} for k in (1, 2)
     ]
-    storage.write_parquet(rejects_table(lost), Shard(root, "town", "train", 0).path("rejects"))
+    storage.write_parquet(make_rejects_table(lost), Shard(root, "town", "train", 0).path("rejects"))
     report = {"objects": 9, "boxes": 5, "dropped": {"bridge": 2}, "duplicates": 1}
     defects = {"defects": [{"index": 7, "label": "car", "reason": "sheared flat"}]}
     thresholds = {"count_p25": 10.0, "count_p75": 90.0, "volume_p25_m3": 100.0, "volume_p75_m3": 9000.0}
@@ -198,7 +198,8 @@ def reconstruction_dataset(tmp_path_factory) -> Path:
     import torch
 
     from models.lvae import LayoutVAE
-    from models.tensors import layout_batch
+    from models.tensors import make_layout_batch
+    from models.vae.config import GroundConfig, ObjectConfig
 
     root = tmp_path_factory.mktemp("rebuild")
     scenes = [random_scene(k, n=25, split="test") for k in range(11)]
@@ -207,10 +208,12 @@ def reconstruction_dataset(tmp_path_factory) -> Path:
     torch.manual_seed(0)
     spec = small_spec(pixels=64)
     model = LayoutVAE(
-        spec.to_dict(), latent_channels=4, channels=(8, 16, 16), norm_groups=4, width=32, layers=1, heads=2,
-        hidden=32, head_hidden=32,
-    )  # fmt: skip
-    model.start_at(layout_batch(scenes, spec))
+        spec.to_dict(),
+        latent_channels=4,
+        ground=GroundConfig((8, 16, 16), norm_groups=4),
+        objects=ObjectConfig(width=32, layers=1, heads=2, hidden=32, head_hidden=32),
+    )
+    model.init_from_data(make_layout_batch(scenes, spec))
     model.save_pretrained(root / "lvae")
     return root
 

@@ -15,8 +15,9 @@ import torch
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.pipeline import PrITTIPipeline, Resampling, scheduler
+from models.pipeline import PrITTIPipeline
 from models.presets import LVAE_PRESETS
+from models.sampling.repaint import RePaintConfig
 from models.scene import (
     CATEGORIES,
     CATEGORY_INDEX,
@@ -24,15 +25,15 @@ from models.scene import (
     PER_PRIMITIVE,
     Grid,
     Scene,
-    canonical_boxes,
-    yaw_rotation,
+    canonicalize_boxes,
+    make_yaw_rotation,
 )
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
 ROOT = Path(__file__).parents[1]  # of the repository
 LATENT_SHAPE = (4, 8, 8)
 VOID = {"meta", "img", "line", "polyline", "rect", "circle"}  # elements without a closing tag
-QUICK = Resampling(num_steps=6, jump_length=2, resamplings=2)
+QUICK = RePaintConfig(num_inference_steps=6, jump_length=2, resamplings=2)
 SHARD_SIZES = (5, 3, 7, 4, 6)
 TOWN_SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}  # of the dataset that the fixture town_dataset writes
 REJECT_REASON = "heights <beyond> 327 m"
@@ -43,7 +44,7 @@ def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) 
     yaw, pitch = rng.uniform(-np.pi, np.pi, n), rng.uniform(-tilt_rad, tilt_rad, n)
     cos, sin, zero, one = np.cos(pitch), np.sin(pitch), np.zeros(n), np.ones(n)
     tilt = np.stack([np.stack(r, -1) for r in ([cos, zero, sin], [zero, one, zero], [-sin, zero, cos])], -2)
-    return yaw_rotation(yaw) @ tilt
+    return make_yaw_rotation(yaw) @ tilt
 
 
 def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad: float = 0.2, **fields) -> Scene:
@@ -51,7 +52,7 @@ def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad:
     rng = np.random.default_rng(seed)
     grid = grid or Grid()
     size = rng.uniform(0.3, 5.0, (n, 3))
-    rotation, size = canonical_boxes(random_rotations(rng, n, tilt_rad), size)
+    rotation, size = canonicalize_boxes(random_rotations(rng, n, tilt_rad), size)
     classes = KITTI_GROUND_CLASSES
     angle, offset = rng.uniform(-np.pi, np.pi, (2, len(classes), 1, 1)) * [[[[1]]], [[[5]]]]
     occupied = np.cos(angle) * (grid.x_m()[:, None] - 32) + np.sin(angle) * grid.y_m() > offset  # half planes
@@ -87,7 +88,7 @@ def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
     dit = DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=spec.to_dict())
     for parameter in dit.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
-    made = PrITTIPipeline(lvae, dit, scheduler())
+    made = PrITTIPipeline(lvae, dit)
     made.set_progress_bar_config(disable=True)
     return made
 
@@ -113,7 +114,7 @@ def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene
     tilt = rng.uniform(-0.1, 0.1, n)
     roll = np.stack([[1 + 0 * tilt, 0 * tilt, 0 * tilt], [0 * tilt, np.cos(tilt), -np.sin(tilt)],
                      [0 * tilt, np.sin(tilt), np.cos(tilt)]]).transpose(2, 0, 1)  # fmt: skip
-    rotation, size = canonical_boxes(yaw_rotation(rng.uniform(-np.pi, np.pi, n)) @ roll, size)
+    rotation, size = canonicalize_boxes(make_yaw_rotation(rng.uniform(-np.pi, np.pi, n)) @ roll, size)
     return Scene(
         scene_id="town-1-0000000007",
         source="town",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 Branches = Literal["both", "ground", "objects"]
@@ -89,3 +90,27 @@ def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
         else:
             nested[name] = value
     return nested
+
+
+def parse_options(config: dict[str, Any]) -> dict[str, Any]:
+    """Keyword arguments of `LayoutVAE` from a stored config, nested or flat.
+
+    Raises:
+        ValueError: An option of a branch is unknown.
+    """
+    options = nest_flat_options(config)
+    for name, kind in (("ground", GroundConfig), ("objects", ObjectConfig)):
+        if isinstance(entries := options.get(name), Mapping):
+            try:
+                options[name] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})
+            except TypeError as error:
+                raise ValueError(f"LayoutVAE: {name} is not a {kind.__name__}: {error}") from error
+    return options
+
+
+def override_options(options: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
+    """Keyword arguments of `LayoutVAE` with changes; a mapping changes entries of a branch's dataclass."""
+    return dict(options) | {
+        name: replace(options[name], **value) if isinstance(value, Mapping) else value
+        for name, value in changes.items()
+    }

@@ -6,10 +6,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 import ray.data
@@ -220,14 +219,6 @@ class Variant:
 
     architecture: Mapping[str, object] = field(default_factory=dict)
     options: Mapping[str, object] = field(default_factory=dict)
-
-
-def change_architecture(architecture: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
-    """Keyword arguments of `LayoutVAE` with a variant's changes; those of a branch change its dataclass."""
-    return dict(architecture) | {
-        name: replace(architecture[name], **value) if isinstance(value, Mapping) else value
-        for name, value in changes.items()
-    }
 
 
 BRANCHES = {

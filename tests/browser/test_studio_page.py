@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from selenium.webdriver.common.action_chains import ActionChains
 
-from pipelines.io.mesh_import import scene_from_glb
+from pipelines.io.mesh_import import import_glb
 from pipelines.schema.tables import read_scenes
 
 
@@ -61,6 +61,6 @@ def test_studio_page_edits_inpaints_undoes_and_downloads(studio_url, studio_file
     )
     path = tmp_path / "downloaded.glb"
     path.write_bytes(glb)
-    scene = scene_from_glb(str(path), "downloaded")
+    scene = import_glb(str(path), "downloaded")
     assert len(scene) == 3 and scene.center_m[number, 0] == pytest.approx(given.center_m[number, 0] + 1, abs=1e-4)
     assert not browser.console_errors()

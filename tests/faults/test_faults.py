@@ -34,11 +34,11 @@ from jobs.preprocess_scenes import main as preprocess
 from models.scene import CATEGORIES, Grid
 from pipelines.preprocess import ingest, sharding
 from pipelines.preprocess.shard_writer import write_shard
-from pipelines.preprocess.sharding import Task, plan_argoverse2, plan_kitti360, plan_own
+from pipelines.preprocess.sharding import ShardTask, plan_argoverse2, plan_custom, plan_kitti360
 from pipelines.preprocess.sources import argoverse2, custom
 from pipelines.preprocess.sources.kitti360 import GROUND_LABELS, read_poses
 from pipelines.preprocess.sources.town import kitti360_writer
-from pipelines.preprocess.sources.town.generator import town_drive, write_kitti360
+from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import storage
 
 import psutil  # isort: skip  # bundled with Ray, importable after ray
@@ -113,14 +113,14 @@ def town(cluster, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def shards(cluster, tmp_path_factory) -> tuple[list[Task], Path]:
+def shards(cluster, tmp_path_factory) -> tuple[list[ShardTask], Path]:
     """Eleven shards of one drive, which a separate task reads once, and the output of an undisturbed run."""
     root = tmp_path_factory.mktemp("shards")
-    write_kitti360(town_drive(7).at(np.arange(40, 84), CROP), root / "raw")
+    write_kitti360(generate_town(7).at(np.arange(40, 84), CROP), root / "raw")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(sharding, "SHARD_SCENES", 4)
         tasks = plan_kitti360(str(root / "raw"), split=False)
-    made = ingest.ingest(tasks, str(root / "undisturbed"), {}, grid=CROP)
+    made = ingest.ingest_drives(tasks, str(root / "undisturbed"), {}, grid=CROP)
     assert len(tasks) == 11 and made.scenes == {"train": 44} and made.duplicates > 5
     return tasks, root / "undisturbed"
 
@@ -175,7 +175,7 @@ def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatc
     ):
         monkeypatch.setattr(ingest, name, slowed(getattr(ingest, name), seconds))
     with killed_workers(quota, seed=seed) as killed:
-        ingest.ingest(tasks, str(tmp_path), {}, grid=CROP)
+        ingest.ingest_drives(tasks, str(tmp_path), {}, grid=CROP)
     assert Counter(killed) == quota
     assert_same(tmp_path, undisturbed)
 
@@ -192,7 +192,7 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
 
     def armed(function: Callable) -> Callable:
         def call(*arguments: Any) -> Any:
-            whole, at_once = storage.write_whole, storage.move
+            whole, at_once = storage.write_whole, storage.move_file
 
             def write_whole(uri: str, write: Callable) -> None:
                 marker = died / str(len(uri))
@@ -210,7 +210,7 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
                 at_once(source, target)
 
             if not hasattr(storage, "armed"):
-                storage.write_whole, storage.move, storage.armed = write_whole, move, True
+                storage.write_whole, storage.move_file, storage.armed = write_whole, move, True
             return function(*arguments)
 
         return call
@@ -218,7 +218,7 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
     monkeypatch.setattr(ingest, "write_shard", armed(ingest.write_shard))
     monkeypatch.setattr(ingest, "label_scenes", armed(ingest.label_scenes))
     with watched(root):
-        ingest.ingest(tasks, str(root), {}, grid=CROP)
+        ingest.ingest_drives(tasks, str(root), {}, grid=CROP)
     assert len(list(died.iterdir())) == len(doomed)
     assert_same(root, undisturbed)
 
@@ -403,7 +403,7 @@ Touches = Callable[[str, dict], bool]  # table, row -> whether this row may diff
 PLANS = {
     "kitti360": lambda root: plan_kitti360(root, split=False),
     "av2": plan_argoverse2,
-    "own": lambda root: plan_own(root, split=False),
+    "own": lambda root: plan_custom(root, split=False),
 }
 
 
@@ -540,7 +540,7 @@ GROUND_NAMES = {label for labels in GROUND_LABELS.values() for label in labels}
 def write_kitti360_excerpt(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four poses of the town and what lies about them, in two annotation windows that share objects."""
     monkeypatch.setattr(kitti360_writer, "WINDOW_POSES", 2)
-    write_kitti360(town_drive(7).at(np.arange(60, 64), Grid(4.0, 4.0, 0.5, 16, 16)), root)
+    write_kitti360(generate_town(7).at(np.arange(60, 64), Grid(4.0, 4.0, 0.5, 16, 16)), root)
 
 
 def objects_of(xml: bytes) -> list[str]:

@@ -2,6 +2,7 @@
 
 import json
 import xml.etree.ElementTree as ElementTree
+from dataclasses import asdict
 from pathlib import Path
 
 import duckdb
@@ -9,11 +10,12 @@ import pytest
 import torch
 
 from models.presets import LVAE_PRESETS
+from models.vae.config import LayoutVAEConfig, override_options
 from pipelines.evaluation.ablation import (
     AUGMENTATIONS,
     BRANCHES,
     DECODERS,
-    measured,
+    average_measurements,
 )
 
 
@@ -72,8 +74,8 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
         mirrored = run.reader.augment is not None and run.reader.augment.flip
         assert mirrored == switch.options.get("flip", False)
         assert run.stream.batch_size == row.batch_size
-        wanted = row.architecture() | switch.architecture
-        assert {name: trainer.model.config[name] for name in wanted} == wanted
+        wanted = LayoutVAEConfig(**override_options(row.architecture(), switch.architecture))
+        assert {name: trainer.model.config[name] for name in asdict(wanted)} == asdict(wanted)
         batch = as_tensors(read_samples(run.stream, run.reader, 0, 1, row.batch_size, 0, 1))
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
 
@@ -90,7 +92,7 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         described |= {"gflops": 0.5}
         reconstruction = scores | {"ap3d": 0.5, "ap3d_50": 0.25}
         described |= {"training_seconds": 1.0, "curve": [(2, 0.1), (7, 0.5)]}
-        return described | measured(BRANCHES[variant], reconstruction)
+        return described | average_measurements(BRANCHES[variant], reconstruction)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
     output = job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=2))

@@ -9,14 +9,14 @@ from golden.golden_recipe import random_state_dict
 from helpers import kill_ray_workers
 
 from jobs.evaluate_scenes import Config, evaluate
-from pipelines.evaluation.evaluate import compare, memorisation
-from pipelines.evaluation.features import Looks, chosen_scenes, describe
+from pipelines.evaluation.evaluate import compare_datasets, compute_memorisation
+from pipelines.evaluation.features import FeatureConfig, compute_scene_features, load_scenes
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.metrics.inception import Inception
 from pipelines.metrics.intervals import Estimate
-from pipelines.rendering.render import bev_picture
+from pipelines.rendering.render import render_bev
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 
 SAMPLES = 5  # the network takes a second per image
 
@@ -32,8 +32,8 @@ def weights(tmp_path_factory) -> str:
 def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_path):
     """Scores real training scenes against real test scenes, as tables and as ADM's .npz of their images."""
     data = str(smoke / "datasets/smoke")
-    test = chosen_scenes(Selection(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
-    write_npz(str(tmp_path / "test.npz"), (np.stack([bev_picture(scene)]) for scene in test), SAMPLES)
+    test = load_scenes(SceneSubset(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
+    write_npz(str(tmp_path / "test.npz"), (np.stack([render_bev(scene)]) for scene in test), SAMPLES)
     options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3), "actors": 1}
     as_tables = evaluate(
         Config(generated=data, generated_split="test", balance=False, output=str(tmp_path / "tables"), **options)
@@ -67,22 +67,22 @@ def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
 def test_describe_is_unchanged_by_worker_kill(smoke, tmp_path):
     """The worker is killed as soon as the first part is written."""
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
-    chosen = Selection(dataset.root, "town", "train")
-    whole = describe(chosen, dataset, Looks(), str(tmp_path / "whole"))
+    chosen = SceneSubset(dataset.root, "town", "train")
+    whole = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "whole"))
     killed = []
 
     def kill(scenes: int) -> None:
         if scenes and not killed:
             killed.extend(kill_ray_workers("describe_scenes"))
 
-    again = describe(chosen, dataset, Looks(), str(tmp_path / "killed"), on_scenes=kill)
+    again = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "killed"), on_scenes=kill)
     assert len(killed) == 1 and whole.keys() == again.keys()
     assert all(np.array_equal(whole[name], again[name], equal_nan=name == "statistics") for name in whole)
 
 
 def scores_of(real: np.ndarray, generated: np.ndarray) -> dict:
     sides = [{"scene_id": np.arange(len(side)), "random": side} for side in (real, generated)]
-    return compare(*sides)
+    return compare_datasets(*sides)
 
 
 def test_compare_handles_degenerate_features(cluster):
@@ -101,7 +101,7 @@ def test_compare_handles_degenerate_features(cluster):
         scores_of(some, np.where(np.arange(20)[:, None] == 4, np.nan, some))
     with pytest.raises(ValueError, match="--k 3 needs more than 3 scenes on each side, got 20 and 3"):
         scores_of(some, some[:3])
-    found = memorisation(some, np.concatenate([some[:5], some[5:] + 9]))
+    found = compute_memorisation(some, np.concatenate([some[:5], some[5:] + 9]))
     assert found["copies"].value == 0.25 and found["memorised"].value == 0.25 and found["nearest"][3, 0] == 3
 
 

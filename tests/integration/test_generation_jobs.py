@@ -123,7 +123,7 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     outpaint(options)
     large, small = next(read_scenes(str(tmp_path))), next(read_scenes(str(samples), "generated-samples"))
     assert large.grid.rows == 2 * small.grid.rows and large.occupied.shape[1:] == (64, 64)
-    middle = large.cropped(small.grid)
+    middle = large.crop(small.grid)
     assert np.array_equal(middle.occupied, small.occupied) and len(middle) == len(small)
     assert np.allclose(middle.height_m, small.height_m, atol=0.006)
     assert (tmp_path / "glb/outpainted").is_dir()
@@ -193,17 +193,17 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
 
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
     from jobs.outpaint_scenes import Config, last_blocks
-    from models.pipeline import Resampling
+    from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
-    from pipelines.schema.scene_subset import Selection
+    from pipelines.schema.scene_subset import SceneSubset
 
     def request(name: str, **options) -> OutpaintRequest:
-        resampling = Resampling(num_steps=4, jump_length=2, resamplings=2)
+        resampling = RePaintConfig(num_inference_steps=4, jump_length=2, resamplings=2)
         model = str(smoke / "models/pritti-smoke")
         made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", resampling, 1.0)
         return replace(made, **{"last": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
 
-    chosen = Selection(str(samples), "generated-samples", None, 1, "first")
+    chosen = SceneSubset(str(samples), "generated-samples", None, 1, "first")
     table = outpaint_scenes(request("whole"), chosen)
     assert len(table) == 8 and set(table.column_names) >= {"ahead", "left", "datum_m", "known_ground"}
     (whole,) = read_scenes(str(tmp_path / "whole"))
@@ -279,33 +279,35 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
 
 
 def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
-    from models.pipeline import Resampling
+    from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest
-    from pipelines.generation.sample import claim_run, load_pipeline
+    from pipelines.generation.sample import guard_generation_run, load_pipeline
 
     model = str(smoke / "models/pritti-smoke")
     pipeline = load_pipeline(model)
-    for run, resampling in (("paper", Resampling()), ("guided", Resampling.guided())):
+    for run, resampling in (("paper", RePaintConfig()), ("guided", RePaintConfig.guided())):
         request = OutpaintRequest(model, str(tmp_path), run, None, 0, 0.5, "reencode", resampling, 1.0)
         pipeline.register_to_config(noise_scaling=1.0)
-        claim_run(request, pipeline, [str(smoke)])
+        guard_generation_run(request, pipeline, [str(smoke)])
         pipeline.register_to_config(noise_scaling=1.01)
         if run == "paper":  # does not scale the noise
-            claim_run(request, pipeline, [str(smoke)])
+            guard_generation_run(request, pipeline, [str(smoke)])
     with pytest.raises(ValueError, match=r"holds a run 'guided' with noise_scaling=1.0, asked for 1.01"):
-        claim_run(request, pipeline, [str(smoke)])
+        guard_generation_run(request, pipeline, [str(smoke)])
 
 
 def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
     """Training scenes scored against themselves give the noise floor of the evaluator."""
-    from pipelines.evaluation.evaluate import compare
-    from pipelines.evaluation.features import Looks, describe
+    from pipelines.evaluation.evaluate import compare_datasets
+    from pipelines.evaluation.features import FeatureConfig, compute_scene_features
     from pipelines.schema.dataset import Dataset
-    from pipelines.schema.scene_subset import Selection
+    from pipelines.schema.scene_subset import SceneSubset
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
-    side = describe(Selection(dataset.root, "town", "train"), dataset, Looks(), str(tmp_path / "described"))
-    scores = compare(side, side, dataset.spec.ground_classes)
+    side = compute_scene_features(
+        SceneSubset(dataset.root, "town", "train"), dataset, FeatureConfig(), str(tmp_path / "described")
+    )
+    scores = compare_datasets(side, side, dataset.spec.ground_classes)
     assert abs(scores["layout_frechet"].value) < 1e-4 and abs(scores["random_frechet"].value) < 1e-4
     assert scores["random_precision_k3"].value == scores["random_recall_k3"].value == 1.0
     assert scores["random_coverage_k3"].value == 1.0
@@ -317,17 +319,21 @@ def test_describe_resumes_where_it_stopped(smoke, tmp_path, monkeypatch):
     """Existing parts are kept, missing ones recomputed; other options or scenes start again."""
     from pipelines.evaluation import features as module
     from pipelines.schema.dataset import Dataset
-    from pipelines.schema.scene_subset import Selection
+    from pipelines.schema.scene_subset import SceneSubset
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
-    chosen, looks, directory = Selection(dataset.root, "town", "train"), module.Looks(), tmp_path / "described"
-    first = module.describe(chosen, dataset, looks, str(directory))
+    chosen, looks, directory = (
+        SceneSubset(dataset.root, "town", "train"),
+        module.FeatureConfig(),
+        tmp_path / "described",
+    )
+    first = module.compute_scene_features(chosen, dataset, looks, str(directory))
     parts = sorted(directory.glob("part-*.parquet"))
     assert len(parts) == len(chosen.shards()) > 1
     kept, times = parts[1:], [part.stat().st_mtime_ns for part in parts[1:]]
     parts[0].unlink()
-    again = module.describe(chosen, dataset, looks, str(directory))
+    again = module.compute_scene_features(chosen, dataset, looks, str(directory))
     assert [part.stat().st_mtime_ns for part in kept] == times
     assert all(np.array_equal(first[name], again[name], equal_nan=name == "statistics") for name in first)
-    module.describe(chosen, dataset, module.Looks(supersample=2), str(directory))
+    module.compute_scene_features(chosen, dataset, module.FeatureConfig(supersample=2), str(directory))
     assert all(part.stat().st_mtime_ns > time for part, time in zip(kept, times, strict=True))

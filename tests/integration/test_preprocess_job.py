@@ -13,10 +13,10 @@ from pipelines.preprocess import ingest
 from pipelines.preprocess.shard_writer import ShardCut, write_shard
 from pipelines.preprocess.sharding import plan_argoverse2, plan_kitti360, plan_town
 from pipelines.preprocess.sources.drive import Drive
-from pipelines.preprocess.sources.town.generator import take, town_drive, write_kitti360
+from pipelines.preprocess.sources.town.generator import generate_town, select_poses, write_kitti360
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.density_labels import density, density_thresholds
+from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 from pipelines.schema.tables import find_shards, read_scenes
 
 
@@ -27,7 +27,7 @@ def table(root: Path, query: str, name: str = "scenes") -> list[tuple]:
 @pytest.fixture(scope="session")
 def town(cluster, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("town")
-    result = ingest.ingest(plan_town(24, 8, 0), str(root), {"source": "town"})
+    result = ingest.ingest_drives(plan_town(24, 8, 0), str(root), {"source": "town"})
     assert result.scenes == {"train": 24, "test": 8} and not result.rejects
     return root
 
@@ -45,9 +45,9 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     )
     training = [row for row in rows if row[0] == "train"]
     count, volume = (np.array([row[k] for row in training], float) for k in (1, 2))
-    assert dataset.vegetation == density_thresholds(count, volume)
+    assert dataset.vegetation == compute_density_thresholds(count, volume)
     for _, n, v, label in rows:
-        assert density(np.array([n]), np.array([v]), dataset.vegetation)[0] == label
+        assert classify_density(np.array([n]), np.array([v]), dataset.vegetation)[0] == label
     p95 = np.percentile(
         [
             [row[k] for k in range(11)]
@@ -65,11 +65,11 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
 
 def test_preprocess_tables_equal_drive(town):
     (seed,) = table(town, "select min(sequence) from TABLE where split = 'train'")[0]
-    drive = town_drive(int(seed))
+    drive = generate_town(int(seed))
     stored = {s.frame: s for s in read_scenes(str(town), "town", "train") if s.sequence == seed}
-    frames = drive.frame[take(len(drive), len(stored))]
+    frames = drive.frame[select_poses(len(drive), len(stored))]
     assert set(frames.tolist()) == set(stored)
-    for index in take(len(drive), len(stored)):
+    for index in select_poses(len(drive), len(stored)):
         scene = drive.scene(int(index), "train")
         assert np.array_equal(stored[scene.frame].center_m, scene.center_m)
         assert np.array_equal(stored[scene.frame].occupied, scene.occupied)
@@ -77,22 +77,22 @@ def test_preprocess_tables_equal_drive(town):
 
 def test_preprocess_keeps_finished_run_and_rejects_other_options(town):
     stamp = (town / "dataset.json").stat().st_mtime_ns
-    again = ingest.ingest(plan_town(24, 8, 0), str(town), {"source": "town"})
+    again = ingest.ingest_drives(plan_town(24, 8, 0), str(town), {"source": "town"})
     assert again.already_complete and (town / "dataset.json").stat().st_mtime_ns == stamp
     with pytest.raises(ValueError, match="choose another --output"):
-        ingest.ingest(plan_town(8, 8, 0), str(town), {"source": "town", "num_train": 8})
+        ingest.ingest_drives(plan_town(8, 8, 0), str(town), {"source": "town", "num_train": 8})
 
 
 def test_preprocess_resumes_interrupted_run_to_same_tables(cluster, town, tmp_path):
     tasks, root = plan_town(24, 8, 0), str(tmp_path)
-    staging = storage.join(root, ingest.STAGING)
-    storage.write_json({"source": "town"}, storage.join(staging, "options.json"))
+    staging = storage.join_uri(root, ingest.STAGING)
+    storage.write_json({"source": "town"}, storage.join_uri(staging, "options.json"))
     done = write_shard(tasks[0], staging, Grid())
     stamp = Path(tasks[0].shard(staging).path("rasters")).stat().st_mtime_ns
     stale = Path(staging) / "rasters" / f"{storage.TEMPORARY}1-part"
     stale.write_text("half")
     assert done["scenes"] > 0 and not (tmp_path / "scenes").exists()
-    ingest.ingest(tasks, root, {"source": "town"})
+    ingest.ingest_drives(tasks, root, {"source": "town"})
     assert Path(tasks[0].shard(root).path("rasters")).stat().st_mtime_ns == stamp
     assert not stale.exists()
     for name in ("scenes", "primitives", "rasters"):
@@ -106,7 +106,7 @@ def test_preprocess_resumes_interrupted_run_to_same_tables(cluster, town, tmp_pa
 
 
 def test_preprocess_reads_real_kitti360_excerpt(cluster, real_data, tmp_path):
-    result = ingest.ingest(plan_kitti360(str(real_data / "kitti360")), str(tmp_path), {"source": "kitti360"})
+    result = ingest.ingest_drives(plan_kitti360(str(real_data / "kitti360")), str(tmp_path), {"source": "kitti360"})
     assert sum(result.scenes.values()) + sum(result.rejects.values()) == 500 and result.duplicates == 133
     assert set(result.scenes) == {"train", "test", "unused"}
     rows = table(tmp_path, "select count(*), count(distinct scene_id), max(crossing_area_m2), min(x_m) from TABLE")
@@ -122,7 +122,7 @@ def test_preprocess_reads_real_kitti360_excerpt(cluster, real_data, tmp_path):
 
 
 def test_preprocess_reads_real_argoverse2_logs(cluster, real_data, tmp_path):
-    result = ingest.ingest(plan_argoverse2(str(real_data / "av2")), str(tmp_path), {"source": "av2"})
+    result = ingest.ingest_drives(plan_argoverse2(str(real_data / "av2")), str(tmp_path), {"source": "av2"})
     assert set(result.scenes) == {"train", "test"} and min(result.scenes.values()) > 150
     dataset = Dataset.open(str(tmp_path))
     assert dataset.spec.ground_classes == ("road", "crossing") and len(dataset.spec.categories) <= 7
@@ -133,9 +133,9 @@ def test_preprocess_reads_real_argoverse2_logs(cluster, real_data, tmp_path):
 
 
 def test_preprocess_reads_town_in_kitti360_format_equally(cluster, tmp_path):
-    drive = town_drive(7)
+    drive = generate_town(7)
     write_kitti360(drive, tmp_path / "raw")
-    result = ingest.ingest(
+    result = ingest.ingest_drives(
         plan_kitti360(str(tmp_path / "raw"), split=False), str(tmp_path / "out"), {"source": "kitti360"}
     )
     assert result.scenes == {"train": len(drive)} and result.duplicates > 50
@@ -158,14 +158,16 @@ def test_preprocess_stops_at_broken_drive_and_keeps_finished(cluster, real_data,
     broken.write_bytes(whole[:1000])
     out = str(tmp_path / "out")
     with pytest.raises(ValueError, match=r"annotations.feather.*All other drives are staged: repair the file"):
-        ingest.ingest(plan_argoverse2(str(raw)), out, {"source": "av2"})
+        ingest.ingest_drives(plan_argoverse2(str(raw)), out, {"source": "av2"})
     assert not (tmp_path / "out/scenes").exists() and not (tmp_path / "out/dataset.json").exists()
-    skipped = ingest.ingest(plan_argoverse2(str(raw)), str(tmp_path / "skip"), {"source": "av2"}, skip_unreadable=True)
+    skipped = ingest.ingest_drives(
+        plan_argoverse2(str(raw)), str(tmp_path / "skip"), {"source": "av2"}, skip_unreadable=True
+    )
     assert set(skipped.scenes) == {"test", "train"} and skipped.scenes["test"] == 0
     reasons = table(tmp_path / "skip", "select scene_id, reason from TABLE", "rejects")
     assert len(reasons) == 1 and "annotations.feather" in reasons[0][1]
     broken.write_bytes(whole)
-    assert ingest.ingest(plan_argoverse2(str(raw)), out, {"source": "av2"}).scenes["test"] > 150
+    assert ingest.ingest_drives(plan_argoverse2(str(raw)), out, {"source": "av2"}).scenes["test"] > 150
 
 
 def test_preprocess_rejects_bad_scene_and_keeps_others(cluster, tmp_path, monkeypatch):
@@ -185,7 +187,7 @@ def test_preprocess_rejects_bad_scene_and_keeps_others(cluster, tmp_path, monkey
 
 def test_preprocess_rejects_empty_training_split(cluster, tmp_path):
     with pytest.raises(ValueError, match="nothing to preprocess"):
-        ingest.ingest([], str(tmp_path), {})
+        ingest.ingest_drives([], str(tmp_path), {})
     only_test = [task for task in plan_town(24, 8, 0) if task.split == "test"]
     with pytest.raises(ValueError, match="the training split is empty"):
-        ingest.ingest(only_test, str(tmp_path), {})
+        ingest.ingest_drives(only_test, str(tmp_path), {})

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from models.pretrained import CHECKSUMS, checksums
+from models.pretrained import CHECKSUMS_NAME, compute_checksums
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
     entry = Path(output)
     assert reference == "models:/tiny/1" and entry == smoke / "zoo/tiny"
-    assert json.loads((entry / CHECKSUMS).read_text()) == checksums(entry)
+    assert json.loads((entry / CHECKSUMS_NAME).read_text()) == compute_checksums(entry)
     card, scores = (entry / "README.md").read_text(), json.loads((evaluated / "metrics.json").read_text())
     assert f"| {scores['generation']['random_frechet']['value']:.3g}"[:8] in card
     assert "| steps done | 8 |" in card and "learning_rate 0.001" in card and "options" in card
@@ -49,7 +49,10 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
         again = load_pipeline(pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
     kept = smoke / "registry" / run_id
-    assert json.loads((kept / CHECKSUMS).read_text()) == checksums(kept) and len(list(kept.parent.iterdir())) == 1
+    assert (
+        json.loads((kept / CHECKSUMS_NAME).read_text()) == compute_checksums(kept)
+        and len(list(kept.parent.iterdir())) == 1
+    )
     second = publish(Config(name="tiny", evaluation=str(evaluated)))
     assert second[1] == "models:/tiny/2"
     (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
@@ -116,8 +119,8 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     from jobs.support.trainer import as_tensors, tag_weights
     from jobs.train_dit import Config, prepare
     from pipelines.generation.sample import load_pipeline
-    from pipelines.training.data_loader import batches
-    from pipelines.training.latents import weights_digest
+    from pipelines.training.data_loader import iterate_batches
+    from pipelines.training.latents import digest_weights
 
     start, more = str(tmp_path / "start"), tmp_path / "more"
     pipeline = load_pipeline(str(smoke / "models/pritti-smoke"))
@@ -127,17 +130,17 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     run, complete = prepare(Config(preset="smoke", name="more", start_from=start, **options))
     trainer = run.build(torch.device("cpu"), lambda model: model)
     first = load_pipeline(start).dit
-    assert weights_digest(trainer.model) == weights_digest(first) == run.identity["start_from"]
+    assert digest_weights(trainer.model) == digest_weights(first) == run.identity["start_from"]
     assert [run.settings.at(step)[0] for step in (0, 1)] == [pytest.approx(1e-3), pytest.approx(1e-5)]
-    for batch in batches(run.stream, run.reader, 0, run.settings.steps):
+    for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
         trainer.step(as_tensors(batch), range(run.stream.batch_size))
-    tag_weights(run.tracker, trainer.averaged(), trainer.steps_done)
-    told = history("pritti-dit", "Transformer", trainer.averaged())
+    tag_weights(run.tracker, trainer.ema_model(), trainer.steps_done)
+    told = history("pritti-dit", "Transformer", trainer.ema_model())
     assert [(run.name, run.stage, run.steps) for run in told] == [
         ("dit", "Transformer", 8),
         ("dit-2", "Transformer, run 2", 2),
     ]
-    assert told[1].options["start_from"] == told[0].weights == weights_digest(first)
+    assert told[1].options["start_from"] == told[0].weights == digest_weights(first)
     first.save_pretrained(more / "dit")
     sampling = load_pipeline(complete(str(more))).config
     assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights

@@ -4,28 +4,28 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.evaluation.evaluate import flattened
+from pipelines.evaluation.evaluate import flatten_scores
 from pipelines.evaluation.reconstruction import (
-    Rebuilt,
-    draw,
-    rebuild,
+    Reconstruction,
+    draw_scenes,
+    evaluate_reconstruction,
 )
-from pipelines.reporting.reconstruction_report import reconstruction_html
-from pipelines.schema.scene_subset import Selection
+from pipelines.reporting.reconstruction_report import render_reconstruction_html
+from pipelines.schema.scene_subset import SceneSubset
 
 
-def selection(root: Path) -> Selection:
-    return Selection(str(root), "town", "test")
+def selection(root: Path) -> SceneSubset:
+    return SceneSubset(str(root), "town", "test")
 
 
 @pytest.fixture(scope="module")
-def rebuilt(reconstruction_dataset, cluster) -> Rebuilt:
-    return rebuild(selection(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
+def rebuilt(reconstruction_dataset, cluster) -> Reconstruction:
+    return evaluate_reconstruction(selection(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
 
 
 def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, rebuilt):
     done = []
-    again = rebuild(
+    again = evaluate_reconstruction(
         selection(reconstruction_dataset),
         str(reconstruction_dataset / "lvae"),
         2,
@@ -33,7 +33,7 @@ def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_data
         on_scene=lambda: done.append(1),
     )
     assert len(done) == rebuilt.scores["scenes"] == len(rebuilt.scenes) == 11
-    first, second = flattened(rebuilt.scores), flattened(again.scores)
+    first, second = flatten_scores(rebuilt.scores), flatten_scores(again.scores)
     different = [name for name in first if first[name] != pytest.approx(second[name], rel=1e-3, abs=1e-6)]
     assert first.keys() == second.keys() and not different
 
@@ -49,14 +49,14 @@ def test_reconstruction_lists_best_scene_first(reconstruction_dataset, rebuilt):
 
 
 def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_dataset, rebuilt):
-    drawn = draw([rebuilt.places[0], rebuilt.places[-1]], str(reconstruction_dataset / "lvae"))
+    drawn = draw_scenes([rebuilt.places[0], rebuilt.places[-1]], str(reconstruction_dataset / "lvae"))
     assert [row["scene_id"] for row in drawn] == rebuilt.scenes["scene_id"].take([0, 10]).to_pylist()
     for row in drawn:
         for view in ("above", "oblique"):
             truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
             differs = bool((truth != again).any())
             assert truth.shape == again.shape == (480, 480, 3) and differs
-    html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:1], drawn[1:])
+    html = render_reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:1], drawn[1:])
     counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
     assert counts == (8, 8, 0)  # self-contained
     wanted = ("AP3D@50", "voxel mIoU", "Memory", "What the voxels leave out", "vegetation ellipsoid")

@@ -10,15 +10,15 @@ import trimesh
 from PIL import Image
 
 from models.scene import Scene
-from pipelines.io.mesh_export import scene_triangles
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.io.mesh_export import triangulate_scene
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.palette import CATEGORY_IDS
 from pipelines.schema.tables import Shard
 
 
 @pytest.fixture(scope="module")
 def town_scenes() -> list[Scene]:
-    return [town_drive(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
+    return [generate_town(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
 
 
 def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
@@ -55,7 +55,7 @@ def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluste
     assert list(refused) == ["bare"] and refused["bare"].startswith("xodr: scene bare has no road")
     path = Path(output)
     mesh = trimesh.load(path / "ply" / f"{town_scenes[0].scene_id}.ply", process=False)
-    soup = scene_triangles(town_scenes[0])
+    soup = triangulate_scene(town_scenes[0])
     assert len(mesh.faces) == len(soup.corners_m)
     assert np.allclose(
         np.sort(mesh.area_faces),

@@ -32,14 +32,14 @@ def test_train_dit_creates_inputs_of_smoke_preset(home):
 
 
 def test_encode_latents_match_lvae_and_scene_order(home):
-    from models.tensors import layout_batch
+    from models.tensors import make_layout_batch
     from pipelines.training.latents import load_lvae
 
     shard = find_shards(str(home / "datasets/smoke"), split="test")[0]
     table, scenes = shard.read("latents"), shard.scenes()
     assert table["scene_id"].to_pylist() == [s.scene_id for s in scenes]
     lvae = load_lvae(str(home / "models/lvae-smoke"))
-    want = lvae.encode(layout_batch(scenes, lvae.spec)).mean.numpy()
+    want = lvae.encode(make_layout_batch(scenes, lvae.spec)).mean.numpy()
     got = table["mean"].combine_chunks().to_numpy_ndarray()
     assert got.dtype == np.float16 and np.allclose(got, want, atol=2e-3 * np.abs(want).max())
 
@@ -139,20 +139,20 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
     from jobs.train_lvae import Config, train
 
     kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
-    assert train(Config(preset="smoke", name="decoder", keep_latents_of=str(kept))) == str(output)
+    assert train(Config(preset="smoke", name="decoder", freeze_all_but_object_decoder=str(kept))) == str(output)
     old, new = weights(kept / "lvae"), weights(output / "lvae")
     changed = {name for name in old if (old[name] != new[name]).any()}
     assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
     assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
     with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
-        train(Config(preset="smoke", name="smoke", keep_latents_of=str(kept)))
+        train(Config(preset="smoke", name="smoke", freeze_all_but_object_decoder=str(kept)))
     with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
         train(
             Config(
                 preset="demo",
                 name="other",
                 dataset=str(home / "datasets/smoke"),
-                keep_latents_of=str(kept),
+                freeze_all_but_object_decoder=str(kept),
             )
         )
 

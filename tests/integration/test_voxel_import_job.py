@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers import save_npz
 
-from pipelines.geometry.voxels import VoxelGrid, voxelise
-from pipelines.io.mesh_export import scene_glb
-from pipelines.io.voxel_import import FULL, voxel_picture, write_voxels
-from pipelines.metrics.reconstruction import voxel_confusion
+from pipelines.geometry.voxels import VoxelGrid, voxelize
+from pipelines.io.mesh_export import export_glb
+from pipelines.io.voxel_import import FULL, draw_voxels, write_voxels
+from pipelines.metrics.reconstruction import compute_voxel_confusion
 from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.tables import Shard, find_shards, read_scenes
 
@@ -32,7 +32,7 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
     for k, scene in enumerate(town_scenes):
         path = meshes / ("day" if k % 2 else "night") / f"{k}.glb"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(scene_glb(scene))
+        path.write_bytes(export_glb(scene))
     good = (meshes / "night/4.glb").read_bytes()
     (meshes / "night/4.glb").write_bytes(good[:1000])
     config = Config(str(meshes), name="theirs", output=str(output))
@@ -68,7 +68,7 @@ def test_evaluate_scores_imported_scenes(smoke, tmp_path):
 
     scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
-        (tmp_path / f"{scene.scene_id}.glb").write_bytes(scene_glb(scene))
+        (tmp_path / f"{scene.scene_id}.glb").write_bytes(export_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
     scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores"), actors=1))
@@ -87,7 +87,7 @@ def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
     config = Config(str(tmp_path / "in"), name="peer", format="npz", output=str(tmp_path / "out"))
     target, made = import_scenes(config)
     assert made["scenes"] == ["scene0", "scene1", "scene2"] and made["rejects"] == 1
-    want = np.stack([voxel_picture(voxelise(scene, VoxelGrid())) for scene in town_scenes[:3]])
+    want = np.stack([draw_voxels(voxelize(scene, VoxelGrid())) for scene in town_scenes[:3]])
     with np.load(target) as pictures:
         assert pictures.files == ["arr_0"] and pictures["arr_0"].dtype == np.uint8
         assert np.array_equal(pictures["arr_0"], want)
@@ -127,7 +127,7 @@ def voxel_files(tmp_path_factory, town_scenes):
     """Truths, and reconstructions with a tenth of the voxels emptied and some classes changed."""
     root, rng, voxels = tmp_path_factory.mktemp("voxels"), np.random.default_rng(0), []
     for k, scene in enumerate(town_scenes[:4]):
-        truth = voxelise(scene, VoxelGrid())
+        truth = voxelize(scene, VoxelGrid())
         rebuilt = np.where(rng.random(FULL) < 0.1, 0, truth)
         rebuilt[rebuilt == CLASS_ID["road"]] = rng.choice([CLASS_ID["road"], CLASS_ID["terrain"]], 1)[0]
         voxels.append((truth, rebuilt.astype(np.uint8)))
@@ -164,7 +164,7 @@ def test_evaluate_voxels_pools_counts_over_scenes(cluster, tmp_path, voxel_files
     assert miou == scores["voxels"]["miou"]
     rows = duckdb.sql(f"select * from '{tmp_path}/voxels.parquet' order by scene_id").fetchall()
     for k, (name, iou, _, size, kept) in enumerate(rows):
-        confusion = voxel_confusion(*voxels[k])
+        confusion = compute_voxel_confusion(*voxels[k])
         filled = confusion.sum() - confusion[0, 0]
         assert (name, size, kept) == (f"s{k}", sizes[k], 100 + 10 * k)
         assert np.isclose(iou, confusion[1:, 1:].sum() / filled)

@@ -9,27 +9,28 @@ import torch
 from helpers import random_scene, small_spec
 from scipy.spatial.transform import Rotation
 
-from models.geometry.encodings import ENCODINGS, harmonics, nearest_frame
+from models.geometry.encodings import ENCODINGS, compute_harmonics, find_nearest_frame
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS
-from models.scene import canonical_boxes, yaw_rotation
-from models.studies.orientation_study import THINGS, OneObjectAutoencoder, Settings, draw_boxes, fit
-from models.tensors import layout_batch, scene_from_layout
-from models.vae.losses import lvae_loss
+from models.scene import canonicalize_boxes, make_yaw_rotation
+from models.studies.orientation_study import THINGS, OneObjectAutoencoder, StudyConfig, draw_boxes, train_autoencoder
+from models.tensors import decode_layout, make_layout_batch
+from models.vae.config import override_options
+from models.vae.losses import compute_lvae_loss
 from pipelines.evaluation.ablation import (
     AUGMENTATIONS,
     BRANCHES,
     DECODERS,
     GROUND,
     LOST_YAW_IOU3D,
-    CentredBoxes,
+    CenteredBoxes,
     Trial,
-    iou3d,
-    square_iou,
-    training_boxes,
-    trials,
-    yaw_loss,
+    compute_mean_iou3d,
+    compute_square_iou,
+    compute_yaw_loss,
+    draw_training_boxes,
+    list_trials,
 )
 
 CUBE_SYMMETRIES = [
@@ -95,10 +96,10 @@ def test_encoding_is_bi_lipschitz_only_if_octahedral():
     step = 10 ** rng.uniform(-4, 0, (6000, 1))
     turn = Rotation.from_rotvec(step * rng.standard_normal((6000, 3))).as_matrix()
     grown = np.maximum(size + rng.integers(0, 2, (6000, 1)) * step * rng.standard_normal((6000, 3)), 0.3)
-    other = canonical_boxes(turn @ rotation, grown)  # canonical boxes, as in a dataset
+    other = canonicalize_boxes(turn @ rotation, grown)  # canonical boxes, as in a dataset
     distance = box_distance((rotation, size), other) / size.max(axis=1)
     ratio = {
-        name: np.linalg.norm(e.encode(*other) - e.encode(*canonical_boxes(rotation, size)), axis=1) / distance
+        name: np.linalg.norm(e.encode(*other) - e.encode(*canonicalize_boxes(rotation, size)), axis=1) / distance
         for name, e in ENCODINGS.items()
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
@@ -113,10 +114,11 @@ def test_encoding_is_continuous_where_length_equals_width(name):
     for count in (501, 5001):
         t = np.linspace(0, 1, count)
         rotation = (
-            yaw_rotation(np.pi * t) @ Rotation.from_rotvec(np.outer(0.3 * np.sin(2 * np.pi * t), [1, 0, 0])).as_matrix()
+            make_yaw_rotation(np.pi * t)
+            @ Rotation.from_rotvec(np.outer(0.3 * np.sin(2 * np.pi * t), [1, 0, 0])).as_matrix()
         )
         size = np.stack([3 + np.cos(2 * np.pi * t), 3 - np.cos(2 * np.pi * t), 1.5 + 0 * t], axis=1)
-        rotation, size = canonical_boxes(rotation, size)
+        rotation, size = canonicalize_boxes(rotation, size)
         code = ENCODINGS[name].encode(rotation, size)
         assert np.allclose(code[0], code[-1])
         largest.append(np.linalg.norm(np.diff(code, axis=0), axis=1).max() * (count - 1))
@@ -126,16 +128,16 @@ def test_encoding_is_continuous_where_length_equals_width(name):
 
 
 def test_harmonics_are_degree_four_and_equivariant_to_yaw():
-    basis = harmonics()
+    basis = compute_harmonics()
     flat = basis.reshape(9, 81)
     assert np.allclose(flat @ flat.T, np.eye(9))
     assert np.allclose(np.einsum("kaacd->kcd", basis), 0)
     assert all(np.allclose(basis, basis.transpose(0, *(1 + np.array(p)))) for p in itertools.permutations(range(4)))
     yaw = np.linspace(-np.pi, np.pi, 50)
-    code = ENCODINGS["octahedral"].encode(yaw_rotation(yaw), np.ones((50, 3)))[:, 6:]
+    code = ENCODINGS["octahedral"].encode(make_yaw_rotation(yaw), np.ones((50, 3)))[:, 6:]
     turning = np.stack([np.cos(4 * yaw), np.sin(4 * yaw)], axis=1) / np.sqrt(2)
     assert np.allclose(code[:, :2], turning) and np.allclose(code[:, 2:], code[0, 2:])
-    assert np.isfinite(nearest_frame(np.zeros((1, 9)))).all()  # a network may predict any values
+    assert np.isfinite(find_nearest_frame(np.zeros((1, 9)))).all()  # a network may predict any values
 
 
 # ----------------------------------------------------------------------------------------------------- lost yaw
@@ -144,15 +146,15 @@ def test_harmonics_are_degree_four_and_equivariant_to_yaw():
 def test_cholesky_error_of_square_equals_closed_form():
     turn = np.linspace(0, np.pi / 2, 2001)
     size = np.broadcast_to([2.0, 2.0, 1.5], (len(turn), 3))
-    still = CentredBoxes(np.broadcast_to(np.eye(3), (len(turn), 3, 3)), size)
-    iou = iou3d(still, CentredBoxes(yaw_rotation(turn), size))
-    assert np.allclose(iou, square_iou(turn), atol=1e-6)
+    still = CenteredBoxes(np.broadcast_to(np.eye(3), (len(turn), 3, 3)), size)
+    iou = compute_mean_iou3d(still, CenteredBoxes(make_yaw_rotation(turn), size))
+    assert np.allclose(iou, compute_square_iou(turn), atol=1e-6)
     assert abs(np.trapezoid(iou, turn) / (np.pi / 2) - LOST_YAW_IOU3D) < 1e-6
 
 
 def test_cholesky_loses_yaw_of_squares_and_octahedral_keeps_it():
     def lost(encoding, share):
-        return yaw_loss({"encoding": encoding, "width_share": share, "noise": 1e-3}, 400)["iou3d_lost_with_yaw"]
+        return compute_yaw_loss({"encoding": encoding, "width_share": share, "noise": 1e-3}, 400)["iou3d_lost_with_yaw"]
 
     assert abs(lost("cholesky", 1.0) - (1 - LOST_YAW_IOU3D)) < 0.02
     assert lost("cholesky", 0.9) > 4 * lost("cholesky", 0.5)
@@ -177,15 +179,15 @@ def test_autoencoder_bodies_are_equal_and_small():
 
 
 def test_trial_training_sets_are_nested_and_differ_by_seed():
-    large, small = (training_boxes(Trial("vehicle", "cholesky", n, 3)) for n in (10_000, 1200))
+    large, small = (draw_training_boxes(Trial("vehicle", "cholesky", n, 3)) for n in (10_000, 1200))
     assert all((a[:1200] == b).all() for a, b in zip(large, small, strict=True))
-    other = training_boxes(Trial("vehicle", "cholesky", 1200, 4))
+    other = draw_training_boxes(Trial("vehicle", "cholesky", 1200, 4))
     assert not np.isin(other.size_m, large.size_m).any()
     low, high = THINGS["vehicle"].length_m
     assert low <= large.size_m[:, 0].min() and large.size_m[:, 0].max() <= high
     assert (large.size_m[:, 1] < large.size_m[:, 0]).all()
     with pytest.raises(ValueError, match="expected sizes of 2 or more"):
-        trials("vehicle", (), 5)
+        list_trials("vehicle", (), 5)
 
 
 @pytest.mark.parametrize("name", ENCODINGS)
@@ -194,9 +196,9 @@ def test_trial_learns_with_tiny_settings(name):
     boxes, truth = draw_boxes(THINGS["vehicle"], 128, 0), draw_boxes(THINGS["vehicle"], 200, 1)
     iou = []
     for epochs in (0, 15):
-        fitted = fit(ENCODINGS[name], boxes, Settings(epochs, batch_size=8), 0, moving_only=True)
+        fitted = train_autoencoder(ENCODINGS[name], boxes, StudyConfig(epochs, batch_size=8), 0, moving_only=True)
         rebuilt, _ = fitted.rebuild(truth)
-        iou.append(iou3d(truth, rebuilt).mean())
+        iou.append(compute_mean_iou3d(truth, rebuilt).mean())
     assert fitted.kept.sum() == {"cholesky": 4, "quaternion": 5, "octahedral": 6}[name]
     assert np.allclose(np.abs(rebuilt.rotation[:, 2]).max(axis=1), 1)  # an omitted angle stays zero
     assert iou[1] > iou[0] + 0.05
@@ -212,12 +214,13 @@ def test_trial_learns_with_tiny_settings(name):
 def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
     spec, scenes = small_spec(), [random_scene(i) for i in range(6)]
     torch.manual_seed(0)
-    options = LVAE_PRESETS["smoke"].architecture() | {"decoder": decoder, "shortcut": True, "latent_channels": 16}
-    lvae, batch = LayoutVAE(layout=spec.to_dict(), **(options | switch)), layout_batch(scenes, spec)
-    lvae.start_at(batch)
+    changes = {"objects": {"decoder": decoder}, "shortcut": True, "latent_channels": 16}
+    options = override_options(LVAE_PRESETS["smoke"].architecture(), changes)
+    lvae, batch = LayoutVAE(layout=spec.to_dict(), **(options | switch)), make_layout_batch(scenes, spec)
+    lvae.init_from_data(batch)
     assert lvae.latent_shape == (channels, 8, 8)
     output, posterior = lvae(batch, torch.randn(6, *lvae.latent_shape))
-    losses = lvae_loss(output, posterior, batch, spec)
+    losses = compute_lvae_loss(output, posterior, batch, spec)
     losses.total.backward()
     ground, objects = (switch.get("branches", "both") in ("both", side) for side in ("ground", "objects"))
     assert (losses.height > 0) == (losses.occupancy > 0) == ground
@@ -226,7 +229,7 @@ def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
     assert names == {name for name, there in (("ground", ground), ("object", objects)) if there}
     with torch.no_grad():
         rebuilt = [
-            scene_from_layout(x, spec, s) for x, s in zip(lvae.decode(posterior.mean).layouts(), scenes, strict=True)
+            decode_layout(x, spec, s) for x, s in zip(lvae.decode(posterior.mean).layouts(), scenes, strict=True)
         ]
     assert all(scene.occupied.any() == ground for scene in rebuilt)
     if not objects:
@@ -241,8 +244,11 @@ def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
 
 
 def test_layout_vae_config_without_switches_is_full_model():
-    old = {"layout": small_spec().to_dict()} | LVAE_PRESETS["smoke"].architecture()
+    flat = {"latent_channels": 4, "channels": [8, 16, 16], "norm_groups": 4, "width": 32, "layers": 1, "heads": 2}
+    old = {"layout": small_spec().to_dict()} | flat | {"hidden": 64, "head_hidden": 32, "fold": 1, "least_per_cell": 1}
     lvae = LayoutVAE.from_config(old)
+    same = LayoutVAE(layout=small_spec().to_dict(), **LVAE_PRESETS["smoke"].architecture())
+    assert lvae.config == same.config
     assert lvae.config.split_latent and lvae.config.branches == "both" and lvae.latent_shape == (8, 8, 8)
     with pytest.raises(ValueError, match="branches is 'sky', expected one of"):
         LayoutVAE.from_config(old | {"branches": "sky"})
@@ -250,11 +256,14 @@ def test_layout_vae_config_without_switches_is_full_model():
 
 def test_ground_study_shrinks_networks_at_equal_latents():
     row = LVAE_PRESETS["town"].architecture()
-    models = {name: LayoutVAE(layout=LayoutSpec().to_dict(), **row | v.architecture) for name, v in GROUND.items()}
+    models = {
+        name: LayoutVAE(layout=LayoutSpec().to_dict(), **override_options(row, variant.architecture))
+        for name, variant in GROUND.items()
+    }
     assert {model.latent_shape for model in models.values()} == {(32, 32, 32)}
     sizes = {name: model.num_parameters() for name, model in models.items()}
     paper = LVAE_PRESETS["kitti360"]
-    assert GROUND["the paper's networks"].architecture["channels"] == paper.channels
+    assert GROUND["the paper's networks"].architecture["ground"]["channels"] == paper.model.ground.channels
     assert min(sizes, key=sizes.get) in ("half as wide", "an eighth of the paper's widths")
     assert max(sizes, key=sizes.get) == "the paper's networks"
 

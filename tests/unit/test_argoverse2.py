@@ -11,7 +11,7 @@ import pyarrow.feather
 import pytest
 
 from models.scene import CATEGORIES
-from pipelines.preprocess.sources.argoverse2 import CATEGORY_OF, logs, read_drive
+from pipelines.preprocess.sources.argoverse2 import CATEGORY_OF, list_logs, read_drive
 
 LOG = "00000000-aaaa-bbbb-cccc-000000000001"
 SWEEPS = np.array([315969904359876000, 315969904459712000, 315969904559845000])
@@ -166,7 +166,7 @@ def test_argoverse2_groups_every_category_of_taxonomy(root):
 
 @pytest.fixture(scope="module", params=["train", "val"])
 def real(real_data, request):
-    (log,) = [log for split, log in logs(real_data / "av2") if split == request.param]
+    (log,) = [log for split, log in list_logs(real_data / "av2") if split == request.param]
     return read_drive(real_data / "av2", request.param, log)
 
 
@@ -391,13 +391,13 @@ def test_argoverse2_lists_logs_with_annotations(root, tmp_path):
     (tmp_path / "val" / "b").mkdir(parents=True)
     (tmp_path / "val" / "a").mkdir()
     (tmp_path / "test" / "c").mkdir(parents=True)
-    assert logs(root) == [("train", LOG), ("val", "a"), ("val", "b")]
+    assert list_logs(root) == [("train", LOG), ("val", "a"), ("val", "b")]
     with pytest.raises(ValueError, match="test split has no annotations"):
         read_drive(root, "test", "c")
     with pytest.raises(ValueError, match="no such log"):
         read_drive(root, "val", "zzz")
     with pytest.raises(ValueError, match="test split has no annotations"):
-        logs(tmp_path / "test")
+        list_logs(tmp_path / "test")
 
 
 def test_argoverse2_raises_only_named_errors_for_mutated_files(root):

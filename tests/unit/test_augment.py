@@ -6,33 +6,33 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.augment import Augmentation, mirrored, moved_vehicle
-from models.geometry.cholesky import scatter_matrix
+from models.augment import Augmentation, mirror_scene, move_vehicle
+from models.geometry.cholesky import compute_scatter_matrix
 from models.scene import Grid
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.preprocess.sources.town.generator import generate_town
 
 
 def test_mirror_reflects_boxes_and_is_an_involution():
     scene = random_scene(0, n=50)
-    seen = mirrored(scene)
-    back = mirrored(seen)
+    seen = mirror_scene(scene)
+    back = mirror_scene(seen)
     for name in ("center_m", "size_m", "height_m", "occupied"):
         assert np.array_equal(getattr(back, name), getattr(scene, name)), name
     assert np.allclose(back.rotation, scene.rotation, atol=1e-6)
     reflection = np.diag([1, -1, 1])
-    want = reflection @ scatter_matrix(scene.rotation, scene.size_m) @ reflection
-    assert np.allclose(scatter_matrix(seen.rotation, seen.size_m), want, atol=1e-4)
+    want = reflection @ compute_scatter_matrix(scene.rotation, scene.size_m) @ reflection
+    assert np.allclose(compute_scatter_matrix(seen.rotation, seen.size_m), want, atol=1e-4)
     assert np.allclose(np.linalg.det(seen.rotation), 1, atol=1e-5)
     x, y = np.meshgrid(scene.grid.x_m(), scene.grid.y_m(), indexing="ij")
     for points in (x, y):  # the raster moves with the boxes
         mean = [(points[None] * s.occupied).sum() / s.occupied.sum() for s in (scene, seen)]
         assert np.isclose(mean[1], -mean[0] if points is y else mean[0], atol=1e-6)
     with pytest.raises(ValueError, match="not symmetric"):
-        mirrored(scene.moved(0.0, 4.0))
+        mirror_scene(scene.translate(0.0, 4.0))
 
 
 def test_moved_scene_equals_scene_of_drive_at_that_pose():
-    drive = town_drive(5)
+    drive = generate_town(5)
     dx, dy, turn = 1.5, -0.75, 0.04
     scene = drive.scene(40)
     cos, sin = np.cos(scene.world_yaw_rad), np.sin(scene.world_yaw_rad)
@@ -42,9 +42,9 @@ def test_moved_scene_equals_scene_of_drive_at_that_pose():
     world[:, :3], world[:2, 3] = turned @ world[:, :3], world[:2, 3] + step
     poses = drive.world_from_imu.copy()
     poses[40] = world
-    want, seen = replace(drive, world_from_imu=poses).scene(40), moved_vehicle(scene, dx, dy, turn)
+    want, seen = replace(drive, world_from_imu=poses).scene(40), move_vehicle(scene, dx, dy, turn)
     inner = Grid(front_m=56.0, left_m=24.0, rows=192, cols=192)
-    want, seen = want.cropped(inner), seen.cropped(inner)
+    want, seen = want.crop(inner), seen.crop(inner)
     assert len(want) > 30 and want.instance_id.tolist() == seen.instance_id.tolist()
     assert np.allclose(seen.center_m, want.center_m, atol=1e-3)
     assert np.allclose(seen.rotation, want.rotation, atol=1e-4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import street_class_ids
 
-from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, control_image
+from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, make_control_image
 from pipelines.schema.palette import CLASS_COLORS, CLASS_ID
 
 
@@ -28,7 +28,7 @@ def request(controlnet_weights: tuple[str, str], **changes) -> PhotoRequest:
 
 
 def test_control_image_uses_palette_and_sky():
-    image = control_image(street_class_ids())
+    image = make_control_image(street_class_ids())
     assert image.dtype == np.uint8 and image[0, 0].tolist() == list(SKY)
     assert image[-1, 0].tolist() == CLASS_COLORS[CLASS_ID["road"]].tolist()
 

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, Grid
 from pipelines.preprocess.sources import custom
-from pipelines.preprocess.sources.custom import drives, ground_classes, read_drive, read_poses, read_splits
+from pipelines.preprocess.sources.custom import list_drives, read_drive, read_ground_classes, read_poses, read_splits
 from pipelines.preprocess.sources.drive import STATIC, Drive, Pose
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.tables import Shard, read_scenes
 
 DOCUMENT = ROOT / "docs/own_drives.md"
@@ -382,7 +382,7 @@ def exported(drive: Drive) -> Tables:
 
 
 def test_custom_source_round_trips_town(tmp_path):
-    town = town_drive(3)
+    town = generate_town(3)
     mine = written(exported(town), tmp_path, parquet=True)
     assert len(mine) == len(town) and (town.timestamp != STATIC).sum() > 10
     seen_moving = 0
@@ -425,8 +425,8 @@ def example(tmp_path_factory) -> dict:
 
 def test_custom_source_document_example_writes_street(example, capsys):
     root = example["folder"] / "my_drives"
-    assert drives(root) == ["first_street"] and read_splits(root) is None
-    assert ground_classes(root) == ("road", "sidewalk", "terrain")
+    assert list_drives(root) == ["first_street"] and read_splits(root) is None
+    assert read_ground_classes(root) == ("road", "sidewalk", "terrain")
     drive = read_drive(root, "first_street")
     assert len(drive) == 110
     scenes = [drive.scene(k) for k in range(0, 110, 17)]
@@ -480,16 +480,16 @@ def test_custom_source_ground_classes_cover_all_drives(tmp_path):
     write(street() | {"polygons": crossing}, tmp_path, "b")
     (tmp_path / "c").mkdir()  # broken: read_drive reports it
     (tmp_path / ".cache").mkdir()
-    assert drives(tmp_path) == ["a", "b", "c"]
-    assert ground_classes(tmp_path) == ("road", "sidewalk", "crossing")
-    scene = read_drive(tmp_path, "b", ground_classes(tmp_path)).scene(0)
+    assert list_drives(tmp_path) == ["a", "b", "c"]
+    assert read_ground_classes(tmp_path) == ("road", "sidewalk", "crossing")
+    scene = read_drive(tmp_path, "b", read_ground_classes(tmp_path)).scene(0)
     assert scene.ground_classes == ("road", "sidewalk", "crossing")
     assert scene.occupied.any(axis=(1, 2)).tolist() == [False, False, True]
     (tmp_path / ".cache" / "broken").mkdir()
     with pytest.raises(ValueError, match=r"broken/polygons.parquet: missing"):
-        ground_classes(tmp_path / ".cache")
+        read_ground_classes(tmp_path / ".cache")
     with pytest.raises(ValueError, match="no drive has a ground polygon; draw at least the road"):
-        ground_classes(write({"polygons": []}, tmp_path / ".bare"))
+        read_ground_classes(write({"polygons": []}, tmp_path / ".bare"))
 
 
 def test_custom_source_splits_are_as_given(tmp_path):
@@ -523,10 +523,10 @@ def test_custom_source_names_broken_splits(tmp_path, name):
 
 def test_custom_source_error_states_where_drives_belong(tmp_path):
     with pytest.raises(ValueError, match="no folder here; --input must name the folder of all drives"):
-        drives(tmp_path)
+        list_drives(tmp_path)
     write(street(), tmp_path, "my street")
     with pytest.raises(ValueError, match="rename the folder"):
-        drives(tmp_path)
+        list_drives(tmp_path)
     with pytest.raises(ValueError, match=r"no such drive; there are b"):
         read_drive(write(street(), tmp_path / "other", "b"), "a")
 

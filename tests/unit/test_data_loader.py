@@ -6,8 +6,8 @@ from helpers import SHARD_SIZES, small_spec
 
 from jobs.support.trainer import with_scene_ids
 from models.augment import Augmentation
-from models.tensors import compact_layout
-from models.training import NotFinite
+from models.tensors import encode_layout
+from models.training import NonFiniteLossError
 from pipelines.training.data_loader import LayoutReader, Stream, read_samples
 
 
@@ -24,7 +24,7 @@ def test_read_samples_equals_layouts_of_stored_scenes(layout_shards):
     spec, stream = small_spec(32), Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     got = read_samples(stream, LayoutReader(spec), first=2, count=3, batch=4, rank=0, world=1)
     for k, (shard, row) in enumerate(zip(*stream.positions(8, 12), strict=True)):
-        want = compact_layout(layout_shards[shard].scenes([int(row)])[0], spec)
+        want = encode_layout(layout_shards[shard].scenes([int(row)])[0], spec)
         for name, value in want.items():
             assert np.allclose(got[name][k], value, rtol=0, atol=1e-6 if name == "features" else 0), name
 
@@ -43,7 +43,7 @@ def test_nonfinite_loss_names_its_scenes(layout_shards):
     stream = Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     shard, row = stream.positions(8, 4)
     ids = [layout_shards[shard[k]].scenes([int(row[k])])[0].scene_id for k in (1, 3)]
-    message = with_scene_ids(NotFinite(2, [1, 3]), stream)
+    message = with_scene_ids(NonFiniteLossError(2, [1, 3]), stream)
     assert "step 2: the loss is not finite because of samples [1, 3]" in message
     assert f"Scenes: {ids[0]}, {ids[1]}; look at them" in message
-    assert "every sample" in with_scene_ids(NotFinite(2, []), stream)
+    assert "every sample" in with_scene_ids(NonFiniteLossError(2, []), stream)

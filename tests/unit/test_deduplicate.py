@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from helpers import random_scene
 
-from models.composition.deduplicate import DRAWN_IOU3D, doubles, repeated
-from models.geometry.iou3d import boxes_of, iou3d_matrix
+from models.composition.deduplicate import REGENERATED_IOU3D, find_lower_confidence_duplicates, find_regenerated_objects
+from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORY_INDEX, Grid
 
 SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
@@ -29,15 +29,18 @@ def row_of_boxes(shift_m, existence, category="construction_small"):
 def test_find_duplicates_finds_known_object():
     scene = random_scene(0, n=10, grid=SMALL)
     near = replace(scene, center_m=scene.center_m + np.float32(0.01))
-    assert doubles(near, scene).all() and not doubles(near, scene.select(slice(0, 0))).any()
-    assert not doubles(replace(near, category=(near.category + 1) % 11), scene).any()
+    assert (
+        find_regenerated_objects(near, scene).all()
+        and not find_regenerated_objects(near, scene.select(slice(0, 0))).any()
+    )
+    assert not find_regenerated_objects(replace(near, category=(near.category + 1) % 11), scene).any()
 
 
 def test_find_duplicates_finds_shifted_copy_but_no_neighbor():
     known = row_of_boxes([0], [0.9], "vegetation_cuboid")
     drawn_aside, beside = [2.5, 7], [0.2, 2.5]  # IoU 1.5 / 6.5 is small; at 2.5 it is the known one or its neighbour
     for shift_m, again in ((drawn_aside, [True, False]), (beside, [True, False]), ([3.9, 7], [False, False])):
-        assert doubles(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+        assert find_regenerated_objects(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
 
 
 def test_find_duplicates_keeps_slightly_overlapping_neighbors():
@@ -45,41 +48,50 @@ def test_find_duplicates_keeps_slightly_overlapping_neighbors():
     made = row_of_boxes(
         [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
     )  # .053 and .039 with the two known; .046 with the first
-    overlaps = iou3d_matrix(boxes_of(made), boxes_of(known))
+    overlaps = compute_iou3d_matrix(extract_boxes(made), extract_boxes(known))
     assert (
-        overlaps[0, 0] > DRAWN_IOU3D > overlaps[1, 0] > 0
-        and 0 < overlaps[0, 1] < DRAWN_IOU3D < overlaps[1, 0] + overlaps[0, 1]
+        overlaps[0, 0] > REGENERATED_IOU3D > overlaps[1, 0] > 0
+        and 0 < overlaps[0, 1] < REGENERATED_IOU3D < overlaps[1, 0] + overlaps[0, 1]
     )
-    assert doubles(made, known).tolist() == [True, False]
+    assert find_regenerated_objects(made, known).tolist() == [True, False]
 
 
 def test_suppress_duplicates_keeps_higher_confidence():
-    assert repeated(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
-    assert repeated(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
+    assert find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
+    assert find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
         False,
         True,
     ]  # the first of two with equal confidence
-    assert repeated(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [False, False]  # 1 / 7: the next part of a fence
+    assert find_lower_confidence_duplicates(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [
+        False,
+        False,
+    ]  # 1 / 7: the next part of a fence
 
 
 def test_suppress_duplicates_uses_threshold_of_category():
     for category, both_stay in (("vehicle_small", False), ("vehicle_big", False), ("construction_big", True)):
-        assert repeated(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [False, not both_stay]  # 1 / 7
-        assert not repeated(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
-        assert repeated(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [False, True]  # 1 / 3
+        assert find_lower_confidence_duplicates(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [
+            False,
+            not both_stay,
+        ]  # 1 / 7
+        assert not find_lower_confidence_duplicates(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
+        assert find_lower_confidence_duplicates(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [
+            False,
+            True,
+        ]  # 1 / 3
         made, known = row_of_boxes([0, 3], [0.9, 0.9], category), row_of_boxes([0], [0.6], category)
-        assert doubles(made, known).tolist() == [True, not both_stay]
+        assert find_regenerated_objects(made, known).tolist() == [True, not both_stay]
 
 
 def test_suppress_duplicates_ignores_suppressed_objects():
     # The middle one overlaps both others by 1 / 3; these two do not overlap.
-    assert repeated(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
-    assert repeated(row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
+    assert find_lower_confidence_duplicates(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
+    assert find_lower_confidence_duplicates(row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
 
 
 def test_suppress_duplicates_lets_plants_and_categories_overlap():
-    assert not repeated(row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
+    assert not find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
     pair = row_of_boxes([0, 1], [0.6, 0.9])
     mixed = replace(pair, category=np.array([pair.category[0], CATEGORY_INDEX["pole"]], np.int8))
-    assert not repeated(mixed).any()
-    assert repeated(pair.select(slice(0, 0))).shape == (0,)
+    assert not find_lower_confidence_duplicates(mixed).any()
+    assert find_lower_confidence_duplicates(pair.select(slice(0, 0))).shape == (0,)

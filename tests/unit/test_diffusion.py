@@ -7,10 +7,10 @@ from diffusers import DDIMScheduler, RePaintScheduler
 from helpers import LATENT_SHAPE
 
 from models.dit import DiT
-from models.pipeline import scheduler
-from models.sampling.diffusion import Diffusion, Known, SceneNoise, Walk, guided, sample
+from models.sampling.diffusion import Diffusion, InpaintCondition, SamplingSchedule, SceneNoise, sample, with_guidance
 from models.sampling.repaint import repaint_transitions
-from models.training import Execution, NotFinite, Optimisation, dit_trainer
+from models.sampling.schedulers import SchedulerConfig
+from models.training import ExecutionConfig, NonFiniteLossError, OptimizerConfig, make_dit_trainer
 
 
 def random_dit(seed: int = 0, **options) -> DiT:
@@ -23,81 +23,91 @@ def random_dit(seed: int = 0, **options) -> DiT:
 
 @pytest.mark.parametrize("steps", [1000, 250, 50, 7])
 def test_ddpm_step_equals_diffusers(steps):
-    reference, walk = scheduler(), Walk(Diffusion(), steps)
+    reference, schedule = SchedulerConfig.ddpm().build(), SamplingSchedule(Diffusion(), steps)
     reference.set_timesteps(steps)
-    assert reference.timesteps.tolist() == walk.timesteps[::-1].tolist()
+    assert reference.timesteps.tolist() == schedule.timesteps[::-1].tolist()
     latent, predicted = torch.randn(2, *LATENT_SHAPE), torch.randn(2, *LATENT_SHAPE)
-    for state, to in walk.plain()[:: max(1, steps // 25)] + [(0, -1)]:
+    for state, to in schedule.descending_transitions()[:: max(1, steps // 25)] + [(0, -1)]:
         assert to == state - 1
-        t = int(walk.timesteps[state])
+        t = int(schedule.timesteps[state])
         noise = torch.randn(2, *LATENT_SHAPE, generator=torch.Generator().manual_seed(state))
         want = reference.step(predicted, t, latent, generator=torch.Generator().manual_seed(state)).prev_sample
-        assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
-    assert walk.timesteps[-1] == (996 if steps == 250 else walk.timesteps[-1])
+        assert torch.allclose(schedule.step_down(latent, predicted, noise, state), want, atol=2e-5), state
+    assert schedule.timesteps[-1] == (996 if steps == 250 else schedule.timesteps[-1])
 
 
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
 def test_ddim_step_equals_diffusers(eta):
-    reference, walk = DDIMScheduler.from_config(scheduler().config), Walk(Diffusion(), 50, eta)
+    reference, schedule = (
+        DDIMScheduler.from_config(SchedulerConfig.ddpm().config),
+        SamplingSchedule(Diffusion(), 50, eta),
+    )
     reference.set_timesteps(50)
     latent, predicted, noise = torch.randn(3, 2, *LATENT_SHAPE)
-    for state, _ in walk.plain()[:-1]:
-        t = int(walk.timesteps[state])
+    for state, _ in schedule.descending_transitions()[:-1]:
+        t = int(schedule.timesteps[state])
         want = reference.step(predicted, t, latent, eta=eta, variance_noise=noise if eta else None).prev_sample
-        assert torch.allclose(walk.down(latent, predicted, noise, state), want, atol=2e-5), state
+        assert torch.allclose(schedule.step_down(latent, predicted, noise, state), want, atol=2e-5), state
 
 
 def test_add_noise_equals_diffusers():
     clean, noise, t = torch.randn(3, *LATENT_SHAPE), torch.randn(3, *LATENT_SHAPE), torch.tensor([0, 500, 999])
-    want = scheduler().add_noise(clean, noise, t)
+    want = SchedulerConfig.ddpm().build().add_noise(clean, noise, t)
     assert torch.allclose(Diffusion().add_noise(clean, noise, t), want, atol=1e-5)
-    walk = Walk(Diffusion(), 1000)
+    schedule = SamplingSchedule(Diffusion(), 1000)
     for k, state in enumerate(t.tolist()):
-        assert torch.allclose(walk.to_state(clean[k], noise[k], state), want[k], atol=1e-5)
-    assert walk.to_state(clean, noise, -1) is clean
+        assert torch.allclose(schedule.noise_to_state(clean[k], noise[k], state), want[k], atol=1e-5)
+    assert schedule.noise_to_state(clean, noise, -1) is clean
 
 
 def test_add_noise_in_two_steps_has_variance_of_one():
-    walk = Walk(Diffusion(), 250)
+    schedule = SamplingSchedule(Diffusion(), 250)
     for low, high in ((0, 10), (100, 110), (239, 249)):
-        ratio = walk.alpha_bar[high] / walk.alpha_bar[low]
-        assert np.isclose(ratio * (1 - walk.alpha_bar[low]) + 1 - ratio, 1 - walk.alpha_bar[high])
+        ratio = schedule.alpha_bar[high] / schedule.alpha_bar[low]
+        assert np.isclose(ratio * (1 - schedule.alpha_bar[low]) + 1 - ratio, 1 - schedule.alpha_bar[high])
     zero, one = torch.zeros(1), torch.ones(1)
-    assert torch.isclose(walk.up(one, zero, 3, 9) ** 2 + walk.up(zero, one, 3, 9) ** 2, one)
+    assert torch.isclose(schedule.step_up(one, zero, 3, 9) ** 2 + schedule.step_up(zero, one, 3, 9) ** 2, one)
 
 
 def test_velocity_converts_to_epsilon():
     """Converts the velocity of diffusers with the weights of a DiT that predicts velocities."""
     clean, noise, t = torch.randn(4, *LATENT_SHAPE), torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999])
-    latent, velocity = scheduler().add_noise(clean, noise, t), scheduler().get_velocity(clean, noise, t)
-    of_latent, of_velocity = random_dit(prediction="velocity").noise_shares[t][:, :, None, None, None].unbind(1)
+    latent, velocity = (
+        SchedulerConfig.ddpm().build().add_noise(clean, noise, t),
+        SchedulerConfig.ddpm().build().get_velocity(clean, noise, t),
+    )
+    of_latent, of_velocity = random_dit(prediction="v_prediction").noise_shares[t][:, :, None, None, None].unbind(1)
     assert torch.allclose(of_latent * latent + of_velocity * velocity, noise, atol=1e-5)
 
 
 def test_velocity_dit_equals_weighted_epsilon_dit():
-    noise_dit, velocity_dit = random_dit(), random_dit(prediction="velocity")
+    noise_dit, velocity_dit = random_dit(), random_dit(prediction="v_prediction")
     latent, t, label = torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999]), torch.tensor([0, 1, 2, 3])
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar[t]).float()[:, None, None, None]
     velocity = noise_dit(latent, t, label)
     expected = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * velocity
     assert torch.allclose(velocity_dit(latent, t, label), expected, atol=1e-6)
-    assert torch.allclose(velocity_dit.prepared(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5)
+    assert torch.allclose(
+        velocity_dit.precompute_conditioning(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5
+    )
     assert (noise_dit.loss_weight(t) == 1).all()
     other = torch.randn(4, *LATENT_SHAPE)  # the weighted error in epsilon is the error in velocity
     wrong = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * other
     weighted = velocity_dit.loss_weight(t) * ((wrong - expected) ** 2).mean((1, 2, 3))
     assert torch.allclose(weighted, ((other - velocity) ** 2).mean((1, 2, 3)), rtol=1e-3)
-    with pytest.raises(ValueError, match="'x0', expected one of: noise, velocity"):
+    with pytest.raises(ValueError, match="'x0', expected one of: epsilon, v_prediction"):
         DiT(prediction="x0")
 
 
 def test_sample_depends_only_on_seed_and_index():
-    dit, walk = random_dit(), Walk(Diffusion(), 20)
+    dit, schedule = random_dit(), SamplingSchedule(Diffusion(), 20)
     labels = torch.arange(8) % 3
-    together = sample(dit, walk, SceneNoise(5, range(8), LATENT_SHAPE, "cpu"), labels)
-    alone = torch.cat([sample(dit, walk, SceneNoise(5, [i], LATENT_SHAPE, "cpu"), labels[i : i + 1]) for i in range(8)])
+    together = sample(dit, schedule, SceneNoise(5, range(8), LATENT_SHAPE, "cpu"), labels)
+    alone = torch.cat(
+        [sample(dit, schedule, SceneNoise(5, [i], LATENT_SHAPE, "cpu"), labels[i : i + 1]) for i in range(8)]
+    )
     assert torch.allclose(together, alone, atol=1e-4)
-    other = sample(dit, walk, SceneNoise(6, range(8), LATENT_SHAPE, "cpu"), labels)
+    other = sample(dit, schedule, SceneNoise(6, range(8), LATENT_SHAPE, "cpu"), labels)
     assert (together - other).abs().mean() > 0.1
     assert (together[0] - together[1]).abs().mean() > 0.1
 
@@ -110,9 +120,9 @@ def test_guidance_at_scale_one_adds_no_evaluation():
         return latent * label[:, None, None, None].float()
 
     latent, label = torch.randn(2, *LATENT_SHAPE), torch.tensor([1, 2])
-    plain = guided(model, 3, 1.0)(latent, torch.zeros(2), label)
+    plain = with_guidance(model, 3, 1.0)(latent, torch.zeros(2), label)
     assert calls == [2] and torch.equal(plain, model(latent, None, label))
-    doubled = guided(model, 3, 4.0)(latent, torch.zeros(2), label)
+    doubled = with_guidance(model, 3, 4.0)(latent, torch.zeros(2), label)
     assert torch.allclose(doubled, latent * (3 + 4 * (label[:, None, None, None] - 3.0)), atol=1e-5)
 
 
@@ -127,26 +137,26 @@ def test_repaint_timesteps_equal_diffusers():
         assert transitions[-1] == (0, -1)
         assert all(a[1] == b[0] and abs(a[0] - a[1]) == 1 for a, b in zip(transitions, transitions[1:], strict=False))
     assert sum(to < state for state, to in repaint_transitions(250)) == 2410
-    assert repaint_transitions(50, 10, 1) == Walk(Diffusion(), 50).plain()
+    assert repaint_transitions(50, 10, 1) == SamplingSchedule(Diffusion(), 50).descending_transitions()
     with pytest.raises(ValueError, match="at least 1"):
         repaint_transitions(10, 0)
 
 
 def test_repaint_returns_known_part_exactly():
-    dit, walk = random_dit(), Walk(Diffusion(), 20)
+    dit, schedule = random_dit(), SamplingSchedule(Diffusion(), 20)
     clean = torch.randn(2, *LATENT_SHAPE)
     mask = torch.zeros(2, *LATENT_SHAPE)
     mask[:, :, :4] = 1
-    known = Known(clean, mask)
+    known = InpaintCondition(clean, mask)
     transitions = repaint_transitions(20, 4, 3)
     noise, label = SceneNoise(0, [0, 1], LATENT_SHAPE, "cpu"), torch.tensor([0, 1])
-    out = sample(dit, walk, noise, label, transitions, known)
+    out = sample(dit, schedule, noise, label, transitions, known)
     assert torch.equal(out[:, :, 4:], clean[:, :, 4:])
     assert (out[:, :, :4] - clean[:, :, :4]).abs().mean() > 0.1
 
 
 def test_repaint_noises_known_part_to_reached_state():
-    walk, seen = Walk(Diffusion(), 50), []
+    schedule, seen = SamplingSchedule(Diffusion(), 50), []
 
     def model(latent, timestep, label):
         seen.append((int(timestep[0]), float(latent[:, :, 4:].std())))
@@ -157,24 +167,26 @@ def test_repaint_noises_known_part_to_reached_state():
     mask[:, :, :4] = 1
     sample(
         model,
-        walk,
+        schedule,
         SceneNoise(0, range(4), shape, "cpu"),
         torch.zeros(4, dtype=torch.long),
         None,
-        Known(torch.zeros(4, *shape), mask),
+        InpaintCondition(torch.zeros(4, *shape), mask),
     )
     for t, std in seen[1:]:
         assert np.isclose(std, (1 - Diffusion().alpha_bar[t]) ** 0.5, rtol=0.05)
 
 
 def test_sampler_rejects_invalid_step_counts():
-    with pytest.raises(ValueError, match="num_steps is 0, expected 1 to 1000"):
-        Walk(Diffusion(), 0)
+    with pytest.raises(ValueError, match="num_inference_steps is 0, expected 1 to 1000"):
+        SamplingSchedule(Diffusion(), 0)
     with pytest.raises(ValueError, match="600: 1 apart, they would begin at 599 of 1000; expected 500 or 1000"):
-        Walk(Diffusion(), 600)
+        SamplingSchedule(Diffusion(), 600)
     with pytest.raises(ValueError, match="334: 2 apart, they would begin at 666 of 1000; expected 333 or 500"):
-        Walk(Diffusion(), 334)
-    assert all(Diffusion().visited(steps)[-1] >= 850 for steps in (7, 10, 20, 25, 50, 100, 250, 300, 500, 1000))
+        SamplingSchedule(Diffusion(), 334)
+    assert all(
+        Diffusion().select_timesteps(steps)[-1] >= 850 for steps in (7, 10, 20, 25, 50, 100, 250, 300, 500, 1000)
+    )
 
 
 def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
@@ -183,14 +195,16 @@ def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
     return {"mean": mean, "logvar": torch.full_like(mean, -6.0), "label": torch.arange(n) % 3}
 
 
-def new_trainer(execution: Execution | None = None, prediction: str = "noise", **changes):
+def new_trainer(execution: ExecutionConfig | None = None, prediction: str = "epsilon", **changes):
     torch.manual_seed(0)
-    settings = Optimisation(**({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes))
+    settings = OptimizerConfig(
+        **({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes)
+    )
     dit = DiT(channels=4, size=8, width=64, depth=2, heads=2, prediction=prediction)
-    return dit_trainer(dit, settings, 0.1, torch.device("cpu"), execution=execution)
+    return make_dit_trainer(dit, settings, 0.1, torch.device("cpu"), execution=execution)
 
 
-@pytest.mark.parametrize("prediction", ["noise", "velocity"])
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_dit_overfits_one_batch(prediction):
     trainer, batch = new_trainer(prediction=prediction), dit_batch(2)
     losses = [trainer.step(batch, range(2)) for _ in range(300)]
@@ -232,7 +246,7 @@ def test_trainer_half_batches_have_losses_of_whole_batch():
 @pytest.mark.parametrize("parts", [2, 3, 8])
 def test_trainer_accumulated_parts_equal_whole_step(parts):
     batch = dit_batch()
-    whole, cut = new_trainer(), new_trainer(execution=Execution(accumulate=parts))
+    whole, cut = new_trainer(), new_trainer(execution=ExecutionConfig(accumulate=parts))
     for _ in range(3):
         losses = [trainer.step(batch, range(8)) for trainer in (whole, cut)]
     assert np.isclose(*(float(part["loss"]) for part in losses), rtol=1e-5)
@@ -244,11 +258,11 @@ def test_trainer_accumulated_parts_equal_whole_step(parts):
 def test_trainer_bf16_and_compile_compute_same_loss():
     batch = dit_batch()
     plain = float(new_trainer().step(batch, range(8))["loss"])
-    half = new_trainer(execution=Execution(precision="bf16"))
+    half = new_trainer(execution=ExecutionConfig(precision="bf16"))
     assert np.isclose(float(half.step(batch, range(8))["loss"]), plain, rtol=2e-2)
     assert all(p.dtype == torch.float32 for p in half.model.parameters())
     with pytest.raises(ValueError, match="expected 1 or more, and auto, fp32 or bf16"):
-        Execution(precision="fp16")
+        ExecutionConfig(precision="fp16")
 
 
 def test_trainer_stops_at_nonfinite_loss_before_update():
@@ -256,13 +270,13 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
     trainer.wrapped = lambda *inputs: asked.append(1) or trainer.model(*inputs)
     batch["mean"][3] = float("nan")
-    with pytest.raises(NotFinite, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
+    with pytest.raises(NonFiniteLossError, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
         trainer.step(batch, range(8, 16))
     assert (
         caught.value.positions == [11] and len(asked) == 1
     )  # the search for the sample is no step: other workers take none
     batch["mean"][:] = float("nan")
-    with pytest.raises(NotFinite, match="of every sample: the weights are broken"):
+    with pytest.raises(NonFiniteLossError, match="of every sample: the weights are broken"):
         trainer.step(batch, range(8))
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 
@@ -285,7 +299,7 @@ def test_trainer_drops_labels_of_a_tenth_of_samples():
 
 def test_learning_rate_is_one_cycle_without_warm_up():
     """Equals torch's cosine annealing from 1e-4 to 1e-5: OneCycleLR without warm-up."""
-    settings = Optimisation(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
+    settings = OptimizerConfig(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
     rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
     assert (
         np.isclose(rates[0], 1e-4)
@@ -303,7 +317,7 @@ def test_learning_rate_is_one_cycle_without_warm_up():
 
 def test_pseudoinverse_guidance_follows_line_that_repaint_loses():
     """Data on the line z_1 = z_0 with its exact denoiser: generated values must match the known ones."""
-    walk, covariance = Walk(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
+    schedule, covariance = SamplingSchedule(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
 
     def denoise(latent, timestep, label):
         a = Diffusion().alpha_bar[int(timestep[0])]
@@ -318,7 +332,7 @@ def test_pseudoinverse_guidance_follows_line_that_repaint_loses():
     missed = {}
     for weight in (0.0, 1.0):
         noise = SceneNoise(0, range(count), (2, 1, 1), "cpu")
-        made = sample(denoise, walk, noise, label, None, Known(given, mask), known_guidance=weight)
+        made = sample(denoise, schedule, noise, label, None, InpaintCondition(given, mask), guidance_weight=weight)
         assert torch.equal(made[:, 0], given[:, 0])
         missed[weight] = (made[:, 1] - given[:, 1]).abs().mean().item()
     assert missed[1.0] < 0.5 * missed[0.0], missed

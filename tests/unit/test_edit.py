@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from helpers import assert_same_primitives, random_scene
 
-from models.geometry.iou3d import boxes_of, iou3d_matrix
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Scene, canonical_boxes
+from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Scene, canonicalize_boxes
 from pipelines.editing import edit
-from pipelines.editing.edit import Select, edits_from_json, edits_to_json, replayed
-from pipelines.io.mesh_export import scene_triangles
-from pipelines.metrics.validity import SLAB_OFFSET_M, faults, scene_validity, validity_rates
+from pipelines.editing.edit import Select, parse_edits, replay_edits, serialize_edits
+from pipelines.io.mesh_export import triangulate_scene
+from pipelines.metrics.validity import SLAB_OFFSET_M, compute_scene_validity, compute_validity_rates, find_faults
 
 CAR = CATEGORY_INDEX["vehicle_small"]
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
@@ -32,7 +32,7 @@ def town_scenes(town_drive_3) -> list[Scene]:
 
 
 def assert_canonical(scene: Scene) -> None:
-    rotation, size_m = canonical_boxes(scene.rotation, scene.size_m)
+    rotation, size_m = canonicalize_boxes(scene.rotation, scene.size_m)
     assert np.array_equal(size_m, scene.size_m)
     assert np.allclose(rotation, scene.rotation, atol=1e-6)
     assert np.allclose(np.linalg.det(scene.rotation.astype(float)), 1, atol=1e-5)
@@ -60,8 +60,8 @@ def test_selection_matches_all_its_conditions(scene):
         (Select(category=CATEGORIES[:2], polygon_m=square, where="length_m > 3"), trees & inside & long),
     ):
         assert expected.any() and not expected.all()
-        assert np.array_equal(select.chosen(scene), expected), select
-    assert ALL.chosen(scene).all() and len(ALL.chosen(scene.select(np.zeros(0, int)))) == 0
+        assert np.array_equal(select.select_primitives(scene), expected), select
+    assert ALL.select_primitives(scene).all() and len(ALL.select_primitives(scene.select(np.zeros(0, int)))) == 0
 
 
 @pytest.mark.parametrize(
@@ -80,12 +80,12 @@ def test_selection_rejects_wrong_values(scene, select, message):
     with pytest.raises(ValueError, match=message):
         select.check()
     with pytest.raises(ValueError, match=message):
-        select.chosen(scene)
+        select.select_primitives(scene)
 
 
 def test_selection_rejects_missing_primitives(scene):
     with pytest.raises(ValueError, match=r"edit 1 \(remove\): scene test-0005 has 60 primitives, from 0 on, not 60"):
-        replayed(scene, [edit.Snap(ALL), edit.Remove(Select(primitives=(60,)))])
+        replay_edits(scene, [edit.Snap(ALL), edit.Remove(Select(primitives=(60,)))])
 
 
 # ---------------------------------------------------------------------------------------------------------- edits
@@ -93,10 +93,10 @@ def test_selection_rejects_missing_primitives(scene):
 
 def test_edit_removes_and_duplicates_primitives(scene):
     cars = scene.category == CAR
-    removed, (done,) = replayed(scene, [edit.Remove(Select(category=("vehicle_small",)))])
+    removed, (done,) = replay_edits(scene, [edit.Remove(Select(category=("vehicle_small",)))])
     assert done.primitive.tolist() == np.flatnonzero(cars).tolist() and cars.any() and set(done.change) == {"removed"}
     assert_same_primitives(removed, scene.select(~cars))
-    doubled, (done,) = replayed(scene, [edit.Duplicate(Select(category=("vehicle_small",)), by_m=(1, -2, 2))])
+    doubled, (done,) = replay_edits(scene, [edit.Duplicate(Select(category=("vehicle_small",)), by_m=(1, -2, 2))])
     assert done.primitive.tolist() == np.flatnonzero(cars).tolist() and set(done.change) == {"copied"}
     assert np.allclose(done.moved_m, 3, atol=1e-5)
     assert_same_primitives(doubled.select(np.arange(60)), scene)
@@ -108,13 +108,13 @@ def test_edit_removes_and_duplicates_primitives(scene):
 
 def test_translate_moves_along_scene_or_own_axes(scene):
     some = Select(primitives=(3, 4, 8))
-    moved, (done,) = replayed(scene, [edit.Translate(some, (1.5, -2, 0.25))])
+    moved, (done,) = replay_edits(scene, [edit.Translate(some, (1.5, -2, 0.25))])
     assert done.primitive.tolist() == [3, 4, 8] and set(done.change) == {"changed"}
     assert np.allclose(done.moved_m, np.linalg.norm([1.5, -2, 0.25]), atol=1e-5)
     way_m = moved.center_m - scene.center_m
     assert np.abs(way_m[[3, 4, 8]] - [1.5, -2, 0.25]).max() < 1e-5 and not np.delete(way_m, [3, 4, 8], 0).any()
     assert_same_primitives(moved, scene, but=("center_m",))
-    driven, _ = replayed(scene, [edit.Translate(ALL, (2, 0, 0), "own")])
+    driven, _ = replay_edits(scene, [edit.Translate(ALL, (2, 0, 0), "own")])
     way_m = (driven.center_m - scene.center_m) / 2
     length = scene.rotation[:, :, 0]
     heading = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1)
@@ -127,7 +127,7 @@ def test_translate_moves_along_scene_or_own_axes(scene):
 @pytest.mark.parametrize("about_m", [None, (20.0, -5.0)])
 @pytest.mark.parametrize("by_deg", [30.0, 90.0, -135.0, 180.0])
 def test_rotate_turns_every_corner(scene, about_m, by_deg):
-    turned, (done,) = replayed(scene, [edit.Rotate(ALL, by_deg, about_m)])
+    turned, (done,) = replay_edits(scene, [edit.Rotate(ALL, by_deg, about_m)])
     angle = np.deg2rad(by_deg)
     matrix = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     axis = scene.center_m * [1, 1, 0] if about_m is None else np.array([*about_m, 0.0])
@@ -149,14 +149,14 @@ def corners(scene: Scene) -> np.ndarray:
 
 
 def test_resized_is_largest_change_of_an_extent(scene):
-    _, (done,) = replayed(scene, [edit.Scale(Select(primitives=(7, 9)), (1.2, 1.02, 0.9))])
+    _, (done,) = replay_edits(scene, [edit.Scale(Select(primitives=(7, 9)), (1.2, 1.02, 0.9))])
     assert done.primitive.tolist() == [7, 9] and np.allclose(done.resized, 0.2, atol=1e-6) and not done.turned_rad.any()
 
 
 @pytest.mark.parametrize("hold", ["bottom", "centre"])
 def test_scale_acts_along_own_axes(scene, hold):
     by = (0.5, 3.0, 1.25)
-    scaled, (done,) = replayed(scene, [edit.Scale(ALL, by, hold)])
+    scaled, (done,) = replay_edits(scene, [edit.Scale(ALL, by, hold)])
     assert len(done.primitive) == 60
     assert_canonical(scaled)
     assert np.allclose(scaled.volume_m3, scene.volume_m3 * np.prod(by), rtol=1e-5)
@@ -167,7 +167,7 @@ def test_scale_acts_along_own_axes(scene, hold):
 
 
 def test_lowest_point_equals_that_of_mesh(scene):
-    corners_m, _, primitive = scene_triangles(scene)
+    corners_m, _, primitive = triangulate_scene(scene)
     for index in range(len(scene)):
         lowest_m = corners_m[primitive == index][..., 2].min()
         assert lowest_m == pytest.approx(
@@ -177,13 +177,13 @@ def test_lowest_point_equals_that_of_mesh(scene):
 
 
 def test_relabel_changes_shape_kind(scene):
-    made, _ = replayed(scene, [edit.Relabel(Select(where="length_m > 4"), "vegetation_ellipsoid")])
+    made, _ = replay_edits(scene, [edit.Relabel(Select(where="length_m > 4"), "vegetation_ellipsoid")])
     long = scene.size_m[:, 0] > 4
     assert (made.category[long] == ELLIPSOID).all() and (made.label[long] == "vegetation_ellipsoid").all()
     assert_same_primitives(made, scene, but=("category", "label"))
     assert np.array_equal(made.category[~long], scene.category[~long])
     with pytest.raises(ValueError, match="'tree' is unknown"):
-        replayed(scene, [edit.Relabel(ALL, "tree")])
+        replay_edits(scene, [edit.Relabel(ALL, "tree")])
 
 
 def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
@@ -191,8 +191,8 @@ def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
     for scene in town_scenes:
         up_m = rng.uniform(-3, 3, (len(scene), 1)) * [[0, 0, 1]]
         lifted = replace(scene, center_m=(scene.center_m + up_m).astype(np.float32))
-        snapped, _ = replayed(lifted, [edit.Snap(ALL)])
-        before, after = (validity_rates(scene_validity(s, SLAB_OFFSET_M)) for s in (lifted, snapped))
+        snapped, _ = replay_edits(lifted, [edit.Snap(ALL)])
+        before, after = (compute_validity_rates(compute_scene_validity(s, SLAB_OFFSET_M)) for s in (lifted, snapped))
         assert before["floating"] > 0.2 and before["sunken"] > 0.2
         assert after["floating"] == after["sunken"] == 0
         height_m, ground_class = scene.ground_under()
@@ -204,7 +204,7 @@ def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
 def test_edit_rejects_degenerate_primitive(scene):
     for wrong in (edit.Scale(ALL, (0, 1, 1)), edit.Scale(ALL, (1e6, 1, 1)), edit.Translate(ALL, (np.inf, 0, 0))):
         with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*thinner than 1 mm"):
-            replayed(scene, [wrong])
+            replay_edits(scene, [wrong])
 
 
 # --------------------------------------------------------------------------------------------------------- repair
@@ -229,15 +229,15 @@ def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Sce
 def test_repair_separates_overlap_by_shortest_move():
     scene = two_boxes(-0.4)  # 0.4 of 7.6 m: an IoU3D of 0.0495 with the offset, or 0.0526 without
     scene = replace(scene, center_m=scene.center_m * np.array([1, 0, 1], np.float32))
-    mended, (done,) = replayed(scene, [edit.Repair(ALL)])
+    mended, (done,) = replay_edits(scene, [edit.Repair(ALL)])
     assert overlap(scene) > 0.05 > overlap(mended) and len(mended) == 2
     assert np.allclose(mended.center_m[:, 1:], scene.center_m[:, 1:]) and (done.moved_m <= 0.05).all()
     assert not done.turned_rad.any() and not done.resized.any()
 
 
 def overlap(scene: Scene) -> float:
-    boxes = boxes_of(scene)
-    return float(iou3d_matrix(boxes, boxes)[0, 1])
+    boxes = extract_boxes(scene)
+    return float(compute_iou3d_matrix(boxes, boxes)[0, 1])
 
 
 @pytest.mark.parametrize(
@@ -256,18 +256,18 @@ def test_repair_rejects_impossible_options(options, message):
 
 def test_repair_shrinks_or_removes_unmovable_primitives():
     deep = two_boxes(-2, existence=np.array([0.9, 0.6], np.float32))
-    mended, (done,) = replayed(deep, [edit.Repair(ALL)])
+    mended, (done,) = replay_edits(deep, [edit.Repair(ALL)])
     assert len(mended) == 1 and mended.existence[0] == np.float32(0.9)
     assert done.primitive.tolist() == [1] and done.change.tolist() == ["removed"]
-    kept, done = replayed(deep, [edit.Repair(ALL, drop=False)])
+    kept, done = replay_edits(deep, [edit.Repair(ALL, drop=False)])
     assert_same_primitives(kept, deep)
-    far, _ = replayed(deep, [edit.Repair(ALL, push_m=1.5)])
+    far, _ = replay_edits(deep, [edit.Repair(ALL, push_m=1.5)])
     assert len(far) == 2 and overlap(far) < 0.05
-    other, _ = replayed(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # unselected primitives are kept
+    other, _ = replay_edits(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # unselected primitives are kept
     assert_same_primitives(other.select(np.array([1])), deep.select(np.array([1])))
     assert overlap(other) < 0.05
     small = two_boxes(-0.8)
-    shrunk, (done,) = replayed(small, [edit.Repair(ALL, push_m=0.2)])
+    shrunk, (done,) = replay_edits(small, [edit.Repair(ALL, push_m=0.2)])
     assert len(shrunk) == 2 and overlap(shrunk) < 0.05 and (done.resized <= 0.0501).all() and done.resized.any()
     assert (done.moved_m <= 0.2001).all()
 
@@ -280,13 +280,13 @@ def test_repair_fixes_disturbed_town_and_keeps_the_rest(town_scenes):
         center_m[::5, 2] += rng.choice([-1, 1], len(center_m[::5])) * rng.uniform(0.6, 0.9, len(center_m[::5]))
         center_m[1::5, :2] += rng.uniform(-1, 1, (len(center_m[1::5]), 2))
         spoilt = replace(scene, center_m=center_m.astype(np.float32))
-        mended, (done,) = replayed(spoilt, [edit.Repair(ALL)])
-        before, after = (validity_rates(scene_validity(s, SLAB_OFFSET_M)) for s in (spoilt, mended))
+        mended, (done,) = replay_edits(spoilt, [edit.Repair(ALL)])
+        before, after = (compute_validity_rates(compute_scene_validity(s, SLAB_OFFSET_M)) for s in (spoilt, mended))
         assert before["floating"] + before["sunken"] > 0.05 and after["floating"] == after["sunken"] == 0
         assert after["overlapping"] == 0
         overlapping.append(before["overlapping"])
-        wrong = np.any([bad for bad, _ in list(faults(spoilt, SLAB_OFFSET_M).values())[:3]], axis=0)
-        partners = (iou3d_matrix(boxes_of(spoilt), boxes_of(spoilt)) > 0.05)[wrong].any(axis=0)
+        wrong = np.any([bad for bad, _ in list(find_faults(spoilt, SLAB_OFFSET_M).values())[:3]], axis=0)
+        partners = (compute_iou3d_matrix(extract_boxes(spoilt), extract_boxes(spoilt)) > 0.05)[wrong].any(axis=0)
         assert set(done.primitive) <= set(np.flatnonzero(wrong | partners))  # valid primitives are unchanged
         assert (done.change == "removed").mean() < 0.5
     assert np.mean(overlapping) > 0.02
@@ -307,9 +307,9 @@ LIST = [
 
 
 def test_edit_list_replays_exactly_after_round_trip(scene):
-    again = edits_from_json(json.loads(json.dumps(edits_to_json(LIST))))
+    again = parse_edits(json.loads(json.dumps(serialize_edits(LIST))))
     assert again == LIST and {e.name for e in LIST} == set(edit.EDITS)
-    first, second = replayed(scene, LIST)[0], replayed(scene, again)[0]
+    first, second = replay_edits(scene, LIST)[0], replay_edits(scene, again)[0]
     assert_same_primitives(first, second)
     assert len(first) != len(scene) or not np.array_equal(first.center_m, scene.center_m)
 
@@ -331,4 +331,4 @@ def test_edit_list_replays_exactly_after_round_trip(scene):
 )
 def test_edit_list_rejects_wrong_values(content, message):
     with pytest.raises(ValueError, match=message):
-        edits_from_json(content)
+        parse_edits(content)

@@ -14,18 +14,12 @@ from scipy.spatial import ConvexHull
 
 from jobs.inspect_scenes import OneScene, Report, draw_scenes, write_page
 from models.scene import CATEGORIES, ELLIPSOID, Grid
-from pipelines.io.mesh_export import cuboid_triangles, ellipsoid_triangles
-from pipelines.rendering.render import bev_picture, picture_3d
-from pipelines.reporting.contact_sheet import (
-    RAMP,
-    Catalogue,
-    best_columns,
-    footprints_m,
-    heights_picture,
-    scene_plate,
-)
-from pipelines.reporting.dataset_charts import MAX_NAMED, count_bins, count_histogram, track_map
-from pipelines.reporting.dataset_report import dataset_html, read_facts
+from pipelines.io.mesh_export import triangulate_cuboids, triangulate_ellipsoids
+from pipelines.rendering.render import render_3d, render_bev
+from pipelines.reporting.contact_sheet import RAMP, choose_columns, compute_footprints_m, draw_heights, draw_scene_plate
+from pipelines.reporting.dataset_charts import MAX_NAMED, count_bins, draw_count_histogram, draw_track_map
+from pipelines.reporting.dataset_report import read_facts, render_dataset_html
+from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
 from pipelines.schema.tables import Shard
 
@@ -100,12 +94,12 @@ def test_catalogue_chooses_scenes_evenly_or_randomly(town_dataset):
 
 def test_plate_shows_rendered_pictures(town_dataset):
     (scene,) = islice((s for s in Shard(town_dataset, "town", "test", 0).scenes()), 1)
-    plate, boxes = scene_plate(scene)
+    plate, boxes = draw_scene_plate(scene)
     assert set(boxes) == {"bev", "3d", "ground", "heights", "primitives"}
     bev, ground, oblique = boxes["bev"], boxes["ground"], boxes["3d"]
-    assert np.array_equal(bev.of(plate), bev_picture(scene, bev.width, supersample=2))
-    assert np.array_equal(ground.of(plate), bev_picture(scene.select([]), ground.width, supersample=2))
-    assert np.array_equal(oblique.of(plate), picture_3d(scene, oblique.width, oblique.height))
+    assert np.array_equal(bev.of(plate), render_bev(scene, bev.width, supersample=2))
+    assert np.array_equal(ground.of(plate), render_bev(scene.select([]), ground.width, supersample=2))
+    assert np.array_equal(oblique.of(plate), render_3d(scene, oblique.width, oblique.height))
     covered = np.zeros(plate.shape[:2], int)
     for box in boxes.values():
         box.of(covered)[:] += 1
@@ -117,15 +111,15 @@ def test_plate_accepts_any_grid_and_empty_scene(rows, cols, n):
     scene = random_scene(0, n, Grid(front_m=64, left_m=cols / 2, resolution_m=1, rows=rows, cols=cols))
     if n == 0:
         scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
-    plate, boxes = scene_plate(scene)
-    assert plate.shape == scene_plate(random_scene(1, 3))[0].shape
+    plate, boxes = draw_scene_plate(scene)
+    assert plate.shape == draw_scene_plate(random_scene(1, 3))[0].shape
     assert boxes["bev"].height / boxes["bev"].width == rows / cols
-    assert np.array_equal(boxes["bev"].of(plate), bev_picture(scene, max(boxes["bev"][2:]), supersample=2))
+    assert np.array_equal(boxes["bev"].of(plate), render_bev(scene, max(boxes["bev"][2:]), supersample=2))
 
 
 def test_plate_draws_heights_on_color_scale():
     scene = random_scene(0, 0, Grid(resolution_m=1, rows=64, cols=64))
-    picture, (low, high) = heights_picture(scene, 64)
+    picture, (low, high) = draw_heights(scene, 64)
     surface, winner = scene.surface()
     known = winner >= 0
     assert np.allclose([low, high], np.percentile(surface[known], [1, 99]))
@@ -139,8 +133,8 @@ def test_plate_draws_heights_on_color_scale():
 
 def test_plate_footprints_equal_mesh_projections():
     scene = random_scene(3, 60, tilt_rad=1.2)
-    outlines = footprints_m(scene)
-    for triangles, tolerance in ((cuboid_triangles(scene), 1e-4), (ellipsoid_triangles(scene), 0.03)):
+    outlines = compute_footprints_m(scene)
+    for triangles, tolerance in ((triangulate_cuboids(scene), 1e-4), (triangulate_ellipsoids(scene), 0.03)):
         for k in np.unique(triangles.primitive):
             shadow = ConvexHull(triangles.corners_m[triangles.primitive == k][..., :2].reshape(-1, 2))
             ours = ConvexHull(outlines[k])
@@ -152,7 +146,7 @@ def test_plate_footprints_equal_mesh_projections():
 
 @pytest.mark.parametrize("count, aspect", [(1, 1), (7, 1), (64, 1), (48, 4 / 3), (1000, 1)])
 def test_sheet_has_aspect_ratio_of_five_to_four(count, aspect):
-    columns = best_columns(count, aspect)
+    columns = choose_columns(count, aspect)
     assert 1 <= columns <= count
     if count >= 48:
         assert 0.6 < columns * aspect / -(-count // columns) < 2.2
@@ -171,11 +165,11 @@ def test_histograms_count_every_scene_once(counts):
     width, scenes = count_bins(counts)
     assert scenes.sum() == len(counts)
     assert np.array_equal(scenes, np.histogram(counts, np.arange(len(scenes) + 1) * width)[0])
-    assert sum(histogram_titles(count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
+    assert sum(histogram_titles(draw_count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
 
 
 def test_dataset_page_is_well_formed_and_self_contained(facts):
-    html = dataset_html(facts)
+    html = render_dataset_html(facts)
     page = SvgPage(html)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
     assert not page.all("script") and not page.all("link")
@@ -193,7 +187,7 @@ def test_dataset_page_is_well_formed_and_self_contained(facts):
 
 
 def test_dataset_page_states_table_contents(facts, town_dataset):
-    html = dataset_html(facts)
+    html = render_dataset_html(facts)
     scenes = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes()]
     for k, name in enumerate(CATEGORIES):
         counts = np.array([s.counts()[k] for s in scenes])
@@ -213,7 +207,7 @@ def test_dataset_page_states_table_contents(facts, town_dataset):
 
 
 def test_dataset_page_ground_shares_and_labels_add_up(facts, town_dataset):
-    html = dataset_html(facts)
+    html = render_dataset_html(facts)
     low = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes() if s.vegetation_density == "low"]
     share = np.mean([s.occupied[0].mean() for s in low])
     svg = re.search(r'aria-label="by vegetation density".*?</svg>', html).group()
@@ -225,7 +219,7 @@ def test_dataset_page_ground_shares_and_labels_add_up(facts, town_dataset):
 
 def test_dataset_map_has_one_dot_per_scene(facts):
     catalogue = facts.catalogue
-    paths = re.findall(r'data-split="(\w+)" d="([^"]*)"', dataset_html(facts))
+    paths = re.findall(r'data-split="(\w+)" d="([^"]*)"', render_dataset_html(facts))
     dots = {split: np.array(re.findall(r"M([-\d.]+) ([-\d.]+)h0", d), float) for split, d in paths}
     assert {split: len(d) for split, d in dots.items()} == Counter(catalogue.column("split"))
     rows = (catalogue.column("split") == "test").nonzero()[0]
@@ -243,7 +237,7 @@ def test_dataset_maps_of_many_sequences_fit_page(sequences):
         f"{k:05d}": {"train": rng.uniform(0, rng.uniform(1, 900, 2), (7, 2)) + 4000, "unused": np.full((1, 2), 4100.0)}
         for k in range(sequences)
     }
-    svg = track_map(tracks)
+    svg = draw_track_map(tracks)
     width, height = map(float, re.search(r'viewBox="0 0 (\d+) (\d+)"', svg).groups())
     dots = np.array(re.findall(r"M([-\d.]+) ([-\d.]+)h0", svg), float)
     assert len(dots) == 8 * sequences and height < 2100

@@ -8,8 +8,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
 from models.geometry import iou3d
-from models.geometry.iou3d import Boxes, boxes, iou3d_matrix, iou3d_pairs
-from models.scene import yaw_rotation
+from models.geometry.iou3d import Boxes, compute_iou3d_matrix, compute_iou3d_pairs, make_boxes
+from models.scene import make_yaw_rotation
 
 TOLERANCE = 1e-4
 
@@ -51,14 +51,14 @@ def halfspace_iou(a: Boxes, b: Boxes, i: int) -> float:
 
 def random_boxes(rng, n, spread_m=1.0, low_m=0.05, high_m=20.0) -> Boxes:
     size_m = np.exp(rng.uniform(np.log(low_m), np.log(high_m), (n, 3)))
-    return boxes(rng.normal(0, spread_m, (n, 3)), Rotation.random(n, rng=rng).as_matrix(), size_m)
+    return make_boxes(rng.normal(0, spread_m, (n, 3)), Rotation.random(n, rng=rng).as_matrix(), size_m)
 
 
 def disturbed(rng, a: Boxes, noise: float) -> Boxes:
     """The same boxes with centres and extents off by `noise` metres and axes by `noise` radians."""
     turn = Rotation.from_rotvec(noise * rng.normal(size=(len(a.size_m), 3))).as_matrix()
     center_m = a.center_m + noise * rng.normal(size=a.center_m.shape)
-    return boxes(center_m, turn @ a.rotation, np.maximum(a.size_m + noise * rng.normal(size=a.size_m.shape), 0.01))
+    return make_boxes(center_m, turn @ a.rotation, np.maximum(a.size_m + noise * rng.normal(size=a.size_m.shape), 0.01))
 
 
 def shifted(a: Boxes, share: float, axis: int) -> Boxes:
@@ -68,17 +68,19 @@ def shifted(a: Boxes, share: float, axis: int) -> Boxes:
 
 def relabelled(a: Boxes, order: list[int]) -> Boxes:
     """The same solids with permuted axes (turned by 90 degrees)."""
-    return boxes(a.center_m, a.rotation[:, :, order], a.size_m[:, order])
+    return make_boxes(a.center_m, a.rotation[:, :, order], a.size_m[:, order])
 
 
 def pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
     n = 800
     a, upright = random_boxes(rng, n), random_boxes(rng, n)
     yaw = rng.uniform(-np.pi, np.pi, n)
-    upright = boxes(upright.center_m, yaw_rotation(yaw), upright.size_m)
+    upright = make_boxes(upright.center_m, make_yaw_rotation(yaw), upright.size_m)
     square = a._replace(size_m=np.repeat(a.size_m[:, :1], 3, axis=1))
-    quarter = boxes(a.center_m, a.rotation @ yaw_rotation(np.pi / 2), a.size_m)
-    inside = boxes(a.center_m, Rotation.random(n, rng=rng).as_matrix(), a.size_m.min(axis=1)[:, None] * np.full(3, 0.5))
+    quarter = make_boxes(a.center_m, a.rotation @ make_yaw_rotation(np.pi / 2), a.size_m)
+    inside = make_boxes(
+        a.center_m, Rotation.random(n, rng=rng).as_matrix(), a.size_m.min(axis=1)[:, None] * np.full(3, 0.5)
+    )
     return {
         "random": (a, random_boxes(rng, n)),
         "random, alike in size": (random_boxes(rng, n, 0.5, 1, 4), random_boxes(rng, n, 0.5, 1, 4)),
@@ -93,14 +95,14 @@ def pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
         "touching": (a, shifted(a, 1.0, 1)),
         "contained": (a, inside),
         "half the size, sharing three faces": (a, shifted(a._replace(size_m=a.size_m / [2, 1, 1]), 0.5, 0)),
-        "float32": (a, boxes(*(part.astype(np.float32) for part in a))),
+        "float32": (a, make_boxes(*(part.astype(np.float32) for part in a))),
     }
 
 
 def test_iou3d_of_10000_pairs_is_within_1e_4_of_oracle():
     cases, total, off = pairs(np.random.default_rng(0)), 0, []
     for name, (a, b) in cases.items():
-        ours, oracle = iou3d_pairs(a, b), manifold_iou(a, b)
+        ours, oracle = compute_iou3d_pairs(a, b), manifold_iou(a, b)
         assert (ours >= 0).all() and (ours <= 1).all(), name
         for i in np.flatnonzero(~(np.abs(ours - oracle) <= TOLERANCE)):
             if not abs(ours[i] - halfspace_iou(a, b, i)) <= TOLERANCE:
@@ -113,48 +115,50 @@ def test_iou3d_of_10000_pairs_is_within_1e_4_of_oracle():
 def test_iou3d_agrees_with_both_oracles_on_random_pairs():
     rng = np.random.default_rng(1)
     a, b = random_boxes(rng, 60, 0.5, 0.5, 4), random_boxes(rng, 60, 0.5, 0.5, 4)
-    np.testing.assert_allclose(iou3d_pairs(a, b), [halfspace_iou(a, b, i) for i in range(60)], atol=1e-7)
-    np.testing.assert_allclose(iou3d_pairs(a, b), manifold_iou(a, b), atol=1e-7)
+    np.testing.assert_allclose(compute_iou3d_pairs(a, b), [halfspace_iou(a, b, i) for i in range(60)], atol=1e-7)
+    np.testing.assert_allclose(compute_iou3d_pairs(a, b), manifold_iou(a, b), atol=1e-7)
 
 
 def test_iou3d_equals_hand_computed_cases():
-    unit = boxes(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
-    assert iou3d_pairs(unit, unit) == pytest.approx(1, abs=1e-12)
-    assert iou3d_pairs(unit, shifted(unit, 0.5, 0)) == pytest.approx(1 / 3, abs=1e-8)
-    assert iou3d_pairs(unit, shifted(unit, 1.0, 0)) == pytest.approx(0, abs=1e-8)
-    assert iou3d_pairs(unit, shifted(unit, 5.0, 2)) == 0
-    assert iou3d_pairs(unit, unit._replace(size_m=np.full((1, 3), 0.5))) == pytest.approx(1 / 8, abs=1e-8)
-    diagonal = yaw_rotation(np.array([np.pi / 4]))
+    unit = make_boxes(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
+    assert compute_iou3d_pairs(unit, unit) == pytest.approx(1, abs=1e-12)
+    assert compute_iou3d_pairs(unit, shifted(unit, 0.5, 0)) == pytest.approx(1 / 3, abs=1e-8)
+    assert compute_iou3d_pairs(unit, shifted(unit, 1.0, 0)) == pytest.approx(0, abs=1e-8)
+    assert compute_iou3d_pairs(unit, shifted(unit, 5.0, 2)) == 0
+    assert compute_iou3d_pairs(unit, unit._replace(size_m=np.full((1, 3), 0.5))) == pytest.approx(1 / 8, abs=1e-8)
+    diagonal = make_yaw_rotation(np.array([np.pi / 4]))
     octagon = 2 * (np.sqrt(2) - 1)  # two unit squares, one turned by 45 degrees
-    assert iou3d_pairs(unit, unit._replace(rotation=diagonal)) == pytest.approx(octagon / (2 - octagon), abs=1e-8)
+    assert compute_iou3d_pairs(unit, unit._replace(rotation=diagonal)) == pytest.approx(
+        octagon / (2 - octagon), abs=1e-8
+    )
 
 
 def test_iou3d_is_symmetric_and_invariant_to_pose_and_chunks(monkeypatch):
     rng = np.random.default_rng(2)
     a, b = random_boxes(rng, 300), random_boxes(rng, 300)
-    iou = iou3d_pairs(a, b)
-    np.testing.assert_allclose(iou, iou3d_pairs(b, a), atol=1e-6)
+    iou = compute_iou3d_pairs(a, b)
+    np.testing.assert_allclose(iou, compute_iou3d_pairs(b, a), atol=1e-6)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 100, 3)
-    moved = [boxes(x.center_m @ turn.T + shift, turn @ x.rotation, x.size_m) for x in (a, b)]
-    np.testing.assert_allclose(iou, iou3d_pairs(*moved), atol=1e-6)
+    moved = [make_boxes(x.center_m @ turn.T + shift, turn @ x.rotation, x.size_m) for x in (a, b)]
+    np.testing.assert_allclose(iou, compute_iou3d_pairs(*moved), atol=1e-6)
     monkeypatch.setattr(iou3d, "PAIRS_PER_CHUNK", 7)
-    np.testing.assert_array_equal(iou, iou3d_pairs(a, b))
+    np.testing.assert_array_equal(iou, compute_iou3d_pairs(a, b))
 
 
 def test_iou3d_matrix_equals_pairs_and_accepts_empty_sides():
     rng = np.random.default_rng(3)
     a, b = random_boxes(rng, 40, 10), random_boxes(rng, 30, 10)
     i, j = np.indices((40, 30)).reshape(2, -1)
-    np.testing.assert_array_equal(iou3d_matrix(a, b), iou3d_pairs(a.take(i), b.take(j)).reshape(40, 30))
+    np.testing.assert_array_equal(compute_iou3d_matrix(a, b), compute_iou3d_pairs(a.take(i), b.take(j)).reshape(40, 30))
     wanted = rng.random((40, 30)) < 0.5
-    np.testing.assert_array_equal(iou3d_matrix(a, b, wanted), iou3d_matrix(a, b) * wanted)
+    np.testing.assert_array_equal(compute_iou3d_matrix(a, b, wanted), compute_iou3d_matrix(a, b) * wanted)
     empty = a.take(np.arange(0))
-    assert iou3d_matrix(empty, b).shape == (0, 30) and iou3d_matrix(a, empty).shape == (40, 0)
+    assert compute_iou3d_matrix(empty, b).shape == (0, 30) and compute_iou3d_matrix(a, empty).shape == (40, 0)
 
 
 def test_iou3d_of_boxes_without_volume_is_zero():
-    flat = boxes(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 1.0, 0.0]]))
-    assert iou3d_pairs(flat, flat) == 0
+    flat = make_boxes(np.zeros((1, 3)), np.eye(3)[None], np.array([[1.0, 1.0, 0.0]]))
+    assert compute_iou3d_pairs(flat, flat) == 0
 
 
 @pytest.mark.parametrize(
@@ -165,7 +169,7 @@ def test_iou3d_rejects_invalid_boxes(part, value, message):
     parts = [np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.ones((2, 3))]
     parts[part][1] = value
     with pytest.raises(ValueError, match=message):
-        boxes(*parts)
+        make_boxes(*parts)
 
 
 def test_ellipsoid_iou3d_keeps_stated_error():
@@ -173,19 +177,19 @@ def test_ellipsoid_iou3d_keeps_stated_error():
     rng = np.random.default_rng(4)
     n = 200
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
-    a = boxes(np.zeros((n, 3)), Rotation.random(n, rng=rng).as_matrix(), 2 * radius[0][:, None] * np.ones(3))
-    b = boxes(
+    a = make_boxes(np.zeros((n, 3)), Rotation.random(n, rng=rng).as_matrix(), 2 * radius[0][:, None] * np.ones(3))
+    b = make_boxes(
         distance[:, None] * [0, 0.6, 0.8], Rotation.random(n, rng=rng).as_matrix(), 2 * radius[1][:, None] * np.ones(3)
     )
     lens = sphere_lens(*radius, distance)
     exact = lens / (4 / 3 * np.pi * (radius**3).sum(axis=0) - lens)
     stretch = np.array([4.0, 1.0, 0.5])  # preserves IoU; spheres become aligned ellipsoids
-    stretched = [boxes(x.center_m * stretch, np.tile(np.eye(3), (n, 1, 1)), x.size_m * stretch) for x in (a, b)]
+    stretched = [make_boxes(x.center_m * stretch, np.tile(np.eye(3), (n, 1, 1)), x.size_m * stretch) for x in (a, b)]
     for pair in ((a, b), stretched):
-        error = iou3d.ellipsoid_iou3d_pairs(*pair) - exact
+        error = iou3d.compute_ellipsoid_iou3d_pairs(*pair) - exact
         assert np.abs(error).max() <= 0.01
         assert np.sqrt(np.mean(error**2)) <= 0.002
-    assert (iou3d.ellipsoid_iou3d_pairs(a, a) > 1 - 1e-9).all()
+    assert (iou3d.compute_ellipsoid_iou3d_pairs(a, a) > 1 - 1e-9).all()
 
 
 def sphere_lens(r: np.ndarray, s: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -198,7 +202,7 @@ def sphere_lens(r: np.ndarray, s: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def test_ball_points_are_uniform():
-    points = iou3d.ball_points(4096)
+    points = iou3d.sample_ball_points(4096)
     radius = np.linalg.norm(points, axis=1)
     assert radius.max() <= 1
     assert (radius <= 0.5).mean() == pytest.approx(1 / 8, abs=2e-3)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORIES, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC
-from pipelines.preprocess.sources.kitti360 import read_drive, read_poses, sequences
+from pipelines.preprocess.sources.kitti360 import list_sequences, read_drive, read_poses
 
 NAME = "2013_05_28_drive_0003_sync"
 CUBE = np.array(
@@ -104,7 +104,7 @@ def set_distance(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def real(real_data):
     root = real_data / "kitti360"
-    (sequence,) = sequences(root)
+    (sequence,) = list_sequences(root)
     drive, report = read_drive(root, sequence)
     path = next((root / "data_3d_bboxes" / "train_full").glob("*.xml"))
     return drive, report, ElementTree.parse(path).getroot()
@@ -488,13 +488,13 @@ def test_kitti360_names_broken_poses(tmp_path, name):
 
 def test_kitti360_names_missing_file(tmp_path):
     with pytest.raises(ValueError, match="data_3d_bboxes"):
-        sequences(tmp_path)
+        list_sequences(tmp_path)
     write(tmp_path, GOOD)
-    assert sequences(tmp_path) == ["0003"]
+    assert list_sequences(tmp_path) == ["0003"]
     poses = tmp_path / "data_poses" / NAME / "poses.txt"
     poses.unlink()
     for call in (
-        lambda: sequences(tmp_path),
+        lambda: list_sequences(tmp_path),
         lambda: read_poses(tmp_path, "0003"),
         lambda: read_drive(tmp_path, "0003"),
     ):

@@ -23,13 +23,13 @@ from models.scene import (
 from pipelines.io.mesh_export import (
     GLTF_FROM_SCENE,
     GROUND,
-    ground_mesh,
-    scene_from_unit,
-    scene_glb,
-    scene_triangles,
+    build_ground_mesh,
+    compute_placements,
+    export_glb,
+    triangulate_scene,
     write_glb,
 )
-from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, GROUND_CLASS_ID, rgb
+from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, GROUND_CLASS_ID, parse_rgb
 
 
 def load(glb: bytes) -> trimesh.Scene:
@@ -46,7 +46,7 @@ def placed(loaded: trimesh.Scene, node: str) -> trimesh.Trimesh:
 
 def test_scene_glb_has_named_node_per_primitive_and_ground():
     scene = example_scene()
-    loaded = load(scene_glb(scene))
+    loaded = load(export_glb(scene))
     expected = {f"{CATEGORIES[c]}_{i:04d}" for i, c in enumerate(scene.category)} | {"ground"}
     assert set(loaded.graph.nodes_geometry) == expected
     assert len(loaded.geometry) == len(CATEGORIES) + 1  # shared, not copied
@@ -66,7 +66,7 @@ def test_scene_glb_is_y_up_with_forward_z_and_left_x():
 
 def test_scene_glb_keeps_corners_and_volumes():
     scene = example_scene()
-    loaded = load(scene_glb(scene))
+    loaded = load(export_glb(scene))
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     for i, category in enumerate(scene.category):
         mesh = placed(loaded, f"{CATEGORIES[category]}_{i:04d}")
@@ -82,7 +82,7 @@ def test_scene_glb_keeps_corners_and_volumes():
 
 def test_ground_mesh_is_fused_surface_at_pixel_centers():
     scene = example_scene()
-    vertices, triangles, class_id = ground_mesh(scene)
+    vertices, triangles, class_id = build_ground_mesh(scene)
     height, winner = scene.surface()
     row, col = scene.grid.pixel(vertices[:, 0], vertices[:, 1])
     assert len(vertices) == (winner >= 0).sum()
@@ -99,7 +99,7 @@ def test_ground_mesh_is_fused_surface_at_pixel_centers():
     at_row, at_col = scene.grid.pixel(first[:, 0], first[:, 1])
     assert ((at_row % 5 == 0) & (at_col % 5 == 0)).sum() == quads
 
-    loaded = placed(load(scene_glb(scene)), "ground")
+    loaded = placed(load(export_glb(scene)), "ground")
     assert np.allclose(loaded.vertices, vertices, atol=1e-4) and np.array_equal(loaded.faces, triangles)
 
 
@@ -115,17 +115,17 @@ def test_ground_mesh_diagonal_and_winding_of_one_block():
         occupied=occupied,
         grid=grid,
     )
-    _, triangles, _ = ground_mesh(one)
+    _, triangles, _ = build_ground_mesh(one)
     assert {frozenset(t) for t in triangles.tolist()} == {frozenset({0, 1, 2}), frozenset({1, 2, 3})}
 
 
 def linear_light(color_hex: str) -> np.ndarray:
-    srgb = np.array(rgb(color_hex)) / 255
+    srgb = np.array(parse_rgb(color_hex)) / 255
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def test_scene_glb_colors_are_palette_in_linear_light():
-    glb = scene_glb(example_scene())
+    glb = export_glb(example_scene())
     header = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
     factors = {m["name"]: m["pbrMetallicRoughness"]["baseColorFactor"][:3] for m in header["materials"]}
     assert np.allclose(factors.pop("ground"), 1)
@@ -141,7 +141,7 @@ def test_scene_glb_colors_are_palette_in_linear_light():
 
 def test_scene_triangles_are_closed_per_primitive():
     scene = example_scene()
-    corners, class_id, primitive = scene_triangles(scene)
+    corners, class_id, primitive = triangulate_scene(scene)
     assert len(corners) == len(class_id) == len(primitive)
     signed = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum(axis=1) / 6
     volume = np.bincount(primitive[primitive != GROUND], signed[primitive != GROUND])
@@ -154,15 +154,15 @@ def test_scene_triangles_are_closed_per_primitive():
 
 def test_scene_from_unit_places_unit_box():
     scene = example_scene()
-    corner = scene_from_unit(scene) @ np.array([0.5, 0.5, 0.5, 1])
+    corner = compute_placements(scene) @ np.array([0.5, 0.5, 0.5, 1])
     expected = scene.center_m + np.einsum("nij,nj->ni", scene.rotation, scene.size_m / 2)
     assert np.allclose(corner[:, :3], expected, atol=1e-4)
 
 
 def test_scene_glb_accepts_empty_scene():
     scene = empty_scene()
-    assert scene_triangles(scene).corners_m.shape == (0, 3, 3)
-    loaded = load(scene_glb(scene))
+    assert triangulate_scene(scene).corners_m.shape == (0, 3, 3)
+    loaded = load(export_glb(scene))
     assert len(loaded.graph.nodes_geometry) == 0 and "scene" in loaded.graph.nodes
 
 
@@ -186,6 +186,6 @@ def test_write_glb_leaves_only_its_file(tmp_path):
     scene = example_scene(5)
     write_glb(scene, tmp_path / "scene.glb")
     assert [p.name for p in tmp_path.iterdir()] == ["scene.glb"]
-    assert (tmp_path / "scene.glb").read_bytes() == scene_glb(scene)
+    assert (tmp_path / "scene.glb").read_bytes() == export_glb(scene)
     with pytest.raises(FileNotFoundError):
         write_glb(scene, tmp_path / "missing" / "scene.glb")

@@ -8,10 +8,10 @@ import pytest
 import trimesh
 from helpers import random_rotations, random_scene
 
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, Grid, Scene, canonical_boxes
-from pipelines.io.mesh_export import scene_glb
-from pipelines.io.mesh_import import scene_from_glb
-from pipelines.schema.palette import COLOR_HEX, rgb
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, GROUND_CLASSES, Grid, Scene, canonicalize_boxes
+from pipelines.io.mesh_export import export_glb
+from pipelines.io.mesh_import import import_glb
+from pipelines.schema.palette import COLOR_HEX, parse_rgb
 
 SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
 Z_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -72,15 +72,15 @@ def assert_same_scene(got: Scene, want: Scene) -> None:
 def test_scene_from_glb_round_trips_own_export(town_scenes):
     labelled = replace(town_scenes[0], vegetation_density="high", vehicle_density="low")
     for scene in (*town_scenes, labelled, random_scene(1, tilt_rad=np.pi)):
-        got = scene_from_glb(scene_glb(scene))
+        got = import_glb(export_glb(scene))
         assert_same_scene(got, scene)
         assert np.abs(got.rotation - scene.rotation).max() < 1e-6
     assert len(scene) == 40 and sum(len(s) for s in town_scenes) > 100 and labelled.occupied.any()
 
 
 def test_scene_from_glb_keeps_fused_scene(town_scenes):
-    once = scene_from_glb(scene_glb(town_scenes[0]))
-    twice = scene_from_glb(scene_glb(once))
+    once = import_glb(export_glb(town_scenes[0]))
+    twice = import_glb(export_glb(once))
     assert np.array_equal(once.height_m, twice.height_m) and np.array_equal(once.occupied, twice.occupied)
     assert np.array_equal(once.size_m, twice.size_m)
 
@@ -88,7 +88,7 @@ def test_scene_from_glb_keeps_fused_scene(town_scenes):
 def test_scene_from_glb_round_trips_any_grid():
     grid = Grid(front_m=96.5, left_m=20.0, resolution_m=0.7, rows=30, cols=50)
     scene = replace(random_scene(2, grid=grid), ground_classes=("sidewalk", "crossing", "road", "ground", "terrain"))
-    assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
+    assert_same_scene(import_glb(export_glb(scene)), scene)
 
 
 @pytest.mark.parametrize("stride", [2, 256])
@@ -97,13 +97,13 @@ def test_scene_from_glb_round_trips_isolated_pixels(stride):
     lonely = np.zeros_like(scene.occupied)
     lonely[2, ::stride, ::stride] = True
     scene = replace(scene, occupied=lonely, height_m=np.where(lonely, np.float32(0.37), np.float32(0)))
-    assert_same_scene(scene_from_glb(scene_glb(scene)), scene)
+    assert_same_scene(import_glb(export_glb(scene)), scene)
 
 
 def test_scene_from_glb_round_trips_empty_scene():
     scene = random_scene(0, n=0)
     scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
-    got = scene_from_glb(scene_glb(scene))
+    got = import_glb(export_glb(scene))
     assert len(got) == 0 and not got.occupied.any() and got.grid == scene.grid
 
 
@@ -118,7 +118,7 @@ def test_scene_from_glb_applies_node_transform():
         matrix[0, 3] += 1.5
         node["matrix"] = matrix.T.ravel().tolist()
 
-    got = scene_from_glb(edited(scene_glb(scene), change), scene_id="edited")
+    got = import_glb(edited(export_glb(scene), change), scene_id="edited")
     box = SIGNS * scene.size_m[1] @ (turn @ scene.rotation[1]).T + scene.center_m[1] + [1.5, 0, 0]
     apart = np.linalg.norm(corners_m(got)[1][:, None] - box[None], axis=-1)
     assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
@@ -159,7 +159,7 @@ def three_box() -> tuple[np.ndarray, np.ndarray]:
 
 def painted(vertices, faces, name: str | np.ndarray, linear: bool) -> trimesh.Trimesh:
     names = np.broadcast_to(name, len(vertices))
-    color = np.array([rgb(COLOR_HEX[n]) for n in names]) / 255
+    color = np.array([parse_rgb(COLOR_HEX[n]) for n in names]) / 255
     if linear:
         color = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     rgba = np.hstack([np.round(255 * color), np.full((len(vertices), 1), 255)]).astype(np.uint8)
@@ -224,7 +224,7 @@ def assert_same_primitives(got: Scene, want: Scene) -> None:
         else:
             apart = np.linalg.norm(corners_m(got)[nearest][:, None] - corners[None], axis=-1)
             assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
-    rotation, size_m = canonical_boxes(got.rotation, got.size_m)
+    rotation, size_m = canonicalize_boxes(got.rotation, got.size_m)
     assert np.allclose(rotation, got.rotation, atol=1e-5) and np.array_equal(size_m, got.size_m)
 
 
@@ -232,7 +232,7 @@ def assert_same_primitives(got: Scene, want: Scene) -> None:
 @pytest.mark.parametrize("linear", [False, True], ids=["sRGB", "linear"])
 def test_scene_from_glb_reads_format_of_authors(town_scenes, merged, linear):
     scene = town_scenes[1]
-    got = scene_from_glb(authors_glb(scene, merged, linear))
+    got = import_glb(authors_glb(scene, merged, linear))
     assert_same_primitives(got, scene)
     assert_same_ground(got, scene)
     assert got.source == "imported" and got.split == "generated" and got.grid == Grid()
@@ -241,18 +241,18 @@ def test_scene_from_glb_reads_format_of_authors(town_scenes, merged, linear):
 @pytest.mark.parametrize("merged", [False, True])
 def test_scene_from_glb_keeps_pitch_and_roll(merged):
     rng = np.random.default_rng(5)
-    rotation, size_m = canonical_boxes(random_rotations(rng, 60), rng.choice([0.05, 0.5, 3, 14], (60, 3)))
+    rotation, size_m = canonicalize_boxes(random_rotations(rng, 60), rng.choice([0.05, 0.5, 3, 14], (60, 3)))
     roll = trimesh.transformations.rotation_matrix(0.4, [1, 0, 0])[:3, :3]
-    rotation, size_m = canonical_boxes(rotation @ roll, size_m)
+    rotation, size_m = canonicalize_boxes(rotation @ roll, size_m)
     scene = replace(random_scene(5, n=60), rotation=rotation.astype(np.float32), size_m=size_m.astype(np.float32))
-    assert_same_primitives(scene_from_glb(authors_glb(scene, merged)), scene)
+    assert_same_primitives(import_glb(authors_glb(scene, merged)), scene)
 
 
 def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
     scene = town_scenes[1].select(np.arange(20))
     assert {ELLIPSOID, *scene.category} > {ELLIPSOID}
     for merged in (False, True):
-        got = scene_from_glb(authors_glb(scene, merged, unmerged=True))
+        got = import_glb(authors_glb(scene, merged, unmerged=True))
         assert_same_primitives(got, scene)
         isolated = got.occupied.any(axis=0) != scene.occupied.any(axis=0)  # in no triangle, so absent from this file
         assert isolated.sum() < 50
@@ -260,7 +260,7 @@ def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
 
 def test_scene_from_glb_mixes_face_colors_only_on_borders(town_scenes):
     scene = town_scenes[1]
-    got = scene_from_glb(authors_glb(scene, merged=True, faces=True))
+    got = import_glb(authors_glb(scene, merged=True, faces=True))
     assert_same_primitives(got, scene)
     both = got.occupied.any(axis=0) & scene.occupied.any(axis=0)
     assert both.sum() > 0.99 * scene.occupied.any(axis=0).sum()
@@ -276,15 +276,15 @@ def test_scene_from_glb_reads_mesh_without_extras_by_shape(town_scenes):
         for entry in (*tree["scenes"], *tree["nodes"], *tree["meshes"]):
             entry.pop("extras", None)
 
-    got = scene_from_glb(edited(scene_glb(scene), strip), axes=("y+", "z+", "x+"))
+    got = import_glb(edited(export_glb(scene), strip), axes=("y+", "z+", "x+"))
     assert_same_primitives(got, scene)
     assert_same_ground(got, scene)
 
 
 def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
     (tmp_path / "scene-7.glb").write_bytes(authors_glb(town_scenes[0].select([0])))
-    assert scene_from_glb(tmp_path / "scene-7.glb").scene_id == "scene-7"
-    assert scene_from_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
+    assert import_glb(tmp_path / "scene-7.glb").scene_id == "scene-7"
+    assert import_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
 
 
 # ------------------------------------------------------------------------------------------------------- faults
@@ -308,7 +308,7 @@ def sheared() -> bytes:
 
 
 def with_json(change) -> bytes:
-    return edited(scene_glb(random_scene(6, n=2)), change)
+    return edited(export_glb(random_scene(6, n=2)), change)
 
 
 def green() -> bytes:
@@ -317,7 +317,7 @@ def green() -> bytes:
 
 FAULTS = {
     "text": (lambda: b"{}", "not a binary glTF"),
-    "truncated": (lambda: scene_glb(random_scene(6, n=2))[:-100], "expected a whole file"),
+    "truncated": (lambda: export_glb(random_scene(6, n=2))[:-100], "expected a whole file"),
     "uri": (lambda: with_json(lambda t: t["buffers"][0].update(uri="http://x/y.bin")), "buffers lie outside"),
     "image": (lambda: with_json(lambda t: t.update(images=[{"uri": "../x.png"}])), "images lie outside"),
     "draco": (lambda: with_json(lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"])), "draco"),
@@ -347,20 +347,20 @@ def test_scene_from_glb_names_unknown_mesh_and_its_content(tmp_path, fault):
     path = tmp_path / "theirs.glb"
     path.write_bytes(make())
     with pytest.raises(ValueError, match=rf"theirs\.glb: .*({words})"):
-        scene_from_glb(path)
+        import_glb(path)
 
 
 def test_scene_from_glb_rejects_wrong_frame_and_axes(town_scenes):
     glb = authors_glb(town_scenes[0])
     with pytest.raises(ValueError, match=r"ground vertices, x .* are not one per pixel .*check the axes"):
-        scene_from_glb(glb, axes=("y+", "x+", "z+"))
+        import_glb(glb, axes=("y+", "x+", "z+"))
     with pytest.raises(ValueError, match=r"axes 'x\+ x\+ z\+': name x"):
-        scene_from_glb(glb, axes=("x+", "x+", "z+"))
+        import_glb(glb, axes=("x+", "x+", "z+"))
 
 
 def test_scene_from_glb_names_missing_file(tmp_path):
     with pytest.raises(ValueError, match=r"absent\.glb: cannot be read"):
-        scene_from_glb(tmp_path / "absent.glb")
+        import_glb(tmp_path / "absent.glb")
 
 
 def leaves(tree: dict | list) -> list[tuple]:
@@ -369,7 +369,7 @@ def leaves(tree: dict | list) -> list[tuple]:
     return [(tree, k) for k, _ in items] + [leaf for _, v in items if isinstance(v, dict | list) for leaf in leaves(v)]
 
 
-@pytest.mark.parametrize("make", [scene_glb, authors_glb], ids=["ours", "theirs"])
+@pytest.mark.parametrize("make", [export_glb, authors_glb], ids=["ours", "theirs"])
 def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
     grid = Grid(front_m=64.0, left_m=32.0, resolution_m=0.25, rows=8, cols=8)
     glb, rng = make(random_scene(7, n=4, grid=grid)), np.random.default_rng(0)
@@ -383,7 +383,7 @@ def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
             container[key] = values[rng.integers(len(values))]
 
         try:
-            scene_from_glb(edited(glb, change))
+            import_glb(edited(glb, change))
             outcomes["scene"] += 1
         except ValueError:
             outcomes["refused"] += 1
@@ -391,4 +391,4 @@ def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
 
 
 def test_scene_from_glb_of_authors_has_five_ground_classes(town_scenes):
-    assert scene_from_glb(authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]
+    assert import_glb(authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]

@@ -6,8 +6,14 @@ import zipfile
 import numpy as np
 import pytest
 
-from pipelines.metrics.adm_npz import Gaussian, picture_shape, pictures_in_npz, reference_moments, write_npz
-from pipelines.metrics.frechet import frechet_distance, moments
+from pipelines.metrics.adm_npz import (
+    StoredGaussian,
+    iterate_pictures,
+    read_picture_shape,
+    read_reference_moments,
+    write_npz,
+)
+from pipelines.metrics.frechet import compute_frechet_distance, compute_moments
 
 
 def pictures(n=7, height=5, width=6) -> np.ndarray:
@@ -19,8 +25,8 @@ def pictures(n=7, height=5, width=6) -> np.ndarray:
 def test_npz_images_are_read_whole_in_order(tmp_path, save, batch):
     path = str(tmp_path / "samples.npz")
     save(path, pictures(), np.arange(7))  # as ADM: pictures, then labels as arr_1
-    assert picture_shape(path) == (7, 5, 6, 3)
-    parts = list(pictures_in_npz(path, batch))
+    assert read_picture_shape(path) == (7, 5, 6, 3)
+    parts = list(iterate_pictures(path, batch))
     assert [len(part) for part in parts[:-1]] == [batch] * (len(parts) - 1) and 0 < len(parts[-1]) <= batch
     assert all(part.flags.writeable for part in parts)
     np.testing.assert_array_equal(np.concatenate(parts), pictures())
@@ -28,7 +34,7 @@ def test_npz_images_are_read_whole_in_order(tmp_path, save, batch):
 
 def test_npz_without_images_has_no_batches(tmp_path):
     np.savez(tmp_path / "none.npz", pictures(0))
-    assert list(pictures_in_npz(str(tmp_path / "none.npz"), 4)) == []
+    assert list(iterate_pictures(str(tmp_path / "none.npz"), 4)) == []
 
 
 @pytest.mark.parametrize("grouping", [[7], [3, 4], [1] * 7])
@@ -38,7 +44,7 @@ def test_npz_writer_is_readable_by_numpy(tmp_path, grouping):
     with np.load(path, allow_pickle=False) as written:
         assert written.files == ["arr_0"]
         np.testing.assert_array_equal(written["arr_0"], pictures())
-    np.testing.assert_array_equal(np.concatenate(list(pictures_in_npz(path, 2))), pictures())
+    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 2))), pictures())
 
 
 def test_npz_memory_is_bounded_by_batch(tmp_path):
@@ -47,7 +53,7 @@ def test_npz_memory_is_bounded_by_batch(tmp_path):
     tracemalloc.start()
     try:
         write_npz(path, (np.full((16, 128, 128, 3), i, np.uint8) for i in range(85)), 85 * 16)
-        total = sum(int(part[0, 0, 0, 0]) for part in pictures_in_npz(path, 16))
+        total = sum(int(part[0, 0, 0, 0]) for part in iterate_pictures(path, 16))
         assert tracemalloc.get_traced_memory()[1] < 8e6
     finally:
         tracemalloc.stop()
@@ -59,7 +65,7 @@ def test_npz_memory_is_bounded_by_batch(tmp_path):
 
 def refused(path, match):
     with pytest.raises(ValueError, match=match) as raised:
-        pictures_in_npz(str(path), 4)  # immediately, before the first image
+        iterate_pictures(str(path), 4)  # immediately, before the first image
     assert str(path) in str(raised.value)
 
 
@@ -78,7 +84,7 @@ def test_npz_reader_rejects_files_without_images(tmp_path):
     refused(path, "Fortran order")
     np.savez(path, pictures())
     with pytest.raises(ValueError, match="at least 1 picture, got 0"):
-        pictures_in_npz(str(path), 0)
+        iterate_pictures(str(path), 0)
 
 
 def test_npz_reader_rejects_pickle_without_reading(tmp_path):
@@ -91,7 +97,7 @@ def test_npz_reader_rejects_pickle_without_reading(tmp_path):
     refused(path, "pickled")
     np.savez(path, mu=np.array([Trap()], dtype=object), sigma=np.zeros((2, 2)))
     with pytest.raises(ValueError, match="pickled"):
-        reference_moments(str(path))
+        read_reference_moments(str(path))
     assert not (tmp_path / "sprung").exists()
 
 
@@ -105,7 +111,7 @@ def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
     at = whole.index(pictures().tobytes()) + 300
     path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])  # one bit in the fourth picture
     with pytest.raises(ValueError, match=r"x\.npz: damaged .*CRC"):
-        list(pictures_in_npz(str(path), 2))
+        list(iterate_pictures(str(path), 2))
 
     with zipfile.ZipFile(path, "w") as archive, archive.open("arr_0.npy", "w") as stream:  # a writer stopped early
         header = {"descr": "|u1", "fortran_order": False, "shape": (7, 5, 6, 3)}
@@ -138,24 +144,24 @@ def test_npz_reference_moments_equal_those_of_features(tmp_path):
     path = str(tmp_path / "reference.npz")
     arrays = {"mu": pool3.mean(0), "sigma": np.cov(pool3, rowvar=False)}
     np.savez(path, pictures(), **arrays, mu_s=spatial.mean(0), sigma_s=np.cov(spatial, rowvar=False))
-    found = reference_moments(path)
-    np.testing.assert_allclose(found.spatial.covariance, moments(spatial).covariance, atol=1e-12)
+    found = read_reference_moments(path)
+    np.testing.assert_allclose(found.spatial.covariance, compute_moments(spatial).covariance, atol=1e-12)
     assert found.spatial.mean.shape == (2023,)
     assert found.pool3.mean.dtype == found.pool3.covariance.dtype == np.float64
-    np.testing.assert_allclose(found.pool3.covariance, moments(pool3).covariance, atol=1e-12)
-    np.testing.assert_array_equal(np.concatenate(list(pictures_in_npz(path, 4))), pictures())
+    np.testing.assert_allclose(found.pool3.covariance, compute_moments(pool3).covariance, atol=1e-12)
+    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 4))), pictures())
 
     np.savez(path, **arrays)  # as TTUR and pytorch-fid store them
-    assert reference_moments(path).spatial is None
+    assert read_reference_moments(path).spatial is None
     np.savez(path, pictures())
-    assert reference_moments(path) is None
+    assert read_reference_moments(path) is None
 
 
 def test_npz_reference_moments_give_frechet_distance():
     deviation = np.array([0.0, 1.0, 2.0])
-    reference = Gaussian(np.zeros(3), np.diag(deviation**2))
-    assert frechet_distance(moments(np.ones((3, 3))), reference) == pytest.approx(3 + 5)
-    assert frechet_distance(reference, moments(np.ones((3, 3)))) == pytest.approx(3 + 5)
+    reference = StoredGaussian(np.zeros(3), np.diag(deviation**2))
+    assert compute_frechet_distance(compute_moments(np.ones((3, 3))), reference) == pytest.approx(3 + 5)
+    assert compute_frechet_distance(reference, compute_moments(np.ones((3, 3)))) == pytest.approx(3 + 5)
 
 
 def test_npz_reader_rejects_incomplete_or_foreign_moments(tmp_path):
@@ -172,6 +178,6 @@ def test_npz_reader_rejects_incomplete_or_foreign_moments(tmp_path):
     ):
         np.savez(path, **arrays)
         with pytest.raises(ValueError, match=match):
-            reference_moments(path)
+            read_reference_moments(path)
     with pytest.raises(ValueError, match="no such file"):
-        reference_moments(str(tmp_path / "absent.npz"))
+        read_reference_moments(str(tmp_path / "absent.npz"))

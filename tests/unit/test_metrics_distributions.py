@@ -11,14 +11,14 @@ from pipelines.metrics.distributions import (
     ENDS,
     HISTOGRAMS,
     NO_GROUND,
-    count_distances,
-    histogram_distances,
-    jensen_shannon,
-    normalised,
-    pair_distances,
-    road_widths,
-    scene_histograms,
-    wasserstein,
+    compute_count_distances,
+    compute_histogram_distances,
+    compute_jensen_shannon,
+    compute_pair_distances,
+    compute_scene_histograms,
+    compute_wasserstein,
+    measure_road_widths,
+    normalize_histogram,
 )
 
 CAR = CATEGORY_INDEX["vehicle_small"]
@@ -46,7 +46,7 @@ def street(width_px: int, cars_xy_m=(), tilted: bool = False) -> Scene:
 
 def histogram(scene: Scene, name: str) -> np.ndarray:
     index = [one.name for one in HISTOGRAMS].index(name)
-    return scene_histograms(scene)[ENDS[index] - len(HISTOGRAMS[index]) : ENDS[index]]
+    return compute_scene_histograms(scene)[ENDS[index] - len(HISTOGRAMS[index]) : ENDS[index]]
 
 
 def bin_of(name: str, value: float) -> int:
@@ -75,17 +75,17 @@ def test_histograms_equal_hand_computed():
 @pytest.mark.parametrize("tilted", [False, True])
 @pytest.mark.parametrize("width_px", [24, 41])
 def test_road_width_of_straight_road(width_px, tilted):
-    width_m, _ = road_widths(street(width_px, tilted=tilted))
+    width_m, _ = measure_road_widths(street(width_px, tilted=tilted))
     assert len(width_m) >= 200
     assert np.median(width_m) == pytest.approx(width_px * 0.25, abs=0.5)
 
 
 def test_road_widths_of_scenes_without_or_with_only_road():
     empty = street(0)
-    assert road_widths(empty)[1] is None and len(road_widths(empty)[0]) == 0
+    assert measure_road_widths(empty)[1] is None and len(measure_road_widths(empty)[0]) == 0
     everywhere = street(600)
-    assert len(road_widths(everywhere)[0]) == 0 and (road_widths(everywhere)[1] == 0).all()
-    assert scene_histograms(empty).sum() == 0
+    assert len(measure_road_widths(everywhere)[0]) == 0 and (measure_road_widths(everywhere)[1] == 0).all()
+    assert compute_scene_histograms(empty).sum() == 0
 
 
 def test_histograms_object_beyond_grid_has_no_ground():
@@ -98,37 +98,37 @@ def test_histograms_object_beyond_grid_has_no_ground():
 def test_pair_distances_equal_loops():
     points = np.random.default_rng(0).normal(size=(7, 2))
     expected = [np.linalg.norm(points[i] - points[j]) for i in range(7) for j in range(i + 1, 7)]
-    assert np.allclose(pair_distances(points), expected)
-    assert len(pair_distances(points[:1])) == 0
+    assert np.allclose(compute_pair_distances(points), expected)
+    assert len(compute_pair_distances(points[:1])) == 0
 
 
 def test_distribution_distances_equal_scipy():
     rng = np.random.default_rng(1)
     edges = np.sort(rng.uniform(0, 10, 13))
     middle = (edges[1:] + edges[:-1]) / 2
-    p, q = (normalised(rng.integers(0, 5, (20, 12)) + np.eye(12)[:1]) for _ in range(2))
+    p, q = (normalize_histogram(rng.integers(0, 5, (20, 12)) + np.eye(12)[:1]) for _ in range(2))
     expected = [wasserstein_distance(middle, middle, a, b) for a, b in zip(p, q, strict=True)]
-    assert np.allclose(wasserstein(p, q, edges), expected)
+    assert np.allclose(compute_wasserstein(p, q, edges), expected)
     expected = [jensenshannon(a, b, base=2) ** 2 for a, b in zip(p, q, strict=True)]
-    assert np.allclose(jensen_shannon(p, q), expected, atol=1e-12)
-    assert jensen_shannon(np.array([[1.0, 0]]), np.array([[0, 1.0]])) == 1
-    assert np.isnan(normalised(np.zeros((1, 3)))).all()
+    assert np.allclose(compute_jensen_shannon(p, q), expected, atol=1e-12)
+    assert compute_jensen_shannon(np.array([[1.0, 0]]), np.array([[0, 1.0]])) == 1
+    assert np.isnan(normalize_histogram(np.zeros((1, 3)))).all()
 
 
 def test_size_distance_of_shift_is_in_meters():
     rng = np.random.default_rng(2)
     scenes = [random_scene(seed, n=60) for seed in range(24)]
-    real = np.stack([scene_histograms(scene) for scene in scenes])
-    assert all(found.value == 0 for found in histogram_distances(real, real).values())
+    real = np.stack([compute_scene_histograms(scene) for scene in scenes])
+    assert all(found.value == 0 for found in compute_histogram_distances(real, real).values())
     near = street(24, rng.uniform(5, 60, (30, 2)) - [0, 30])
-    near = np.stack([scene_histograms(near)] * 12)
+    near = np.stack([compute_scene_histograms(near)] * 12)
     longer = near.copy()
     index = [one.name for one in HISTOGRAMS].index("vehicle_small.length_m")
     columns = slice(ENDS[index] - len(HISTOGRAMS[index]), ENDS[index])
     longer[:, columns] = np.roll(longer[:, columns], 3, axis=1)
     middle = (HISTOGRAMS[index].edges[1:] + HISTOGRAMS[index].edges[:-1]) / 2
     at = bin_of("vehicle_small.length_m", 4.0)
-    got = histogram_distances(near, longer)
+    got = compute_histogram_distances(near, longer)
     assert got["vehicle_small.length_m"].value == pytest.approx(middle[at + 3] - middle[at])
     assert all(found.value == 0 for name, found in got.items() if name != "vehicle_small.length_m")
     assert "pole.length_m" not in got  # in neither source
@@ -138,7 +138,7 @@ def test_count_distance_names_differing_category():
     counts = np.random.default_rng(4).integers(0, 6, (200, len(CATEGORIES)))
     other = counts[::-1].copy()
     other[:, CAR] += 10
-    got = count_distances(counts, other)
+    got = compute_count_distances(counts, other)
     assert got["vehicle_small"].value == pytest.approx(10)
     assert got["vehicle_small"].low > 9 and got["vehicle_small"].high < 11
     assert all(got[name].value == pytest.approx(0, abs=1e-12) for name in CATEGORIES if name != "vehicle_small")

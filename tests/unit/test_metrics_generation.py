@@ -9,11 +9,25 @@ import scipy.linalg
 from pipelines.metrics import inception_score as inception_score_module
 from pipelines.metrics import kernel_distance as kernel_distance_module
 from pipelines.metrics import neighbours
-from pipelines.metrics.frechet import Moments, frechet_distance, frechet_influence, influence_maps, moments, transport
-from pipelines.metrics.inception_score import inception_score
-from pipelines.metrics.intervals import mean_estimate, moved, ratio_estimates
-from pipelines.metrics.kernel_distance import kernel_distance
-from pipelines.metrics.neighbours import ball_radii, nearest, neighbourhoods, prepare, principal_axes, short_vectors
+from pipelines.metrics.frechet import (
+    Moments,
+    compute_frechet_distance,
+    compute_frechet_influence,
+    compute_influence_maps,
+    compute_moments,
+    compute_transport,
+)
+from pipelines.metrics.inception_score import compute_inception_score
+from pipelines.metrics.intervals import estimate_from_influence, estimate_mean, estimate_ratios
+from pipelines.metrics.kernel_distance import compute_kernel_distance
+from pipelines.metrics.neighbours import (
+    compute_ball_radii,
+    compute_neighbourhoods,
+    compute_principal_axes,
+    find_nearest,
+    prepare_features,
+    project_to_axes,
+)
 
 # ------------------------------------------------------------------------------------------ Frechet distance
 
@@ -33,8 +47,12 @@ def sets(rng, n=400, m=300, d=32):
 def test_frechet_distance_equals_literal_version():
     for seed in range(5):
         x, y = sets(np.random.default_rng(seed))
-        assert frechet_distance(moments(x), moments(y)) == pytest.approx(literal_fid(x, y), rel=1e-6)
-        assert frechet_distance(moments(x), moments(y)) == pytest.approx(frechet_distance(moments(y), moments(x)))
+        assert compute_frechet_distance(compute_moments(x), compute_moments(y)) == pytest.approx(
+            literal_fid(x, y), rel=1e-6
+        )
+        assert compute_frechet_distance(compute_moments(x), compute_moments(y)) == pytest.approx(
+            compute_frechet_distance(compute_moments(y), compute_moments(x))
+        )
 
 
 def test_frechet_distance_equals_closed_form():
@@ -46,26 +64,28 @@ def test_frechet_distance_equals_closed_form():
     a = Moments(11, mean, np.diag(deviation**2) * 10)
     b = Moments(21, other_mean, np.diag(other_deviation**2) * 20)
     expected = np.square(mean - other_mean).sum() + np.square(deviation - other_deviation).sum()
-    assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-12)
+    assert compute_frechet_distance(a, b) == pytest.approx(expected, rel=1e-12)
 
 
 def test_frechet_distance_handles_constant_and_few_samples():
     rng = np.random.default_rng(1)
     x, _ = sets(rng)
-    assert frechet_distance(moments(x), moments(x)) == pytest.approx(0, abs=1e-6)
-    assert frechet_distance(moments(x), moments(x + 1)) == pytest.approx(32, rel=1e-6)
+    assert compute_frechet_distance(compute_moments(x), compute_moments(x)) == pytest.approx(0, abs=1e-6)
+    assert compute_frechet_distance(compute_moments(x), compute_moments(x + 1)) == pytest.approx(32, rel=1e-6)
     constant = np.ones((10, 4))
-    assert frechet_distance(moments(constant), moments(constant + 2)) == pytest.approx(16)
+    assert compute_frechet_distance(compute_moments(constant), compute_moments(constant + 2)) == pytest.approx(16)
     few, many = rng.normal(size=(5, 32)), rng.normal(size=(500, 32))  # rank 4 of 32
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert frechet_distance(moments(few), moments(many)) == pytest.approx(literal_fid(few, many), rel=1e-4)
+        assert compute_frechet_distance(compute_moments(few), compute_moments(many)) == pytest.approx(
+            literal_fid(few, many), rel=1e-4
+        )
 
 
 def test_moments_add_up_exactly_in_any_grouping():
     rng = np.random.default_rng(2)
     x = rng.normal(1000, 1, size=(500, 8))  # a mean far from 0, where sums of squares lose digits
-    parts = [moments(part) for part in np.split(x, [1, 40, 300])]
+    parts = [compute_moments(part) for part in np.split(x, [1, 40, 300])]
     for total in (parts[0] + parts[1] + parts[2] + parts[3], (parts[3] + parts[1]) + (parts[0] + parts[2])):
         assert total.count == 500
         np.testing.assert_allclose(total.mean, x.mean(0), rtol=1e-13)
@@ -82,13 +102,15 @@ def test_inception_score_equals_literal_version(monkeypatch):
     for start in range(0, 1300, 500):
         p = np.array([np.exp(row) / np.exp(row).sum() for row in logits[start : start + 500]])
         scores.append(np.exp(np.mean([(row * (np.log(row) - np.log(p.mean(0)))).sum() for row in p])))
-    assert inception_score(logits).value == pytest.approx(np.mean(scores), rel=1e-9)
+    assert compute_inception_score(logits).value == pytest.approx(np.mean(scores), rel=1e-9)
 
 
 def test_inception_score_of_certain_and_equal_predictions():
-    assert inception_score(np.eye(7).repeat(3, axis=0) * 1e4).value == pytest.approx(7)
-    assert inception_score(np.ones((9, 7))).value == pytest.approx(1)
-    assert inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])).value == pytest.approx(1)  # a class that never occurs
+    assert compute_inception_score(np.eye(7).repeat(3, axis=0) * 1e4).value == pytest.approx(7)
+    assert compute_inception_score(np.ones((9, 7))).value == pytest.approx(1)
+    assert compute_inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])).value == pytest.approx(
+        1
+    )  # a class that never occurs
 
 
 # ------------------------------------------------------------------------------------------ neighbourhoods
@@ -114,7 +136,7 @@ def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float,
 
 
 def scores(real, generated, k) -> list[tuple]:
-    found = neighbourhoods(real, generated, k)
+    found = compute_neighbourhoods(real, generated, k)
     return [(one.precision, one.recall, one.density, one.coverage) for one in found]
 
 
@@ -133,10 +155,10 @@ def test_neighborhood_scores_equal_brute_force(seed, monkeypatch):
     elif seed % 3 == 2:  # without dominant axes the filter uses all features
         monkeypatch.setattr(neighbours, "BASIS_SAMPLES", 20)
         real, generated = rng.normal(size=(90, 50)), rng.normal(0.05, 0.98, size=(70, 50))
-        assert not prepare(real, generated, (3,))[0].rest.any()
+        assert not prepare_features(real, generated, (3,))[0].rest.any()
     else:
         real, generated = clustered(rng, 90, 60, 0).astype(np.float32), clustered(rng, 130, 60, 0.3).astype(np.float32)
-        assert len(principal_axes(real, generated).axes) < 30
+        assert len(compute_principal_axes(real, generated).axes) < 30
     for k, got in zip((1, 3, 5), scores(real, generated, (1, 3, 5)), strict=True):
         assert got == brute_force(real, generated, k)
         assert 0 < got[0] <= 1 and 0 < got[1] <= 1
@@ -164,8 +186,8 @@ def test_neighborhood_scores_include_border_of_ball():
 def test_neighborhood_of_duplicates_contains_copies():
     rng = np.random.default_rng(7)
     real = np.repeat(rng.normal(size=(5, 16)) * 1e3, 4, axis=0)  # every sample four times: radius 0 at k = 3
-    side = short_vectors(real, principal_axes(real, real))
-    np.testing.assert_array_equal(ball_radii(side, range(20), [3]), 0)
+    side = project_to_axes(real, compute_principal_axes(real, real))
+    np.testing.assert_array_equal(compute_ball_radii(side, range(20), [3]), 0)
     assert scores(real, real[::4].repeat(4, axis=0), [3])[0][:2] == (1, 1)
     assert scores(real, real + 1e-3, [3])[0] == (0, 0, 0, 0)
 
@@ -180,8 +202,8 @@ def test_nearest_returns_neighbors_in_order(monkeypatch):
     rng = np.random.default_rng(9)
     a, b = clustered(rng, 50, 40, 0), clustered(rng, 80, 40, 0)
     b[30] = b[60]  # equal distances: the lower index first
-    basis = principal_axes(a, b)
-    squared, index = nearest(short_vectors(a, basis), short_vectors(b, basis), range(10, 50), 4)
+    basis = compute_principal_axes(a, b)
+    squared, index = find_nearest(project_to_axes(a, basis), project_to_axes(b, basis), range(10, 50), 4)
     every = np.array([[np.square(p - q).sum() for q in b] for p in a[10:]])
     assert np.array_equal(index, np.argsort(every, axis=1, kind="stable")[:, :4])
     np.testing.assert_allclose(squared, np.sort(every, axis=1)[:, :4], rtol=1e-12)
@@ -205,17 +227,17 @@ def literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
 def test_kernel_distance_equals_literal_version(monkeypatch):
     rng = np.random.default_rng(10)
     x, y = rng.normal(size=(40, 8)), rng.normal(0.4, 1.2, size=(50, 8))
-    got = kernel_distance(x, y)
+    got = compute_kernel_distance(x, y)
     assert got.value == pytest.approx(literal_kernel_distance(x, y), rel=1e-9)
     assert got.low < got.value < got.high
     monkeypatch.setattr(kernel_distance_module, "GROUP_SAMPLES", 20)
     halves = [literal_kernel_distance(x[k::2], y[k::2]) for k in range(2)]
-    assert kernel_distance(x, y).value == pytest.approx(np.mean(halves), rel=1e-9)
+    assert compute_kernel_distance(x, y).value == pytest.approx(np.mean(halves), rel=1e-9)
 
 
 def test_kernel_distance_of_equal_sources_contains_zero():
     rng = np.random.default_rng(11)
-    got = kernel_distance(*rng.normal(size=(2, 300, 16)))
+    got = compute_kernel_distance(*rng.normal(size=(2, 300, 16)))
     assert got.low < 0 < got.high
 
 
@@ -229,15 +251,18 @@ def test_intervals_have_stated_coverage():
     for _ in range(200):
         objects = rng.poisson(5, 150) + 1
         bad = rng.binomial(objects, 0.2)
-        mean, share = mean_estimate(rng.exponential(2, 150)), ratio_estimates(bad[:, None], objects[:, None])[0]
+        mean, share = estimate_mean(rng.exponential(2, 150)), estimate_ratios(bad[:, None], objects[:, None])[0]
         held += [mean.low <= 2 <= mean.high, share.low <= 0.2 <= share.high]
     assert (np.abs(held / 200 - 0.95) < 0.045).all()
 
 
 def both_influences(real: np.ndarray, generated: np.ndarray) -> list[np.ndarray]:
-    a, b = moments(real), moments(generated)
-    maps = influence_maps(b, transport(a, b))
-    return [frechet_influence(real, a, b.mean, maps[0]), frechet_influence(generated, b, a.mean, maps[1])]
+    a, b = compute_moments(real), compute_moments(generated)
+    maps = compute_influence_maps(b, compute_transport(a, b))
+    return [
+        compute_frechet_influence(real, a, b.mean, maps[0]),
+        compute_frechet_influence(generated, b, a.mean, maps[1]),
+    ]
 
 
 def test_frechet_interval_matches_spread_of_distance():
@@ -247,14 +272,14 @@ def test_frechet_interval_matches_spread_of_distance():
     def draw() -> tuple[np.ndarray, np.ndarray]:
         return rng.normal(size=(400, 24)) * scale, rng.normal(0.2, 1.2, size=(400, 24)) * scale
 
-    repeated = [frechet_distance(*map(moments, draw())) for _ in range(60)]
+    repeated = [compute_frechet_distance(*map(compute_moments, draw())) for _ in range(60)]
     widths = []
     for _ in range(5):
         real, generated = draw()
-        a, b = moments(real), moments(generated)
-        between = transport(a, b)
+        a, b = compute_moments(real), compute_moments(generated)
+        between = compute_transport(a, b)
         influences = both_influences(real, generated)
-        got = moved(frechet_distance(a, b, between), influences)
+        got = estimate_from_influence(compute_frechet_distance(a, b, between), influences)
         assert got.low < got.value < got.high
         widths.append(got.high - got.low)
     assert np.mean(widths) == pytest.approx(2 * 1.96 * np.std(repeated), rel=0.25)
@@ -264,7 +289,7 @@ def test_influences_are_derivatives_of_frechet_distance():
     """Compares with finite differences of moments moved towards one sample."""
     rng = np.random.default_rng(14)
     real, generated = rng.normal(size=(600, 5)), rng.normal(0.5, 1.5, size=(700, 5))
-    a, b = moments(real), moments(generated)
+    a, b = compute_moments(real), compute_moments(generated)
     influences = both_influences(real, generated)
 
     def towards(side: Moments, sample: np.ndarray, share: float) -> Moments:
@@ -274,9 +299,9 @@ def test_influences_are_derivatives_of_frechet_distance():
 
     share = 1e-6
     for i in (0, 17, 300):
-        slope = (frechet_distance(towards(a, real[i], share), b) - frechet_distance(a, b)) / share
+        slope = (compute_frechet_distance(towards(a, real[i], share), b) - compute_frechet_distance(a, b)) / share
         assert slope == pytest.approx(influences[0][i], rel=1e-3, abs=0.02)
-        slope = (frechet_distance(a, towards(b, generated[i], share)) - frechet_distance(a, b)) / share
+        slope = (compute_frechet_distance(a, towards(b, generated[i], share)) - compute_frechet_distance(a, b)) / share
         assert slope == pytest.approx(influences[1][i], rel=1e-3, abs=0.02)
 
 
@@ -285,24 +310,24 @@ def test_scores_reject_invalid_features():
     broken = x.copy()
     broken[3, 1] = np.nan
     with pytest.raises(ValueError, match="hold 3 samples, at least 4"):
-        neighbourhoods(x[:3], x, k=[3])
+        compute_neighbourhoods(x[:3], x, k=[3])
     with pytest.raises(ValueError, match=r"generated features hold NaN .* first 3"):
-        neighbourhoods(x, broken)
+        compute_neighbourhoods(x, broken)
     with pytest.raises(ValueError, match="real features have 4 dimensions, generated 3"):
-        neighbourhoods(x, x[:, :3])
+        compute_neighbourhoods(x, x[:, :3])
     with pytest.raises(ValueError, match="k must name"):
-        neighbourhoods(x, x, k=[0])
+        compute_neighbourhoods(x, x, k=[0])
     with pytest.raises(ValueError, match="at least 2"):
-        kernel_distance(x, x[:1])
+        compute_kernel_distance(x, x[:1])
     with pytest.raises(ValueError, match="NaN"):
-        moments(broken)
+        compute_moments(broken)
     with pytest.raises(ValueError, match="4 and 3 dimensions"):
-        frechet_distance(moments(x), moments(x[:, :3]))
+        compute_frechet_distance(compute_moments(x), compute_moments(x[:, :3]))
     with pytest.raises(ValueError, match="4 and 3 dimensions"):
-        moments(x) + moments(x[:, :3])
+        compute_moments(x) + compute_moments(x[:, :3])
     with pytest.raises(ValueError, match="at least 2 samples"):
-        frechet_distance(moments(x), moments(x[:1]))
+        compute_frechet_distance(compute_moments(x), compute_moments(x[:1]))
     with pytest.raises(ValueError, match=r"\(samples, dimensions\)"):
-        moments(x[0])
+        compute_moments(x[0])
     with pytest.raises(ValueError, match="NaN"):
-        inception_score(broken)
+        compute_inception_score(broken)

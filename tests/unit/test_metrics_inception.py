@@ -15,11 +15,11 @@ from safetensors import safe_open
 from pipelines.metrics import inception
 from pipelines.metrics.inception import (
     Inception,
-    inception_features,
+    compute_inception_features,
+    compute_random_features,
+    describe_weights,
     load_inception,
-    random_features,
     resize_like_tensorflow1,
-    weights_line,
 )
 
 
@@ -179,7 +179,7 @@ def test_inception_features_equal_literal_forward_pass(network):
     assert x.shape == (1, 2048, 8, 8)
     expected = x.mean((2, 3))
 
-    pool3, _, logits = inception_features(network, images)
+    pool3, _, logits = compute_inception_features(network, images)
     scale = expected.abs().max().item()
     assert expected.std().item() > 0.01 * scale  # activations do not vanish
     np.testing.assert_allclose(pool3, expected, atol=1e-4 * scale)
@@ -213,18 +213,18 @@ def test_inception_resize_equals_tensorflow(height, width, size):
 
 def test_inception_features_are_independent_of_batch(network):
     images = pictures(3)
-    together = inception_features(network, images, batch_size=3)
-    alone = inception_features(network, images, batch_size=1)
+    together = compute_inception_features(network, images, batch_size=3)
+    alone = compute_inception_features(network, images, batch_size=1)
     for got, expected in zip(together, alone, strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)
-    assert [part.shape for part in inception_features(network, images[:0])] == [(0, 2048), (0, 2023), (0, 1008)]
+    assert [part.shape for part in compute_inception_features(network, images[:0])] == [(0, 2048), (0, 2023), (0, 1008)]
 
 
 def test_inception_spatial_features_are_mixed_6_channels_last(network):
     """TensorFlow flattens row, column, channel: the order of the moments of ADM's reference batches."""
     maps = []
     hook = network.Mixed_6d.branch1x1.register_forward_hook(lambda module, inputs, output: maps.append(output))
-    spatial = inception_features(network, pictures()).spatial
+    spatial = compute_inception_features(network, pictures()).spatial
     hook.remove()
     assert maps[0].shape == (2, 192, 17, 17) and maps[0].min() == 0  # after the ReLU
     for row, column, channel in ((0, 0, 0), (0, 0, 6), (0, 1, 0), (3, 5, 2), (16, 16, 6)):
@@ -252,7 +252,9 @@ def golden_difference(network: Inception) -> dict[str, float]:
         getattr(network, module).register_forward_hook(lambda m, i, x, layer=layer: layers[layer].append(x))
         for layer, module in (("64", "Conv2d_2b_3x3"), ("192", "Conv2d_4a_3x3"), ("768", "Mixed_6e"))
     ]
-    features = [inception_features(network, golden_recipe.picture(k)[None]) for k in range(len(golden_recipe.PICTURES))]
+    features = [
+        compute_inception_features(network, golden_recipe.picture(k)[None]) for k in range(len(golden_recipe.PICTURES))
+    ]
     for hook in hooks:
         hook.remove()
     got = {"2048": "pool3", "spatial": "spatial", "logits_unbiased": "logits"}
@@ -309,12 +311,12 @@ def test_inception_loads_pth_and_safetensors(network, tmp_path):
     torch.save(state, tmp_path / "weights.pth")
     safetensors.torch.save_file(state, tmp_path / "weights.safetensors")
     images = pictures(1)
-    expected = inception_features(network, images)
+    expected = compute_inception_features(network, images)
     for name in ("weights.pth", "weights.safetensors"):
         with pytest.warns(UserWarning, match="no score of theirs compares with published ones"):
             loaded = load_inception(tmp_path / name)
         assert loaded.weights_sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-        for got, want in zip(inception_features(loaded, images), expected, strict=True):
+        for got, want in zip(compute_inception_features(loaded, images), expected, strict=True):
             np.testing.assert_array_equal(got, want)
 
 
@@ -341,9 +343,9 @@ def test_inception_recognizes_published_weights_by_sha(network, tmp_path, monkey
     path = tmp_path / "mine.pth"
     torch.save(network.state_dict(), path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert f"{path}, sha256 {sha256}: not weights-inception-2015-12-05-6726825d.pth" in weights_line(path)
+    assert f"{path}, sha256 {sha256}: not weights-inception-2015-12-05-6726825d.pth" in describe_weights(path)
     monkeypatch.setattr(inception, "KNOWN_SHA256", sha256)
-    assert weights_line(path) == f"Inception weights {path}, sha256 {sha256}: the published ones"
+    assert describe_weights(path) == f"Inception weights {path}, sha256 {sha256}: the published ones"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_inception(path).weights_sha256 == sha256
@@ -353,7 +355,7 @@ def test_inception_gpu_convolutions_use_full_precision(network):
     allowed = []
     hook = network.Mixed_7c.register_forward_hook(lambda *_: allowed.append(torch.backends.cudnn.allow_tf32))
     before = torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled
-    inception_features(network, pictures(1))
+    compute_inception_features(network, pictures(1))
     hook.remove()
     assert allowed == [False]
     assert (torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled) == before
@@ -361,7 +363,7 @@ def test_inception_gpu_convolutions_use_full_precision(network):
 
 def test_inception_rejects_images_of_another_kind(network):
     with pytest.raises(ValueError, match="uint8"):
-        inception_features(network, pictures().astype(np.float32))
+        compute_inception_features(network, pictures().astype(np.float32))
     with pytest.raises(ValueError, match="uint8"):
         network(torch.zeros(1, 3, 8, 8, dtype=torch.uint8))
 
@@ -371,15 +373,15 @@ def test_inception_rejects_images_of_another_kind(network):
 
 def test_random_features_are_fixed_finite_and_discriminative():
     images = pictures(5)
-    features = random_features(images)
+    features = compute_random_features(images)
     assert features.shape == (5, 480) and np.isfinite(features).all()
-    np.testing.assert_array_equal(features, random_features(images))
-    np.testing.assert_allclose(features, random_features(images, batch_size=2), atol=1e-5)
-    assert np.abs(features - random_features(images, seed=1)).max() > 0.01
+    np.testing.assert_array_equal(features, compute_random_features(images))
+    np.testing.assert_allclose(features, compute_random_features(images, batch_size=2), atol=1e-5)
+    assert np.abs(features - compute_random_features(images, seed=1)).max() > 0.01
     black, white = np.zeros_like(images), np.full_like(images, 255)
-    assert np.abs(random_features(black) - random_features(white)).max() > 0.1
+    assert np.abs(compute_random_features(black) - compute_random_features(white)).max() > 0.1
     # Fixed, so that results of older reports remain comparable.
     np.testing.assert_allclose(
-        random_features(white[:1])[0, [0, 100, 300, 479]], [2.72897, 0.675502, 0.103905, 1.17206], rtol=1e-4
+        compute_random_features(white[:1])[0, [0, 100, 300, 479]], [2.72897, 0.675502, 0.103905, 1.17206], rtol=1e-4
     )
-    assert random_features(images[:0]).shape == (0, 480)
+    assert compute_random_features(images[:0]).shape == (0, 480)

@@ -13,10 +13,10 @@ from golden.golden_recipe import GOLDEN, feature_sets, logits
 from safetensors import safe_open
 
 from pipelines.metrics import inception_score as inception_score_module
-from pipelines.metrics.frechet import frechet_distance, moments
-from pipelines.metrics.inception_score import inception_score
-from pipelines.metrics.kernel_distance import kernel_distance
-from pipelines.metrics.neighbours import neighbourhoods
+from pipelines.metrics.frechet import compute_frechet_distance, compute_moments
+from pipelines.metrics.inception_score import compute_inception_score
+from pipelines.metrics.kernel_distance import compute_kernel_distance
+from pipelines.metrics.neighbours import compute_neighbourhoods
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def torch_fidelity() -> dict[str, float]:
 
 
 def fid(real: np.ndarray, generated: np.ndarray) -> float:
-    return frechet_distance(moments(real), moments(generated))
+    return compute_frechet_distance(compute_moments(real), compute_moments(generated))
 
 
 # ------------------------------------------------------------------------- ADM's formulas (evaluations/evaluator.py)
@@ -73,7 +73,7 @@ def test_scores_equal_adm(seed):
     real, generated = walks(seed, 400, 48), walks(seed + 10, 250, 48)
     exact = real.astype(np.float64), generated.astype(np.float64)
     assert fid(real, generated) == pytest.approx(adm_frechet(*exact), rel=1e-6)
-    found = neighbourhoods(real, generated, k=(1, 3, 5))
+    found = compute_neighbourhoods(real, generated, k=(1, 3, 5))
     assert [(r.precision, r.recall) for r in found] == [adm_precision_recall(*exact, k) for k in (1, 3, 5)]
     assert 0 < found[1].precision < 1 and 0 < found[1].recall < 1
 
@@ -81,11 +81,11 @@ def test_scores_equal_adm(seed):
 def test_inception_score_of_chunks_equals_adm(monkeypatch):
     rng = np.random.default_rng(4)
     scores = rng.normal(0, 2, (12_000, 10)) + 3 * np.eye(10)[np.sort(rng.integers(0, 10, 12_000))]  # in class order
-    in_chunks = inception_score(scores).value
+    in_chunks = compute_inception_score(scores).value
     assert in_chunks == pytest.approx(adm_inception_score(scores), rel=1e-6)
     # The chunks matter: sorted samples score less in chunks than together.
     monkeypatch.setattr(inception_score_module, "SPLIT_SAMPLES", 12_000)
-    assert inception_score(scores).value > 1.1 * in_chunks
+    assert compute_inception_score(scores).value > 1.1 * in_chunks
 
 
 def test_adm_half_precision_shifts_precision_recall_below_0_01():
@@ -100,7 +100,7 @@ def test_adm_half_precision_shifts_precision_recall_below_0_01():
     moved = []
     for seed in (7, 8, 9):
         real, generated = (np.abs(walks(s, 500, 256)) / 10 for s in (seed, seed + 50))
-        exact = neighbourhoods(real, generated, k=[3])[0]
+        exact = compute_neighbourhoods(real, generated, k=[3])[0]
         between = distances(real, generated)
         real_radii, generated_radii = (np.sort(distances(side, side), axis=1)[:, 3] for side in (real, generated))
         moved.append((between <= real_radii[:, None]).any(axis=0).mean() - exact.precision)
@@ -122,17 +122,17 @@ def test_frechet_distance_equals_torch_fidelity(torch_fidelity):
 def test_inception_score_equals_torch_fidelity_on_same_splits(torch_fidelity, monkeypatch):
     """One split: ADM's score of up to 5000 samples. Ten shuffled ones, its default: 5 % less for these 300."""
     one, ten = (torch_fidelity[f"isc_{splits}.inception_score_mean"] for splits in (1, 10))
-    assert inception_score(logits()).value == pytest.approx(one, rel=1e-6)
+    assert compute_inception_score(logits()).value == pytest.approx(one, rel=1e-6)
     shuffled = logits()[np.random.RandomState(2020).permutation(300)]
     monkeypatch.setattr(inception_score_module, "SPLIT_SAMPLES", 30)
-    assert inception_score(shuffled).value == pytest.approx(ten, rel=1e-6)
+    assert compute_inception_score(shuffled).value == pytest.approx(ten, rel=1e-6)
     assert ten == pytest.approx(0.95 * one, rel=0.01)
 
 
 def test_precision_and_recall_equal_torch_fidelity(torch_fidelity):
     real, generated = feature_sets()
     for name, samples in (("prc_{}", generated), ("prc_{}_few", generated[:20])):
-        for found in neighbourhoods(real, samples, k=(1, 3, 5)):
+        for found in compute_neighbourhoods(real, samples, k=(1, 3, 5)):
             theirs = {key: torch_fidelity[f"{name.format(found.k)}.{key}"] for key in ("precision", "recall")}
             # torch-fidelity averages in float32.
             assert found.precision == pytest.approx(theirs["precision"], rel=1e-6)
@@ -155,7 +155,7 @@ def test_kid_of_all_samples_equals_torch_fidelity(torch_fidelity):
     """torch-fidelity draws random subsets, ours use each sample once: both are equal for a single group."""
     real, generated = feature_sets()
     whole = torch_fidelity["kid_all.kernel_inception_distance_mean"]
-    assert kernel_distance(real, generated).value == pytest.approx(whole, rel=1e-5)
+    assert compute_kernel_distance(real, generated).value == pytest.approx(whole, rel=1e-5)
     random = np.random.RandomState(2020)
     subsets = [
         polynomial_kid(generated[random.choice(300, 100, replace=False)], real[random.choice(300, 100, replace=False)])

@@ -7,27 +7,27 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.geometry.iou3d import boxes_of, ellipsoid_iou3d_matrix, iou3d_matrix
+from models.geometry.iou3d import compute_ellipsoid_iou3d_matrix, compute_iou3d_matrix, extract_boxes
 from models.layout import LayoutSpec
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, yaw_rotation
-from models.tensors import layout_batch
-from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelise
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
+from models.tensors import make_layout_batch
+from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.metrics.reconstruction import (
     MEMORY,
     SCORED,
     THRESHOLDS,
-    average_precision,
-    detection_scores,
-    ground_scores,
-    ground_sums,
+    compute_average_precision,
+    compute_detection_scores,
+    compute_ground_scores,
+    compute_pair_scores,
+    compute_voxel_confusion,
+    compute_voxel_scores,
     join_matches,
     match_greedily,
     match_scene,
-    memory_bytes,
-    pair_scores,
-    pair_sums,
-    voxel_confusion,
-    voxel_scores,
+    measure_memory_bytes,
+    sum_ground,
+    sum_pairs,
 )
 from pipelines.schema.palette import CLASS_ID
 
@@ -42,7 +42,7 @@ def scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scen
         "a", "town", "0", 0, "test",
         category=np.asarray(category, np.int8),
         center_m=np.asarray(center_m, np.float32).reshape(n, 3),
-        rotation=yaw_rotation(np.zeros(n) if yaw_rad is None else yaw_rad).astype(np.float32),
+        rotation=make_yaw_rotation(np.zeros(n) if yaw_rad is None else yaw_rad).astype(np.float32),
         size_m=np.ones((n, 3), np.float32) if size_m is None else np.asarray(size_m, np.float32),
         ground_classes=KITTI_GROUND_CLASSES, height_m=ground, occupied=ground > 0, grid=GRID,
         existence=None if existence is None else np.asarray(existence, np.float32),
@@ -51,7 +51,7 @@ def scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scen
 
 def scores(truths: list[Scene], predictions: list[Scene], **options):
     parts = [match_scene(t, p) for t, p in zip(truths, predictions, strict=True)]
-    return detection_scores(join_matches(parts), **options)
+    return compute_detection_scores(join_matches(parts), **options)
 
 
 # ------------------------------------------------------------------------------------------ the literal version
@@ -67,7 +67,7 @@ def literal_ap(
         for truth, prediction in zip(truths, predictions, strict=True):
             real, found = truth.select(truth.category == c), prediction.select(prediction.category == c)
             order = sorted(range(len(found)), key=lambda i: -found.existence[i])[:max_detections]
-            iou = iou3d_matrix(boxes_of(found), boxes_of(real))
+            iou = compute_iou3d_matrix(extract_boxes(found), extract_boxes(real))
             num_truths += len(real)
             taken = set()
             for d in order:
@@ -133,7 +133,7 @@ def test_ap3d_records_join_in_any_grouping():
     truths, predictions = random_dataset(np.random.default_rng(7))
     parts = [match_scene(t, p) for t, p in zip(truths, predictions, strict=True)]
     grouped = join_matches([join_matches(parts[:2]), parts[2], join_matches(parts[3:])])
-    assert detection_scores(grouped) == detection_scores(join_matches(parts))
+    assert compute_detection_scores(grouped) == compute_detection_scores(join_matches(parts))
 
 
 # -------------------------------------------------------------------------------------------------- hand-computed cases
@@ -202,7 +202,7 @@ def test_ap3d_matches_best_free_truth_and_later_of_ties():
     leaves_the_first_free = np.array([[0.5, 0.5], [0.6, 0.2]])
     np.testing.assert_array_equal(match_greedily(leaves_the_first_free, np.array([0.3])), [[True], [True]])
     assert match_greedily(np.zeros((2, 0))).shape == (2, 10)
-    assert average_precision(np.zeros((0, 10), bool), 3).tolist() == [0] * 10
+    assert compute_average_precision(np.zeros((0, 10), bool), 3).tolist() == [0] * 10
 
 
 def test_ap3d_rejects_nan_existence():
@@ -222,7 +222,9 @@ def random_rasters(rng, shape=(3, 2, 5, 6)):
 def test_ground_scores_equal_plain_loops():
     true_occupied, true_height_m, occupied, height_m = random_rasters(np.random.default_rng(0))
     bounds_m = np.array([[-5.0, 5.0], [-2.0, 8.0]])
-    got = ground_scores(ground_sums(true_occupied, true_height_m, occupied, height_m), ("road", "terrain"), bounds_m)
+    got = compute_ground_scores(
+        sum_ground(true_occupied, true_height_m, occupied, height_m), ("road", "terrain"), bounds_m
+    )
     both, either, errors, normalised = [0, 0], [0, 0], [[], []], []
     for s, c, row, col in np.ndindex(true_occupied.shape):
         real, found = true_occupied[s, c, row, col], occupied[s, c, row, col]
@@ -249,8 +251,8 @@ def test_ground_scores_equal_plain_loops():
 
 def test_ground_sums_of_scenes_equal_those_of_stack():
     rasters = random_rasters(np.random.default_rng(1))
-    one_by_one = [ground_sums(*(part[s] for part in rasters)) for s in range(3)]
-    total, stacked = one_by_one[0] + one_by_one[1] + one_by_one[2], ground_sums(*rasters)
+    one_by_one = [sum_ground(*(part[s] for part in rasters)) for s in range(3)]
+    total, stacked = one_by_one[0] + one_by_one[1] + one_by_one[2], sum_ground(*rasters)
     for field in dataclasses.fields(total):
         np.testing.assert_allclose(getattr(total, field.name), getattr(stacked, field.name), rtol=1e-12)
 
@@ -258,24 +260,24 @@ def test_ground_sums_of_scenes_equal_those_of_stack():
 def test_ground_scores_of_perfect_ground_and_absent_class():
     true_occupied, true_height_m, _, _ = random_rasters(np.random.default_rng(2))
     true_occupied[:, 1] = False
-    got = ground_scores(
-        ground_sums(true_occupied, true_height_m, true_occupied, true_height_m), ("road", "terrain"), (-5, 5)
+    got = compute_ground_scores(
+        sum_ground(true_occupied, true_height_m, true_occupied, true_height_m), ("road", "terrain"), (-5, 5)
     )
     assert got.class_iou == {"road": 1.0} and got.mean_iou == got.iou == 1 and got.height_mse == 0
 
 
 def test_ground_scores_reject_missing_truth_bad_bounds_and_nan():
     rasters = random_rasters(np.random.default_rng(3))
-    empty = ground_sums(np.zeros_like(rasters[0]), *rasters[1:])
+    empty = sum_ground(np.zeros_like(rasters[0]), *rasters[1:])
     with pytest.raises(ValueError, match="at least one truly occupied pixel"):
-        ground_scores(empty, ("road", "terrain"), (-5, 5))
+        compute_ground_scores(empty, ("road", "terrain"), (-5, 5))
     with pytest.raises(ValueError, match="bounds"):
-        ground_scores(ground_sums(*rasters), ("road", "terrain"), (5, 5))
+        compute_ground_scores(sum_ground(*rasters), ("road", "terrain"), (5, 5))
     rasters[3][rasters[0]] = np.nan
     with pytest.raises(ValueError, match="NaN"):
-        ground_sums(*rasters)
+        sum_ground(*rasters)
     with pytest.raises(ValueError, match="differ in shape"):
-        ground_sums(*rasters[:3], rasters[3][:2])
+        sum_ground(*rasters[:3], rasters[3][:2])
 
 
 # ------------------------------------------------------------------------------------------ matched primitives
@@ -299,10 +301,10 @@ def test_pairs_equal_best_assignment(seed):
     found = dataclasses.replace(
         truth.select(kept), center_m=truth.center_m[kept] + rng.normal(0, 0.5, (12, 3)).astype(np.float32)
     )
-    got = pair_sums(truth, found)
+    got = sum_pairs(truth, found)
     for c in (CAR, POLE, ELLIPSOID):
-        sides = [boxes_of(side.select(side.category == c)) for side in (found, truth)]
-        iou = (ellipsoid_iou3d_matrix if c == ELLIPSOID else iou3d_matrix)(*sides)
+        sides = [extract_boxes(side.select(side.category == c)) for side in (found, truth)]
+        iou = (compute_ellipsoid_iou3d_matrix if c == ELLIPSOID else compute_iou3d_matrix)(*sides)
         pairs, total = best_pairs(iou) if iou.size else (0, 0.0)
         assert got.pairs[c] == pairs and got.iou[c] == pytest.approx(total)
         assert (got.truths[c], got.predictions[c]) == (len(iou.T), len(iou))
@@ -311,8 +313,8 @@ def test_pairs_equal_best_assignment(seed):
 def test_pair_scores_equal_hand_computed():
     truth = scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
     found = scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D 1/3, nothing, 1
-    sums = pair_sums(truth, found)
-    got = pair_scores(sums + sums)
+    sums = sum_pairs(truth, found)
+    got = compute_pair_scores(sums + sums)
     assert got.mean_iou3d == pytest.approx(1 / 3) and got.truth_iou3d == pytest.approx(1 / 9)
     assert got.found == pytest.approx(1 / 3) and got.right == pytest.approx(1 / 2)  # of boxes: three true, two found
     assert got.category_mean_iou3d == pytest.approx({"vehicle_small": 1 / 3, "vegetation_ellipsoid": 1})
@@ -322,10 +324,10 @@ def test_pair_scores_equal_hand_computed():
 
 def test_pair_scores_without_pairs_or_truths_are_undefined():
     nothing = scene([], [])
-    got = pair_scores(pair_sums(scene([CAR], CENTERS[:1]), nothing))
+    got = compute_pair_scores(sum_pairs(scene([CAR], CENTERS[:1]), nothing))
     assert got.mean_iou3d is None and got.right is None and got.found == got.truth_iou3d == 0
     with pytest.raises(ValueError, match="no scored category"):
-        pair_scores(pair_sums(nothing, scene([CAR], CENTERS[:1])))
+        compute_pair_scores(sum_pairs(nothing, scene([CAR], CENTERS[:1])))
 
 
 # ------------------------------------------------------------------------------------------ voxels
@@ -334,11 +336,11 @@ def test_pair_scores_without_pairs_or_truths_are_undefined():
 def test_voxel_scores_equal_plain_counting():
     rng = np.random.default_rng(0)
     truth, found = rng.choice([0, 0, 0, 1, 5, 9, 17], (2, 3, 12, 11, 10)).astype(np.uint8)
-    confusion = sum(voxel_confusion(t, f) for t, f in zip(truth, found, strict=True))
-    np.testing.assert_array_equal(confusion, voxel_confusion(truth, found))
+    confusion = sum(compute_voxel_confusion(t, f) for t, f in zip(truth, found, strict=True))
+    np.testing.assert_array_equal(confusion, compute_voxel_confusion(truth, found))
     assert confusion.shape == (NUM_CLASSES, NUM_CLASSES) and confusion.sum() == truth.size
     assert confusion[5, 9] == ((truth == 5) & (found == 9)).sum()
-    got = voxel_scores(confusion)
+    got = compute_voxel_scores(confusion)
     assert got.iou == pytest.approx(((truth > 0) & (found > 0)).sum() / ((truth > 0) | (found > 0)).sum())
     names = {name: k for name, k in CLASS_ID.items() if k in (1, 5, 9, 17)}
     literal = {n: ((truth == k) & (found == k)).sum() / ((truth == k) | (found == k)).sum() for n, k in names.items()}
@@ -348,15 +350,15 @@ def test_voxel_scores_equal_plain_counting():
 
 def test_voxel_scores_of_equal_voxels_are_one_and_ignore_air():
     space = VoxelGrid(GRID, -2, 2, 8)
-    voxels = voxelise(scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
-    got = voxel_scores(voxel_confusion(voxels, voxels))
+    voxels = voxelize(scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
+    got = compute_voxel_scores(compute_voxel_confusion(voxels, voxels))
     assert got.iou == got.miou == 1 and set(got.class_iou) == {"vehicle_small", "pole"}
     nothing = np.zeros_like(voxels)
-    assert voxel_scores(voxel_confusion(voxels, nothing)).iou == 0
+    assert compute_voxel_scores(compute_voxel_confusion(voxels, nothing)).iou == 0
     with pytest.raises(ValueError, match="at least one filled voxel"):
-        voxel_scores(voxel_confusion(nothing, nothing))
+        compute_voxel_scores(compute_voxel_confusion(nothing, nothing))
     with pytest.raises(ValueError, match="differ in shape"):
-        voxel_confusion(voxels, nothing[:2])
+        compute_voxel_confusion(voxels, nothing[:2])
 
 
 # ------------------------------------------------------------------------------------------ memory
@@ -366,7 +368,7 @@ def test_layout_memory_equals_paper():
     """2.50 MB of rasters, 0.02 MB of primitives; voxels of four bytes 8.00 MB (paper, Sec. 4.2 and Tab. 1)."""
     truth, spec = random_scene(0, n=40), LayoutSpec()
     latent = np.zeros((64, 32, 32), np.float32)
-    got = memory_bytes(layout_batch([truth], spec), latent, voxelise(truth, VoxelGrid()))
+    got = measure_memory_bytes(make_layout_batch([truth], spec), latent, voxelize(truth, VoxelGrid()))
     found = dict(zip(MEMORY, (got / 2**20).round(2), strict=True))
     assert found["rasters"] == 2.50 and found["vectors"] == 0.02
     assert found["voxels_32_bit"] == 8.00 and found["voxels"] == 2.00 and found["latent"] == 0.25

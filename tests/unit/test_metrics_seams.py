@@ -6,11 +6,22 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.pipeline import Resampling
+from models.sampling.repaint import RePaintConfig
 from models.scene import CATEGORY_INDEX, Grid
-from pipelines.evaluation.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
+from pipelines.evaluation.seam_sweep import (
+    build_seam_table,
+    count_objects_per_ha,
+    make_seam_row,
+    render_seam_sweep_html,
+)
 from pipelines.metrics.intervals import Estimate
-from pipelines.metrics.seams import MEASURES, footprint_ranges, neighbours, seam_ratios, seam_record
+from pipelines.metrics.seams import (
+    MEASURES,
+    compute_footprint_ranges,
+    estimate_seam_ratios,
+    list_parallel_lines,
+    measure_scene_seams,
+)
 
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
@@ -48,7 +59,7 @@ def with_cars(scene, centers_xy_m, size_m=(4.0, 2.0, 1.5)):
 
 
 def ratios(scenes, **lines) -> dict:
-    return seam_ratios(np.stack([seam_record(scene, **lines) for scene in scenes]))
+    return estimate_seam_ratios(np.stack([measure_scene_seams(scene, **lines) for scene in scenes]))
 
 
 def test_seam_ratio_of_invisible_seam_is_one():
@@ -85,26 +96,26 @@ def test_seam_scores_count_cut_and_duplicate_objects(axis):
     size = (4.0, 2.0) if axis == 0 else (2.0, 4.0)
     lines = {"rows": [128]} if axis == 0 else {"cols": [128]}
     ends = with_cars(speckled(0), [placed(2.0), placed(-2.1, 3)], (*size, 1.5))  # both end within 0.25 m of the line
-    assert seam_record(ends, **lines)[2, 0].tolist() == [2, 2]
+    assert measure_scene_seams(ends, **lines)[2, 0].tolist() == [2, 2]
     crosses = with_cars(speckled(0), [placed(0.5)], (*size, 1.5))
-    assert seam_record(crosses, **lines)[2, 0].tolist() == [0, 1]
+    assert measure_scene_seams(crosses, **lines)[2, 0].tolist() == [0, 1]
     twice = with_cars(speckled(0), [placed(0.6), placed(-0.6), placed(0.0, 8)], (*size, 1.5))
-    assert seam_record(twice, **lines)[3, 0].tolist() == [2, 3]
+    assert measure_scene_seams(twice, **lines)[3, 0].tolist() == [2, 3]
     same_side = with_cars(speckled(0), [placed(0.6), placed(0.7)], (*size, 1.5))
-    assert seam_record(same_side, **lines)[3, 0].tolist() == [0, 2]
+    assert measure_scene_seams(same_side, **lines)[3, 0].tolist() == [0, 2]
 
 
 def test_footprint_of_rotated_box_contains_corners():
     scene = random_scene(3, 50)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     corners = scene.center_m[:, None] + (0.5 * signs[None] * scene.size_m[:, None]) @ scene.rotation.transpose(0, 2, 1)
-    ranges = footprint_ranges(scene)
+    ranges = compute_footprint_ranges(scene)
     np.testing.assert_allclose(ranges[:, :, 0], corners.min(axis=1)[:, :2], atol=1e-4)
     np.testing.assert_allclose(ranges[:, :, 1], corners.max(axis=1)[:, :2], atol=1e-4)
 
 
 def test_reference_lines_avoid_every_seam():
-    near = neighbours([100, 130], 256, 0.25)  # 7.5 m apart
+    near = list_parallel_lines([100, 130], 256, 0.25)  # 7.5 m apart
     assert 115 not in near[100] and 84 in near[100] and 85 not in near[100] and 146 in near[100]
     assert min(abs(line - seam) for line in near[130] for seam in (100, 130)) == 16
     assert near[100].min() == 36
@@ -112,19 +123,19 @@ def test_reference_lines_avoid_every_seam():
 
 def test_seam_scores_reject_edge_seam_and_skip_empty_scene():
     with pytest.raises(ValueError, match="seam before pixel 256, expected 1 to 255"):
-        seam_record(speckled(0), rows=[256])
+        measure_scene_seams(speckled(0), rows=[256])
     empty = replace(speckled(0), occupied=np.zeros((5, 256, 256), bool))
-    assert set(seam_ratios(seam_record(empty, rows=[128])[None]).values()) == {None}
+    assert set(estimate_seam_ratios(measure_scene_seams(empty, rows=[128])[None]).values()) == {None}
     assert len(MEASURES) == 4
 
 
 def test_seam_sweep_row_has_cost_and_visibility():
     ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
     cars = with_cars(speckled(0), [(10, 0), (20, 3)])
-    assert objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice
-    row = seam_row(Resampling(), 200, 12.3, ratios)
+    assert count_objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice
+    row = make_seam_row(RePaintConfig(), 200, 12.3, ratios)
     assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
-    (cells,) = seam_table([row]).rows
+    (cells,) = build_seam_table([row]).rows
     assert cells[:8] == (250, 10, 10, 0.0, 1.0, 2410, 12, 200)
     assert cells[9] == "1.20 (1.00 to 1.50)" and cells[10] is None
-    assert "2410" in seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")
+    assert "2410" in render_seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")

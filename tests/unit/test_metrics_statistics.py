@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from models.scene import CATEGORIES, CATEGORY_INDEX, Grid, Scene
-from pipelines.metrics.frechet import frechet_distance, moments
+from pipelines.metrics.frechet import compute_frechet_distance, compute_moments
 from pipelines.metrics.statistics import (
-    layout_statistics,
-    standardised,
-    statistic_names,
+    compute_layout_statistics,
+    list_statistic_names,
+    standardize_statistics,
 )
 
 CAR, POLE = CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["pole"]
@@ -29,8 +29,10 @@ def scene(category, size_m) -> Scene:
 
 
 def test_layout_statistics_equal_hand_computed():
-    names = statistic_names(("road", "terrain"))
-    got = dict(zip(names, layout_statistics(scene([CAR, POLE, CAR], [[4, 2, 1], [1, 1, 6], [5, 2, 2]])), strict=True))
+    names = list_statistic_names(("road", "terrain"))
+    got = dict(
+        zip(names, compute_layout_statistics(scene([CAR, POLE, CAR], [[4, 2, 1], [1, 1, 6], [5, 2, 2]])), strict=True)
+    )
     assert got["num_vehicle_small"] == 2 and got["num_pole"] == 1 and got["num_human"] == 0
     assert got["vehicle_small_length_m"] == 4.5 and got["vehicle_small_height_m"] == 1.5
     assert got["pole_height_m"] == 6
@@ -39,12 +41,12 @@ def test_layout_statistics_equal_hand_computed():
 
 
 def test_layout_statistics_of_empty_scene():
-    got = layout_statistics(scene([], []))
+    got = compute_layout_statistics(scene([], []))
     assert (got[: len(CATEGORIES)] == 0).all() and got[-2] == 0.5
 
 
 def layout_frechet(reference, other) -> float:
-    return frechet_distance(*map(moments, standardised(reference, other)))
+    return compute_frechet_distance(*map(compute_moments, standardize_statistics(reference, other)))
 
 
 def test_layout_frechet_is_in_reference_deviations():

@@ -7,9 +7,9 @@ from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES, Grid, Scene
 from pipelines.metrics.validity import (
     LABEL_MEASURES,
     MEASURES,
-    label_fidelity,
-    scene_validity,
-    validity_rates,
+    compute_label_fidelity,
+    compute_scene_validity,
+    compute_validity_rates,
 )
 from pipelines.schema.density_labels import DensityThresholds
 
@@ -48,7 +48,7 @@ def town(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
 
 
 def measure(name: str, scene: Scene) -> tuple[float, float]:
-    return tuple(scene_validity(scene, SLAB_M)[MEASURES.index(name)])
+    return tuple(compute_scene_validity(scene, SLAB_M)[MEASURES.index(name)])
 
 
 def test_validity_overlap_counts_both_solid_objects_of_a_pair():
@@ -129,11 +129,11 @@ def test_road_connectivity_breaks_at_diagonal_and_skips_no_road():
 
 def test_validity_rates_pool_scenes_and_skip_absent_categories():
     good, bad = town([(CAR, 5.0, 4.0, 0)]), town([(CAR, 5.0, -4.0, 0), (CAR, 9.0, -4.0, 0), (CAR, 12.0, 4.0, 3)])
-    rates = validity_rates([scene_validity(good, SLAB_M), scene_validity(bad, SLAB_M)])
+    rates = compute_validity_rates([compute_scene_validity(good, SLAB_M), compute_scene_validity(bad, SLAB_M)])
     assert rates["off_road_vehicles"] == 0.5 and rates["floating"] == 0.25
     assert rates["buildings_on_road"] is None
     assert list(rates) == list(MEASURES)
-    assert set(validity_rates([]).values()) == {None}
+    assert set(compute_validity_rates([]).values()) == {None}
 
 
 def test_label_fidelity_compares_measured_and_stated_label():
@@ -141,9 +141,9 @@ def test_label_fidelity_compares_measured_and_stated_label():
     three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3: high; no car: low
     right = town(three_trees, vegetation_density="high", vehicle_density="low")
     wrong = town(three_trees, vegetation_density="high", vehicle_density="medium")
-    records = [label_fidelity(scene, many, many) for scene in (right, wrong)]
+    records = [compute_label_fidelity(scene, many, many) for scene in (right, wrong)]
     np.testing.assert_array_equal(records[0], [[1, 1], [1, 1], [1, 1]])
     np.testing.assert_array_equal(records[1], [[1, 1], [0, 1], [0, 1]])
-    assert validity_rates(records, LABEL_MEASURES) == dict(zip(LABEL_MEASURES, (1, 0.5, 0.5), strict=True))
+    assert compute_validity_rates(records, LABEL_MEASURES) == dict(zip(LABEL_MEASURES, (1, 0.5, 0.5), strict=True))
     with pytest.raises(ValueError, match="no density label"):
-        label_fidelity(town(three_trees), many, many)
+        compute_label_fidelity(town(three_trees), many, many)

@@ -13,13 +13,30 @@ from torch.nn import functional as F
 from models.batch import LayoutBatch
 from models.dit import DiT
 from models.layout import LayoutSpec
-from models.lvae import LayoutVAE, Posterior
-from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
-from models.tensors import compact_layout, layout_batch
-from models.training import Execution, Optimisation, Trainer, lvae_trainer, stacked_corruption
-from models.vae.ground import HEIGHT_WEIGHT, LOGITS_PER_PX, reach, signed_distance_px, smooth_maps
-from models.vae.losses import height_loss, kl_loss, lvae_loss, object_losses, occupancy_loss
-from models.vae.matching import MatchWeights, match
+from models.lvae import LayoutVAE
+from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
+from models.tensors import encode_layout, make_layout_batch
+from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
+from models.vae.config import nest_flat_options, override_options
+from models.vae.ground import (
+    HEIGHT_WEIGHT,
+    LOGITS_PER_PX,
+    compute_edge_reach_px,
+    compute_signed_distance_px,
+    compute_smooth_maps,
+)
+from models.vae.config import nest_flat_options, override_options
+from models.vae.losses import (
+    compute_height_loss,
+    compute_kl_loss,
+    compute_lvae_loss,
+    compute_object_losses,
+    compute_occupancy_loss,
+)
+from models.vae.config import nest_flat_options, override_options
+from models.vae.matching import MatchWeights, match_primitives
+from models.vae.config import nest_flat_options, override_options
+from models.vae.outputs import Posterior
 
 
 def millions(model) -> float:
@@ -28,7 +45,8 @@ def millions(model) -> float:
 
 def small_lvae(seed: int = 0, **options) -> LayoutVAE:
     torch.manual_seed(seed)
-    return LayoutVAE(layout=small_spec().to_dict(), **(LVAE_PRESETS["smoke"].architecture() | options))
+    options = override_options(LVAE_PRESETS["smoke"].architecture(), nest_flat_options(options))
+    return LayoutVAE(layout=small_spec().to_dict(), **options)
 
 
 def test_presets_have_parameter_counts_of_paper():
@@ -43,12 +61,12 @@ def test_presets_have_parameter_counts_of_paper():
 
 def test_presets_error_lists_known_names():
     with pytest.raises(ValueError, match="unknown preset 'tiny', expected one of: smoke, demo, town, kitti360, av2"):
-        preset(LVAE_PRESETS, "tiny")
+        find_preset(LVAE_PRESETS, "tiny")
 
 
 def test_object_encoder_ignores_padding_and_order():
     lvae, spec = small_lvae(), small_spec()
-    batch = layout_batch([random_scene(0), random_scene(1, n=0)], spec)
+    batch = make_layout_batch([random_scene(0), random_scene(1, n=0)], spec)
     latent = lvae.object_encoder(batch.features, batch.real)
     assert torch.isfinite(latent).all()
     assert torch.equal(latent[1], lvae.object_encoder.grid)  # an empty scene is the learnable grid
@@ -62,13 +80,13 @@ def test_object_encoder_ignores_padding_and_order():
 def test_object_encoder_writes_to_cell_under_center():
     lvae, spec = small_lvae(), small_spec()
     scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # far left corner
-    batch = layout_batch([scene], spec)
+    batch = make_layout_batch([scene], spec)
     change = (lvae.object_encoder(batch.features, batch.real)[0] - lvae.object_encoder.grid).abs().sum(0)
     assert change[0, 0] > 0 and change.sum() == change[0, 0]
 
 
 def test_layout_vae_latent_is_split():
-    lvae, batch = small_lvae(), layout_batch([random_scene(0)], small_spec())
+    lvae, batch = small_lvae(), make_layout_batch([random_scene(0)], small_spec())
     latent = lvae.encode(batch).mean
     changed = latent.clone()
     changed[:, latent.shape[1] // 2 :] += 1
@@ -99,7 +117,7 @@ def test_matching_reaches_optimum_of_padded_square_problem():
         logit = 3 * torch.randn(1, n, generator=generator)
         counts = [int(torch.randint(0, s + 1, (), generator=generator)) for s in slots]
         real = torch.cat([torch.arange(s) < c for s, c in zip(slots, counts, strict=True)])[None]
-        assignment = match(features, logit, truth, real, slots, slots)[0]
+        assignment = match_primitives(features, logit, truth, real, slots, slots)[0]
         start = 0
         for s, count in zip(slots, counts, strict=True):
             here = slice(start, start + s)
@@ -126,7 +144,7 @@ def test_matching_of_surplus_proposals_is_optimal():
     features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
     logit = torch.randn(1, 12, generator=generator)
     real = torch.tensor([[True, True, True, True, False]])
-    assignment = match(features, logit, truth, real, slots, proposals, weights)[0]
+    assignment = match_primitives(features, logit, truth, real, slots, proposals, weights)[0]
     scale = torch.tensor([24.0] * 3 + [3.0] * 6)
     for mine, theirs in ((range(7), (0, 1, 2)), (range(7, 12), (3,))):
 
@@ -141,7 +159,7 @@ def test_matching_of_surplus_proposals_is_optimal():
         assert np.isclose(cost(got), cost(best), atol=1e-5)
     assert (assignment >= 0).sum() == 4
     with pytest.raises(ValueError, match="not finite"):
-        match(features * float("nan"), logit, truth, real, slots, proposals)
+        match_primitives(features * float("nan"), logit, truth, real, slots, proposals)
 
 
 def test_cell_decoder_proposals_lie_around_their_cell():
@@ -170,11 +188,11 @@ def test_object_shortcut_is_equivariant_to_cell_shift():
 
 
 def test_init_from_data_starts_outputs_at_means():
-    batch = layout_batch([random_scene(i) for i in range(8)], small_spec())
+    batch = make_layout_batch([random_scene(i) for i in range(8)], small_spec())
     for decoder in ("detr", "cells"):
         lvae = small_lvae(decoder=decoder)
         before = lvae.decode(lvae.encode(batch).mean)
-        lvae.start_at(batch)
+        lvae.init_from_data(batch)
         after = lvae.decode(lvae.encode(batch).mean)
         mean = batch.occupied.mean(dim=(0, 2, 3))
         errors = [(o.occupancy_logit.sigmoid().mean(dim=(0, 2, 3)) - mean).abs().mean() for o in (before, after)]
@@ -189,7 +207,7 @@ def test_distance_transform_equals_scipy():
     inside = np.stack([rng.random((40, 30)) < share for share in (0.02, 0.5, 0.9, 0.0, 1.0)])
     inside[1] = ndimage.binary_opening(inside[1], iterations=1)
     for most in (1, 3, 6):
-        found = signed_distance_px(torch.from_numpy(inside), most).numpy()
+        found = compute_signed_distance_px(torch.from_numpy(inside), most).numpy()
         for mask, distance in zip(inside, found, strict=True):
             border = np.pad(mask, 50, mode="edge")  # ground beyond the crop is unknown
             to = [
@@ -205,19 +223,19 @@ def test_distance_transform_equals_scipy():
 
 
 def test_linear_init_is_optimal_with_unit_variance_codes():
-    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    batch = make_layout_batch([random_scene(i) for i in range(12)], small_spec())
     lvae = small_lvae(shortcut=True, latent_channels=16)
-    lvae.start_at(batch)
+    lvae.init_from_data(batch)
     cell = lvae.ground_encoder.shortcut.stride[0]
-    maps = smooth_maps(batch.height, batch.occupied, cell)
+    maps = compute_smooth_maps(batch.height, batch.occupied, cell)
     with torch.no_grad():
         code = lvae.ground_encoder.shortcut(maps)
         rebuilt = lvae.ground_decoder.shortcut(code)
     classes, pixels = batch.occupied.shape[1], maps.shape[1] * cell**2
     slope = torch.linalg.lstsq(maps[:, classes:].flatten()[:, None], rebuilt[:, classes:].flatten()[:, None]).solution
-    best = min(LOGITS_PER_PX, key=lambda logit: abs(logit * reach(cell) - float(slope)))
-    assert abs(float(slope) / (best * reach(cell)) - 1) < 0.1
-    unit = torch.tensor([1.0, best * reach(cell)]).repeat_interleave(classes)[:, None, None]
+    best = min(LOGITS_PER_PX, key=lambda logit: abs(logit * compute_edge_reach_px(cell) - float(slope)))
+    assert abs(float(slope) / (best * compute_edge_reach_px(cell)) - 1) < 0.1
+    unit = torch.tensor([1.0, best * compute_edge_reach_px(cell)]).repeat_interleave(classes)[:, None, None]
     weight = torch.tensor([HEIGHT_WEIGHT, 1.0]).repeat_interleave(classes)[:, None, None]
     cells = (
         F.pixel_unshuffle(m * weight, cell).permute(0, 2, 3, 1).reshape(-1, pixels) for m in (maps, rebuilt / unit)
@@ -233,7 +251,7 @@ def test_linear_init_is_optimal_with_unit_variance_codes():
 
 def test_linear_init_lowers_learning_rate():
     lvae = small_lvae(shortcut=True, decoder="cells")
-    trainer = Trainer(lvae, None, Optimisation(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
+    trainer = Trainer(lvae, None, OptimizerConfig(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
     share = {id(p): group["share"] for group in trainer.optimiser.param_groups for p in group["params"]}
     assert len(share) == len(list(lvae.parameters()))
     names = {name: share[id(p)] for name, p in lvae.named_parameters()}
@@ -242,15 +260,15 @@ def test_linear_init_lowers_learning_rate():
     }
     assert {v for n, v in names.items() if n.startswith("ground_") and ".shortcut" not in n} == {0.25}
     assert {v for n, v in names.items() if n.startswith("object_")} == {1.0}
-    assert not small_lvae().learning_rates()
+    assert not small_lvae().learning_rate_factors()
 
 
 def test_shortcuts_show_ground_before_first_step():
-    batch = layout_batch([random_scene(i) for i in range(12)], small_spec())
+    batch = make_layout_batch([random_scene(i) for i in range(12)], small_spec())
     iou = []
     for shortcut in (False, True):
         lvae = small_lvae(shortcut=shortcut, latent_channels=16)
-        lvae.start_at(batch)
+        lvae.init_from_data(batch)
         with torch.no_grad():
             seen = lvae.decode(lvae.encode(batch).mean).occupancy_logit > 0
         truth = batch.occupied > 0.5
@@ -265,10 +283,11 @@ def test_losses_equal_their_equations():
     features, truth = (torch.rand(b, n, 9, generator=generator) for _ in range(2))
     logit = torch.randn(b, n, generator=generator)
     real = torch.cat([torch.arange(3) < c for c in (3, 0, 1, 2, 0, 1, 3, 2, 1, 0, 2)])[None].repeat(b, 1)
-    assignment = match(features, logit, truth, real, spec.slots, spec.slots)
-    got = [float(v) for v in object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
+    assignment = match_primitives(features, logit, truth, real, spec.slots, spec.slots)
+    got = [float(v) for v in compute_object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
 
-    from models.vae.losses import OBJECT_WEIGHTS
+    from models.vae.config import nest_flat_options, override_options
+from models.vae.losses import OBJECT_WEIGHTS
 
     want = np.zeros(3)
     for sample in range(b):
@@ -288,15 +307,15 @@ def test_losses_equal_their_equations():
     occupied[1] = 0  # a sample without ground must not divide by zero
     height, true_height = (torch.rand(2, 5, 8, 8, generator=generator) for _ in range(2))
     want = float(((height - true_height).abs()[0] * occupied[0]).sum() / occupied[0].sum()) / 2
-    assert np.isclose(float(height_loss(height, true_height, occupied)), want, rtol=1e-5)
+    assert np.isclose(float(compute_height_loss(height, true_height, occupied)), want, rtol=1e-5)
     p = torch.sigmoid(height)
     want = float(-(occupied * p.log() + (1 - occupied) * (1 - p).log()).mean())
-    assert np.isclose(float(occupancy_loss(height, occupied)), want, rtol=1e-5)
+    assert np.isclose(float(compute_occupancy_loss(height, occupied)), want, rtol=1e-5)
     posterior = Posterior(torch.randn(2, 4, 3, 3, generator=generator), torch.randn(2, 4, 3, 3, generator=generator))
     normal = torch.distributions.Normal
     sigma = (0.5 * posterior.logvar).exp()
     want = torch.distributions.kl_divergence(normal(posterior.mean, sigma), normal(0.0, 1.0)).sum() / 2
-    assert np.isclose(float(kl_loss(posterior)), float(want), rtol=1e-5)
+    assert np.isclose(float(compute_kl_loss(posterior)), float(want), rtol=1e-5)
 
 
 @pytest.mark.parametrize("decoder, steps, ground", [("detr", 200, 0.9), ("cells", 60, 0.7)])
@@ -305,14 +324,14 @@ def test_lvae_overfits_one_batch(decoder, steps, ground):
     lvae = small_lvae(
         decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
     )
-    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
     generator = torch.Generator().manual_seed(0)
     losses = []
     for _ in range(steps):
         noise = torch.randn(2, *lvae.latent_shape, generator=generator)
         output, posterior = lvae(batch, noise)
-        loss = lvae_loss(output, posterior, batch, spec)
+        loss = compute_lvae_loss(output, posterior, batch, spec)
         optimiser.zero_grad()
         loss.total.backward()
         optimiser.step()
@@ -323,19 +342,20 @@ def test_lvae_overfits_one_batch(decoder, steps, ground):
 
 
 @pytest.mark.parametrize(
-    "execution", [Execution(precision="bf16"), Execution(accumulate=2), Execution(accumulate=4, precision="bf16")]
+    "execution",
+    [ExecutionConfig(precision="bf16"), ExecutionConfig(accumulate=2), ExecutionConfig(accumulate=4, precision="bf16")],
 )
 def test_lvae_step_is_equal_in_halves_and_bf16(execution):
     """Compares the loss at equal weights, then the decrease of the loss after separate training steps."""
     spec = small_spec()
-    layouts = [compact_layout(random_scene(i, n=20), spec) for i in range(4)]
+    layouts = [encode_layout(random_scene(i, n=20), spec) for i in range(4)]
     arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
     losses = {}
-    for way in (Execution(precision="fp32"), execution):
+    for way in (ExecutionConfig(precision="fp32"), execution):
         lvae = small_lvae(decoder="cells", shortcut=True)
-        lvae.start_at(LayoutBatch.from_compact(arrays))
-        settings = Optimisation(steps=20, learning_rate=3e-3, weight_decay=0.0)
-        trainer = lvae_trainer(lvae, settings, 1e-6, torch.device("cpu"), lambda model: model, way)
+        lvae.init_from_data(LayoutBatch.from_compact(arrays))
+        settings = OptimizerConfig(steps=20, learning_rate=3e-3, weight_decay=0.0)
+        trainer = make_lvae_trainer(lvae, settings, 1e-6, torch.device("cpu"), lambda model: model, way)
         losses[way] = [float(trainer.step(arrays, range(4))["loss"]) for _ in range(20)]
         assert all(p.dtype == torch.float32 for p in lvae.parameters())
     plain, other = losses.values()
@@ -345,13 +365,13 @@ def test_lvae_step_is_equal_in_halves_and_bf16(execution):
 
 def test_latent_noise_is_per_sample_with_stated_scale():
     generators = [torch.Generator().manual_seed(k) for k in range(400)]
-    drawn = stacked_corruption(generators, (4, 8, 8), 0.2, torch.device("cpu"))
-    alone = stacked_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
+    drawn = sample_corruption(generators, (4, 8, 8), 0.2, torch.device("cpu"))
+    alone = sample_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
     assert torch.equal(drawn[7], alone[0])
     sizes = drawn.std(dim=(1, 2, 3))
     assert np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02  # |N(0, 0.2)|
     lvae, spec = small_lvae(decoder="cells", shortcut=True), small_spec()
-    batch = layout_batch([random_scene(i, n=20) for i in range(2)], spec)
+    batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     noise = torch.zeros(2, *lvae.latent_shape)
     with torch.no_grad():
         plain, posterior = lvae(batch, noise)
@@ -363,9 +383,9 @@ def test_latent_noise_is_per_sample_with_stated_scale():
 
 
 def test_lvae_retrains_more_proposals_on_same_latents():
-    old, new = (small_lvae(decoder="cells", shortcut=True, least_per_cell=least) for least in (1, 3))
-    batch = layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
-    new.keep_latents_of(old.state_dict())
+    old, new = (small_lvae(shortcut=True, objects={"decoder": "cells", "min_proposals_per_cell": least}) for least in (1, 3))
+    batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
+    new.freeze_all_but_object_decoder(old.state_dict())
     with torch.no_grad():
         latents = [lvae.encode(batch).mean for lvae in (old, new)]
         assert torch.equal(*latents)
@@ -388,7 +408,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
     assert not torch.allclose(base, dit(latent, time.flip(0), label))
     with pytest.raises(ValueError, match="must be whole"):
         DiT(size=9)
-    prepared = dit.prepared([999, 500, 0, 4], [3, 1, 0, 1])
+    prepared = dit.precompute_conditioning([999, 500, 0, 4], [3, 1, 0, 1])
     assert torch.allclose(prepared(latent, time, label), base, atol=1e-4)
     for other in ((torch.tensor([0, 5, 999]), label), (time, torch.tensor([0, 2, 3])), (time + 1, label)):
         with pytest.raises(IndexError):

@@ -10,27 +10,36 @@ from diffusers import DPMSolverMultistepScheduler
 from helpers import LATENT_SHAPE, QUICK, random_scene, scenes_equal, small_spec
 
 from models.composition.inpaint import (
-    cells_of,
-    composited,
-    half_plane_region,
-    latent_mask,
-    object_region,
-    polygon_region,
+    composite_scenes,
+    find_region_cells,
+    make_latent_mask,
+    select_around_objects,
+    select_half_plane,
+    select_polygon,
 )
-from models.composition.seam_blending import continued
+from models.composition.seam_blending import blend_ground
 from models.dit import DiT
 from models.lvae import LayoutVAE
-from models.pipeline import SAMPLERS, PrITTIPipeline, Resampling, scheduler
+from models.pipeline import PrITTIPipeline
 from models.presets import LVAE_PRESETS
-from models.sampling.diffusion import Diffusion, Known, SceneNoise, Walk, rescaled, sample, solve
+from models.sampling.diffusion import (
+    Diffusion,
+    InpaintCondition,
+    SamplingSchedule,
+    SceneNoise,
+    sample,
+    sample_with_scheduler,
+    scale_noise,
+)
+from models.sampling.repaint import RePaintConfig
+from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Grid
 
 SPEC = small_spec()
 
 
 def sampler_of(name: str):
-    kind, changes = SAMPLERS[name]
-    return kind.from_config(scheduler().config, **changes)
+    return SchedulerConfig.ddpm().with_sampler(name).build()
 
 
 # --------------------------------------------------------------------------------------------------------- samplers
@@ -50,11 +59,11 @@ def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, off):
 
     noise, label = SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), torch.zeros(64, dtype=torch.long)
     if name == "ddpm":
-        drawn = sample(model, Walk(Diffusion(), steps), noise, label)
+        drawn = sample(model, SamplingSchedule(Diffusion(), steps), noise, label)
     else:
         solver = sampler_of(name)
         solver.set_timesteps(steps)
-        drawn = solve(model, solver, noise, label)
+        drawn = sample_with_scheduler(model, solver, noise, label)
     assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < off
 
 
@@ -80,7 +89,7 @@ def test_samplers_are_independent_of_batch_composition(pipeline):
 def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
     pipeline.use_sampler("dpm++")
     pipeline.save_pretrained(tmp_path)
-    again = PrITTIPipeline.from_pretrained(tmp_path, low_cpu_mem_usage=False)
+    again = PrITTIPipeline.from_pretrained(tmp_path)
     again.set_progress_bar_config(disable=True)
     pipeline.use_sampler("ddpm")
     assert isinstance(again.scheduler, DPMSolverMultistepScheduler) and again.diffusion == pipeline.diffusion
@@ -139,15 +148,15 @@ def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
 
     def raw(resampling, scaling):
         pipeline.register_to_config(noise_scaling=scaling)
-        made = pipeline.complete(Known(torch.ones_like(mask), mask), ["low"], 0, [0], resampling)
+        made = pipeline.inpaint_latents(InpaintCondition(torch.ones_like(mask), mask), ["low"], 0, [0], resampling)
         pipeline.register_to_config(noise_scaling=1.0)
         return made
 
     assert torch.equal(raw(QUICK, 1.0), raw(QUICK, 1.01))
-    assert not torch.equal(raw(Resampling.guided(6), 1.0), raw(Resampling.guided(6), 1.01))
-    assert Resampling.guided().evaluations == 50
+    assert not torch.equal(raw(RePaintConfig.guided(6), 1.0), raw(RePaintConfig.guided(6), 1.01))
+    assert RePaintConfig.guided().num_evaluations == 50
     with pytest.raises(ValueError, match="eta is 2, expected 0"):
-        Resampling(eta=2)
+        RePaintConfig(eta=2)
 
 
 def test_noise_scaling_corrects_overestimated_noise():
@@ -165,10 +174,12 @@ def test_noise_scaling_corrects_overestimated_noise():
 
     def deviation(denoiser):
         solver.set_timesteps(20)
-        return float(solve(denoiser, solver, SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), label).std())
+        return float(
+            sample_with_scheduler(denoiser, solver, SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), label).std()
+        )
 
     assert deviation(model(1.01)) < 0.49
-    assert abs(deviation(rescaled(model(1.01), 1.01)) - deviation(model(1.0))) < 1e-6
+    assert abs(deviation(scale_noise(model(1.01), 1.01)) - deviation(model(1.0))) < 1e-6
 
 
 # ------------------------------------------------------------------------------------------------------ conventions
@@ -206,7 +217,7 @@ def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
     assert not pipeline.sample_latents(["low"], 0, [0], 5, callback_on_step_end=erase).any()
     seen.clear()
     whole = np.ones((32, 32), bool)
-    pipeline.inpaint([random_scene(0, grid=SPEC.grid)], [whole], ["low"], resampling=QUICK, callback_on_step_end=watch)
+    pipeline.inpaint([random_scene(0, grid=SPEC.grid)], [whole], ["low"], repaint=QUICK, callback_on_step_end=watch)
     assert [step for step, _ in seen] == list(range(10))  # 6 and twice a roll-back of 2
 
 
@@ -218,22 +229,22 @@ def test_polygon_region_equals_shapely():
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     for corners in ([(10, -20), (50, 0), (30, 25)], [(5, -30), (60, -30), (20, 0), (60, 30), (5, 30)]):
         want = shapely.contains_xy(shapely.Polygon(corners), x, y)
-        assert np.array_equal(polygon_region(grid, corners), want) and 0.05 < want.mean() < 0.9
-        assert np.array_equal(polygon_region(grid, corners[::-1]), want)
+        assert np.array_equal(select_polygon(grid, corners), want) and 0.05 < want.mean() < 0.9
+        assert np.array_equal(select_polygon(grid, corners[::-1]), want)
     for bad in ([(0, 0), (1, 1)], [(0, 0), (1, np.nan), (2, 2)], [1, 2, 3]):
         with pytest.raises(ValueError, match="three or more corners"):
-            polygon_region(grid, bad)
+            select_polygon(grid, bad)
 
 
 def test_half_plane_and_object_regions_lie_where_stated():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
-    ahead = half_plane_region(grid, (2, 0), 40)
+    ahead = select_half_plane(grid, (2, 0), 40)
     assert np.array_equal(ahead, np.broadcast_to(grid.x_m()[:, None] >= 40, ahead.shape))
-    assert not (ahead & half_plane_region(grid, (-1, 0), -39.9)).any()
+    assert not (ahead & select_half_plane(grid, (-1, 0), -39.9)).any()
     with pytest.raises(ValueError, match="length above 0"):
-        half_plane_region(grid, (0, 0), 1)
+        select_half_plane(grid, (0, 0), 1)
     scene = random_scene(1, n=30, grid=grid)
-    region = object_region(scene, [4, 9], margin_m=0.5)
+    region = select_around_objects(scene, [4, 9], margin_m=0.5)
     for k in (4, 9):
         corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * scene.size_m[k]
         rows, cols = grid.pixel(*(corners @ scene.rotation[k].T + scene.center_m[k])[:, :2].T)
@@ -241,30 +252,30 @@ def test_half_plane_and_object_regions_lie_where_stated():
         assert inside.any() and region[rows[inside], cols[inside]].all()
     assert region.mean() < 0.1
     with pytest.raises(IndexError):
-        object_region(scene, [30])
+        select_around_objects(scene, [30])
 
 
 def test_region_grows_to_whole_cells():
     region = np.zeros((32, 32), bool)
     region[5, 30] = True
-    assert np.argwhere(cells_of(region, 8)).tolist() == [[1, 7]]
-    mask = latent_mask([region], (6, 8, 8), "objects")
+    assert np.argwhere(find_region_cells(region, 8)).tolist() == [[1, 7]]
+    mask = make_latent_mask([region], (6, 8, 8), "objects")
     assert mask.sum() == 3 and mask[0, 3:, 1, 7].all()
-    assert latent_mask([region], (6, 8, 8), "both").sum() == 6
+    assert make_latent_mask([region], (6, 8, 8), "both").sum() == 6
     with pytest.raises(ValueError, match="does not divide into 5 x 5 cells"):
-        cells_of(region, 5)
+        find_region_cells(region, 5)
     with pytest.raises(ValueError, match="contents 'cars', expected one of: both, ground, objects"):
-        latent_mask([region], (6, 8, 8), "cars")
+        make_latent_mask([region], (6, 8, 8), "cars")
 
 
 @pytest.mark.parametrize("contents", ["both", "ground", "objects"])
 def test_inpaint_keeps_the_rest(pipeline, contents):
     scene = random_scene(2, n=30, grid=SPEC.grid)
-    region = half_plane_region(SPEC.grid, (1, 0), 32.0)
-    (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK)
-    (raw,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, resampling=QUICK, composite=False)
+    region = select_half_plane(SPEC.grid, (1, 0), 32.0)
+    (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, repaint=QUICK)
+    (raw,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, repaint=QUICK, composite=False)
     new_ground, new_objects = (contents in ("both", what) for what in ("ground", "objects"))
-    bent = continued(raw, scene, region)
+    bent = blend_ground(raw, scene, region)
     for name in ("height_m", "occupied"):
         got, kept, new = (getattr(s, name) for s in (made, scene, bent))
         assert np.array_equal(got[:, ~region], kept[:, ~region])
@@ -280,7 +291,7 @@ def test_inpaint_decodes_given_ground_exactly(pipeline):
     """Inpaints objects on known ground: the ground decoder reads only the known ground channels."""
     scene = random_scene(5, n=30, grid=SPEC.grid)
     whole = np.ones((32, 32), bool)
-    (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", resampling=QUICK, composite=False)
+    (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", repaint=QUICK, composite=False)
     (rebuilt,) = pipeline.decode(pipeline.encode([scene]), [scene])
     assert np.array_equal(raw.height_m, rebuilt.height_m) and np.array_equal(raw.occupied, rebuilt.occupied)
     assert not scenes_equal(raw, rebuilt)
@@ -289,8 +300,10 @@ def test_inpaint_decodes_given_ground_exactly(pipeline):
 def test_inpaint_returns_known_latent_exactly(pipeline):
     scene = random_scene(6, n=30, grid=SPEC.grid)
     known = pipeline.encode([scene])
-    mask = latent_mask([polygon_region(SPEC.grid, [(10, -20), (50, 0), (30, 25)])], pipeline.lvae.latent_shape, "both")
-    latents = pipeline.complete(Known(known, mask), ["low"], 0, [0], QUICK)
+    mask = make_latent_mask(
+        [select_polygon(SPEC.grid, [(10, -20), (50, 0), (30, 25)])], pipeline.lvae.latent_shape, "both"
+    )
+    latents = pipeline.inpaint_latents(InpaintCondition(known, mask), ["low"], 0, [0], QUICK)
     kept = mask == 0
     assert torch.equal(latents[kept], known[kept]) and kept.any()
     assert (latents[~kept] != known[~kept]).all()
@@ -306,7 +319,7 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
     architecture = LVAE_PRESETS["smoke"].architecture() | {"split_latent": False}
     lvae = LayoutVAE(layout=SPEC.to_dict(), **architecture)
     channels, size, _ = lvae.latent_shape
-    mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2), scheduler())
+    mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2))
     with pytest.raises(ValueError, match="mixes ground and objects: objects cannot be made anew alone"):
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
 
@@ -314,18 +327,18 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
 def test_composite_of_nothing_changes_nothing():
     scene, other = random_scene(0, n=20, grid=SPEC.grid), random_scene(1, n=20, grid=SPEC.grid)
     nothing, everything = np.zeros((32, 32), bool), np.ones((32, 32), bool)
-    assert scenes_equal(composited(scene, other, nothing, "both"), scene)
-    assert scenes_equal(composited(scene, other, everything, "both"), other)
-    both = composited(composited(scene, other, everything, "ground"), other, everything, "objects")
+    assert scenes_equal(composite_scenes(scene, other, nothing, "both"), scene)
+    assert scenes_equal(composite_scenes(scene, other, everything, "both"), other)
+    both = composite_scenes(composite_scenes(scene, other, everything, "ground"), other, everything, "objects")
     assert scenes_equal(both, other)
 
 
 def test_composite_does_not_repeat_object_across_border():
     scene = random_scene(0, n=1, grid=SPEC.grid)
-    region = half_plane_region(SPEC.grid, (1, 0), 32.0)
+    region = select_half_plane(SPEC.grid, (1, 0), 32.0)
     scene = replace(scene, center_m=np.array([[31.95, 0, 0]], np.float32))
     again = replace(scene, center_m=np.array([[32.05, 0, 0]], np.float32))
     far = replace(scene, center_m=np.array([[50, 0, 0]], np.float32))
     for contents in ("both", "objects"):
-        assert np.array_equal(composited(scene, again, region, contents).center_m, scene.center_m)
-        assert len(composited(scene, far, region, contents)) == 2
+        assert np.array_equal(composite_scenes(scene, again, region, contents).center_m, scene.center_m)
+        assert len(composite_scenes(scene, far, region, contents)) == 2

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from models.pretrained import CHECKSUMS, WEIGHTS, checksums, pipeline_path, released
+from models.pretrained import CHECKSUMS_NAME, WEIGHTS, compute_checksums, find_pipeline_path, list_released
 
 
 def test_tracking_hides_password_of_uri():
@@ -18,7 +18,7 @@ def test_pipeline_directory_default_is_only_trained_or_released(tmp_path, monkey
     from jobs.support.options import pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
-    assert pipeline_directory("") == pipeline_path("town")
+    assert pipeline_directory("") == find_pipeline_path("town")
     for name, expected in (("demo", "pritti-demo"), ("smoke", None), ("town", "pritti-town")):
         directory = tmp_path / f"models/pritti-{name}"
         directory.mkdir(parents=True)
@@ -37,11 +37,11 @@ def test_provenance_command_hides_machine_paths(monkeypatch):
     typed = ["jobs/train_dit.py", "demo", "--dataset", "/data/sets/town", "--output=/data2/a b", "--name", "x y"]
     monkeypatch.setattr(provenance.sys, "argv", [str(provenance.ROOT / typed[0]), *typed[1:]])
     assert (
-        provenance.command()
+        provenance.format_command()
         == "jobs/train_dit.py demo --dataset $PRITTI_HOME/sets/town '--output=.../a b' --name 'x y'"
     )
 
 
 def test_released_weights_match_checksums():
-    for name in released():
-        assert json.loads((WEIGHTS / name / CHECKSUMS).read_text()) == checksums(pipeline_path(name))
+    for name in list_released():
+        assert json.loads((WEIGHTS / name / CHECKSUMS_NAME).read_text()) == compute_checksums(find_pipeline_path(name))

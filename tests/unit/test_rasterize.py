@@ -5,7 +5,7 @@ import shapely
 import trimesh
 
 from models.scene import Grid
-from pipelines.geometry.rasterize import cast_down, fill_polygon
+from pipelines.geometry.rasterize import cast_rays_down, fill_polygon
 
 
 def cast_by_rays(triangles_m: np.ndarray, grid: Grid) -> np.ndarray:
@@ -28,7 +28,7 @@ def test_cast_down_equals_ray_casting():
     rng = np.random.default_rng(0)
     grid = Grid()
     triangles = random_triangles(rng, 200)
-    height, hit = cast_down(triangles, grid)
+    height, hit = cast_rays_down(triangles, grid)
     rays = cast_by_rays(triangles, grid)
     same = np.isfinite(height[0]) == np.isfinite(rays)
     assert same.mean() > 0.999
@@ -42,8 +42,8 @@ def test_cast_down_last_triangle_wins_ties():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     level = random_triangles(np.random.default_rng(3), 60)
     level[..., 2] = 1.5
-    height, hit = cast_down(level, grid)
-    alone = np.stack([cast_down(triangle[None], grid)[1][0] == 0 for triangle in level])
+    height, hit = cast_rays_down(level, grid)
+    alone = np.stack([cast_rays_down(triangle[None], grid)[1][0] == 0 for triangle in level])
     assert (height[0][alone.any(axis=0)] == 1.5).all() and (alone.sum(axis=0) > 3).any()
     assert np.array_equal(hit[0], np.where(alone, np.arange(60)[:, None, None], -1).max(axis=0))
 
@@ -52,9 +52,9 @@ def test_cast_down_separates_layers():
     rng = np.random.default_rng(1)
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     triangles, layer = random_triangles(rng, 60), rng.integers(0, 3, 60)
-    together, hit = cast_down(triangles, grid, layer, 4)
+    together, hit = cast_rays_down(triangles, grid, layer, 4)
     for k in range(4):
-        alone, _ = cast_down(triangles[layer == k], grid)
+        alone, _ = cast_rays_down(triangles[layer == k], grid)
         assert np.array_equal(together[k], alone[0])
         assert set(layer[hit[k][hit[k] >= 0]]) <= {k}
     assert not np.isfinite(together[3]).any()
@@ -65,14 +65,14 @@ def test_cast_down_leaves_no_crack_between_triangles():
     corners = np.array([[0, -32, 0], [64, -32, 0], [64, 32, 0], [0, 32, 0]], float)
     for centre in ([32.5, 0.5, 0], [10.1, 3.7, 0], [31.5, -7.5, 0]):
         fan = np.array([[corners[i], corners[(i + 1) % 4], centre] for i in range(4)])
-        assert np.isfinite(cast_down(fan, grid)[0]).all()
+        assert np.isfinite(cast_rays_down(fan, grid)[0]).all()
 
 
 def test_cast_down_accepts_no_triangles():
     grid = Grid(rows=8, cols=8, resolution_m=1.0)
     vertical = np.array([[[5, 0, 0], [5, 1, 0], [5, 0, 3]]], float)
     for triangles in (np.zeros((0, 3, 3)), vertical, vertical + 500):
-        height, hit = cast_down(triangles, grid)
+        height, hit = cast_rays_down(triangles, grid)
         assert not np.isfinite(height).any() and (hit == -1).all()
 
 

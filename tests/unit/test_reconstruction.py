@@ -10,18 +10,18 @@ from helpers import random_scene
 
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Scene
-from models.tensors import DecodedLayout, compact_layout
+from models.tensors import DecodedLayout, encode_layout
 from pipelines.evaluation.reconstruction import (
     SceneRecord,
-    chunks_of,
-    reconstruction_scores,
-    scene_record,
-    table_bytes,
-    voxel_grid,
+    compute_reconstruction_scores,
+    make_scene_record,
+    make_voxel_grid,
+    measure_table_bytes,
+    split_chunks,
 )
 from pipelines.metrics.intervals import Estimate
 from pipelines.runtime import storage
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 
 LATENT = np.zeros((4, 8, 8), np.float32)
 SPEC = replace(
@@ -33,7 +33,7 @@ SPEC = replace(
 
 def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
     """The output of a perfect decoder."""
-    layout = compact_layout(scene, spec)
+    layout = encode_layout(scene, spec)
     return DecodedLayout(
         occupancy=layout["occupied"].astype(np.float32),
         height=layout["height"].astype(np.float32) / 65535,
@@ -44,12 +44,12 @@ def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
 
 
 def record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> SceneRecord:
-    return scene_record(scene, layout, LATENT, spec, voxel_grid(spec))
+    return make_scene_record(scene, layout, LATENT, spec, make_voxel_grid(spec))
 
 
 def test_reconstruction_of_perfect_decoder_scores_one():
     scenes = [random_scene(k, n=60, tilt_rad=0.1) for k in range(2)]
-    got = reconstruction_scores([record(s, perfect(s, SPEC)) for s in scenes], SPEC, voxel_grid(SPEC))
+    got = compute_reconstruction_scores([record(s, perfect(s, SPEC)) for s in scenes], SPEC, make_voxel_grid(SPEC))
     assert got["ground_iou"] == got["ground_mean_iou"] == 1 and got["height_rmse_m"] < 1e-4
     for variant in got["detection"].values():
         assert variant["ap3d"] > 0.99 and variant["ap3d_50"] > 0.99
@@ -64,7 +64,7 @@ def test_reconstruction_of_perfect_decoder_scores_one():
 def test_reconstruction_separates_cost_of_coarse_raster():
     coarse, scenes = SPEC.with_resolution(SPEC.grid.rows // 2), [random_scene(k, n=30) for k in range(2)]
     records = [record(s, perfect(s, coarse), coarse) for s in scenes]
-    got = reconstruction_scores(records, coarse, voxel_grid(coarse))
+    got = compute_reconstruction_scores(records, coarse, make_voxel_grid(coarse))
     assert got["raster_px"] == coarse.grid.rows and got["raster_ground_iou"] == 1 > got["ground_iou"] > 0.5
     assert got["raster_height_rmse_m"] < 1e-4
 
@@ -73,7 +73,7 @@ def test_reconstruction_ground_errors_are_in_meters():
     scene = random_scene(0, n=30)
     exact = perfect(scene, SPEC)
     raised = replace(exact, height=exact.height + 0.3 / 6.0, occupancy=np.zeros_like(exact.occupancy))
-    got = reconstruction_scores([record(scene, raised)], SPEC, voxel_grid(SPEC))
+    got = compute_reconstruction_scores([record(scene, raised)], SPEC, make_voxel_grid(SPEC))
     assert got["ground_iou"] == 0  # no occupied pixel is predicted; height errors count nevertheless
     assert got["height_rmse_m"] == pytest.approx(0.3, abs=1e-4) and got["height_mae_m"] == pytest.approx(0.3, abs=1e-4)
     assert got["height_mse_normalised"] == pytest.approx((0.3 / 6) ** 2, rel=1e-3)
@@ -82,7 +82,7 @@ def test_reconstruction_ground_errors_are_in_meters():
 def test_reconstruction_counts_primitives_without_slot_as_missed():
     scene = random_scene(1, n=60, tilt_rad=0.1)
     few = replace(SPEC, slots=(1,) * 11)
-    got = reconstruction_scores([record(scene, perfect(scene, few), few)], few, voxel_grid(few))
+    got = compute_reconstruction_scores([record(scene, perfect(scene, few), few)], few, make_voxel_grid(few))
     boxes = scene.category != 1
     assert got["matched"]["found"] == pytest.approx(len(set(scene.category[boxes])) / boxes.sum())
     assert got["matched"]["right"] == 1
@@ -105,25 +105,25 @@ def test_reconstruction_scores_empty_scene(tmp_path):
     empty = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
     full = random_scene(4, n=30)
     records = [record(s, perfect(s, SPEC)) for s in (empty, full)]
-    assert reconstruction_scores(records, SPEC, voxel_grid(SPEC))["ground_iou"] == 1
+    assert compute_reconstruction_scores(records, SPEC, make_voxel_grid(SPEC))["ground_iou"] == 1
 
 
 # --------------------------------------------------------------------------------------------- chunks, sizes and MLflow
 
 
-def selection(root: Path) -> Selection:
-    return Selection(str(root), "town", "test")
+def selection(root: Path) -> SceneSubset:
+    return SceneSubset(str(root), "town", "test")
 
 
 def test_reconstruction_chunks_cover_selection_once(reconstruction_dataset):
-    chunks = chunks_of(selection(reconstruction_dataset), 3)
+    chunks = split_chunks(selection(reconstruction_dataset), 3)
     assert [rows for _, rows in chunks] == [[0, 1, 2], [3, 4, 5], [6], [0, 1, 2], [3]]
     assert [shard.number for shard, _ in chunks] == [0, 0, 0, 1, 1]
 
 
 def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
     files = [p for p in reconstruction_dataset.rglob("*.parquet")]
-    assert table_bytes(chunks_of(selection(reconstruction_dataset), 3)) == pytest.approx(
+    assert measure_table_bytes(split_chunks(selection(reconstruction_dataset), 3)) == pytest.approx(
         sum(p.stat().st_size for p in files) / 11
     )
 

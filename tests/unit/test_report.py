@@ -9,7 +9,7 @@ import pytest
 from helpers import Page
 from PIL import Image
 
-from pipelines.reporting.chart import Chart, chart_svg, log_ticks, number, ticks
+from pipelines.reporting.chart import Chart, choose_log_ticks, choose_ticks, draw_chart_svg, format_number
 from pipelines.reporting.report import (
     Charts,
     Figure,
@@ -18,7 +18,7 @@ from pipelines.reporting.report import (
     Pictures,
     Table,
     Text,
-    report_html,
+    render_report_html,
     write_report,
 )
 
@@ -41,7 +41,7 @@ def sections():
 
 
 def test_report_page_is_well_formed_and_escaped(sections):
-    page = Page(report_html("A & B <demo>", sections, "sub < title"))
+    page = Page(render_report_html("A & B <demo>", sections, "sub < title"))
     assert not page.all("script") and not page.all("link") and not page.all("i") and not page.all("b")
     for text in (
         "A & B <demo>",
@@ -58,14 +58,14 @@ def test_report_page_is_well_formed_and_escaped(sections):
 
 
 def test_report_page_is_self_contained(sections):
-    html = report_html("Demo", sections)
+    html = render_report_html("Demo", sections)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
     assert all(url.startswith("data:") for url in re.findall(r'src="([^"]+)"', html))
 
 
 def test_report_keeps_pictures(sections):
     flat, shaded = (picture.image for picture in sections[2].pictures)
-    sources = [attrs["src"] for attrs in Page(report_html("Demo", sections)).all("img")]
+    sources = [attrs["src"] for attrs in Page(render_report_html("Demo", sections)).all("img")]
     assert sources[0].startswith("data:image/png;") and sources[1].startswith("data:image/webp;")
     decoded = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))).convert("RGB")) for source in sources
@@ -77,14 +77,14 @@ def test_report_keeps_pictures(sections):
 def test_write_report_is_atomic(tmp_path, sections):
     write_report(tmp_path / "report.html", "Demo", sections)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
-    assert (tmp_path / "report.html").read_text("utf-8") == report_html("Demo", sections)
+    assert (tmp_path / "report.html").read_text("utf-8") == render_report_html("Demo", sections)
 
 
 def test_report_rejects_table_of_wrong_shape():
     with pytest.raises(ValueError, match="2 columns, a row has 1"):
-        report_html("Demo", [Table("T", ["a", "b"], [["x"]])])
+        render_report_html("Demo", [Table("T", ["a", "b"], [["x"]])])
     with pytest.raises(ValueError, match="1 rows and 2 meanings"):
-        report_html("Demo", [Table("T", ["a"], [["x"]], ["one", "two"])])
+        render_report_html("Demo", [Table("T", ["a"], [["x"]], ["one", "two"])])
 
 
 def polylines(svg):
@@ -95,41 +95,41 @@ def polylines(svg):
 
 
 def test_chart_draws_lines_at_values():
-    (line,) = polylines(chart_svg(Chart("c", {"a": ([0, 1, 2], [0, 5, 10])})))
+    (line,) = polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [0, 5, 10])})))
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
     assert (np.diff(line[:, 1]) < 0).all()
-    (line,) = polylines(chart_svg(Chart("c", {"a": ([0, 1, 2], [1, 10, 100])}, log_y=True)))
+    (line,) = polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [1, 10, 100])}, log_y=True)))
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
 
 
 def test_chart_omits_undrawable_values():
     chart = Chart("c", {"a": ([0, 1, 2, 3, 4], [1, np.nan, 0, -1, 10])}, log_y=True)
-    (line,) = polylines(chart_svg(chart))
+    (line,) = polylines(draw_chart_svg(chart))
     assert len(line) == 2
     for series in ({}, {"a": ([], [])}, {"a": ([1.0], [np.inf])}):
-        assert "no data" in chart_svg(Chart("c", series))
-    assert "<circle" in chart_svg(Chart("c", {"a": ([3], [4])}))
+        assert "no data" in draw_chart_svg(Chart("c", series))
+    assert "<circle" in draw_chart_svg(Chart("c", {"a": ([3], [4])}))
     with pytest.raises(ValueError, match="2 x values and 1 y values"):
-        chart_svg(Chart("c", {"a": ([1, 2], [1])}))
+        draw_chart_svg(Chart("c", {"a": ([1, 2], [1])}))
 
 
 def test_chart_thins_and_smooths_long_series():
     y = np.sin(np.arange(10_000) / 2000)
-    faint, mean = polylines(chart_svg(Chart("c", {"a": (np.arange(10_000), y)})))
+    faint, mean = polylines(draw_chart_svg(Chart("c", {"a": (np.arange(10_000), y)})))
     assert len(faint) <= 600 and len(mean) <= 600
     assert np.abs(faint - mean).max() < 6  # a smooth series is its own running mean
 
 
 @pytest.mark.parametrize("low, high", [(0, 1), (-3, 17), (5, 5), (0, 0), (1e-7, 3e-7), (0.99, 123456)])
 def test_ticks_enclose_data(low, high):
-    values = ticks(low, high)
+    values = choose_ticks(low, high)
     assert values[0] <= low and values[-1] >= high and 2 <= len(values) <= 8
     assert np.allclose(np.diff(values), values[1] - values[0])
 
 
 @pytest.mark.parametrize("low, high", [(0.1, 10), (0.0023, 0.9), (3, 3), (1, 1), (1e-9, 1e6), (2.1, 3.9)])
 def test_log_ticks_enclose_data(low, high):
-    values = log_ticks(low, high)
+    values = choose_log_ticks(low, high)
     assert values[0] <= low * (1 + 1e-9) and values[-1] >= high * (1 - 1e-9) and 2 <= len(values) <= 9
 
 
@@ -148,4 +148,4 @@ NUMBERS = {
 
 @pytest.mark.parametrize("value, written", NUMBERS.items())
 def test_number_is_formatted_short(value, written):
-    assert number(value) == written
+    assert format_number(value) == written

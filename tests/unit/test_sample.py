@@ -10,14 +10,14 @@ from pipelines.schema.tables import read_scenes
 def test_sampler_repairs_sampled_scenes(tmp_path):
     from jobs.support.options import pipeline_directory
     from pipelines.generation.sample import Sampler, SampleRequest
-    from pipelines.metrics.validity import SLAB_OFFSET_M, faults
+    from pipelines.metrics.validity import SLAB_OFFSET_M, find_faults
 
     request = SampleRequest(pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++")
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
         Sampler(one, batch_size=4)({"id": 0})
         made = list(read_scenes(str(tmp_path), source=one.source))
-        found = [faults(scene, SLAB_OFFSET_M) for scene in made]
+        found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
         scenes.append(made)
         number.append([sum(f[name][0].sum() for f in found) for name in ("overlapping", "floating", "sunken")])
     for before, after in zip(*scenes, strict=True):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers import random_rotations, random_scene
 
-from models.geometry.cholesky import boxes_from_cholesky, cholesky_parameters, scatter_matrix
-from models.scene import Grid, canonical_boxes, merge, yaw_of
+from models.geometry.cholesky import compute_cholesky_parameters, compute_scatter_matrix, decode_cholesky_boxes
+from models.scene import Grid, canonicalize_boxes, compute_yaw, merge_scenes
 
 
 def same_corners(a, b):
@@ -21,14 +21,14 @@ def test_canonical_boxes_keep_corners():
     rng = np.random.default_rng(0)
     rotation, size = random_rotations(rng, 500), rng.uniform(0.1, 9, (500, 3))
     rotation[::3, :, 0] *= -1  # mirrored boxes
-    canonical, lwh = canonical_boxes(rotation, size)
+    canonical, lwh = canonicalize_boxes(rotation, size)
     assert same_corners((rotation, size), (canonical, lwh))
     assert np.allclose(np.linalg.det(canonical), 1)
     assert (lwh[:, 0] >= lwh[:, 1]).all()
     assert (np.abs(canonical[:, 2, 2]) >= np.abs(canonical[:, 2, :2]).max(axis=1) - 1e-12).all()
-    yaw = yaw_of(canonical)
+    yaw = compute_yaw(canonical)
     assert (yaw >= -np.pi / 2).all() and (yaw < np.pi / 2).all()
-    again = canonical_boxes(canonical, lwh)
+    again = canonicalize_boxes(canonical, lwh)
     assert np.allclose(again[0], canonical) and np.allclose(again[1], lwh)
 
 
@@ -36,24 +36,26 @@ def test_yaw_of_quarter_turns_is_in_range():
     for quarter in range(4):
         angle = quarter * np.pi / 2
         rotation = np.round([[[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]])
-        yaw = yaw_of(canonical_boxes(rotation, np.array([[4.0, 2.0, 1.0]]))[0])
+        yaw = compute_yaw(canonicalize_boxes(rotation, np.array([[4.0, 2.0, 1.0]]))[0])
         assert -np.pi / 2 <= yaw[0] < np.pi / 2
 
 
 def test_scatter_matrix_round_trips():
     rng = np.random.default_rng(1)
     rotation, size = random_rotations(rng, 1000), rng.uniform(0.05, 30, (1000, 3))
-    parameters = cholesky_parameters(rotation, size)
+    parameters = compute_cholesky_parameters(rotation, size)
     assert parameters.shape == (1000, 6)
-    back_rotation, back_size = boxes_from_cholesky(parameters)
-    assert np.allclose(scatter_matrix(back_rotation, back_size), scatter_matrix(rotation, size), atol=1e-9)
+    back_rotation, back_size = decode_cholesky_boxes(parameters)
+    assert np.allclose(
+        compute_scatter_matrix(back_rotation, back_size), compute_scatter_matrix(rotation, size), atol=1e-9
+    )
     assert np.allclose(np.linalg.det(back_rotation), 1)
     # Unlike quaternions, equal for R and its mirrored and rotated equivalents.
-    assert np.allclose(cholesky_parameters(rotation * [-1, -1, 1], size), parameters)
+    assert np.allclose(compute_cholesky_parameters(rotation * [-1, -1, 1], size), parameters)
 
 
 def test_cholesky_decodes_any_six_numbers():
-    rotation, size = boxes_from_cholesky(np.array([[0.0] * 6, [-1, 2, 0, 3, -4, 1e-9], [1, 0, 1, 0, 0, 1]]))
+    rotation, size = decode_cholesky_boxes(np.array([[0.0] * 6, [-1, 2, 0, 3, -4, 1e-9], [1, 0, 1, 0, 0, 1]]))
     assert np.isfinite(rotation).all() and (size >= 0.01).all()
     assert np.allclose(np.linalg.det(rotation), 1)
 
@@ -81,21 +83,21 @@ def test_surface_is_highest_class():
 def test_move_and_crop_are_inverse():
     scene = random_scene(4)
     there = Grid(front_m=96.0, left_m=32.0)
-    ahead = scene.cropped(there)
+    ahead = scene.crop(there)
     assert ahead.occupied[:, :128].sum() == 0
     assert np.array_equal(ahead.occupied[:, 128:], scene.occupied[:, :128])
     assert (ahead.center_m[:, 0] > 32).all() and len(ahead) == (scene.center_m[:, 0] > 32).sum()
-    moved = ahead.moved(-32, 0, 1.5)
+    moved = ahead.translate(-32, 0, 1.5)
     assert moved.grid == Grid() and np.allclose(moved.center_m + [32, 0, -1.5], ahead.center_m)
     with pytest.raises(ValueError, match="aligned"):
-        scene.cropped(Grid(front_m=64.1))
+        scene.crop(Grid(front_m=64.1))
 
 
 def test_merge_assigns_one_owner_per_pixel_and_primitive():
     a, b = random_scene(5), random_scene(6)
     left = np.zeros((256, 256), bool)
     left[:, :128] = True
-    joined = merge([a, b], [left, ~left], a)
+    joined = merge_scenes([a, b], [left, ~left], a)
     assert np.array_equal(joined.occupied[:, :, :128], a.occupied[:, :, :128])
     assert np.array_equal(joined.height_m[:, :, 128:], b.height_m[:, :, 128:])
     assert len(joined) == (a.center_m[:, 1] > 0).sum() + (b.center_m[:, 1] <= 0).sum()
@@ -103,6 +105,6 @@ def test_merge_assigns_one_owner_per_pixel_and_primitive():
 
 def test_enlarged_cells_cover_grid_in_blocks():
     grid = Grid(8.0, 3.0, 1.0, 8, 6)
-    large = grid.enlarged(np.array([[1, 2, 3], [4, 5, 6]]))
+    large = grid.upsample_cells(np.array([[1, 2, 3], [4, 5, 6]]))
     assert large.shape == (8, 6) and (large[:4, 2:4] == 2).all() and (large[4:, :2] == 4).all()
     assert np.array_equal(np.unique(large, return_counts=True)[1], [8] * 6)

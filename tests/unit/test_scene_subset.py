@@ -5,7 +5,14 @@ import pyarrow as pa
 import pytest
 from helpers import random_scene
 
-from pipelines.schema.scene_subset import Selection, apart, balanced, evenly, farthest, poses
+from pipelines.schema.scene_subset import (
+    SceneSubset,
+    read_poses,
+    select_apart,
+    select_balanced,
+    select_evenly,
+    select_farthest,
+)
 from pipelines.schema.tables import Shard
 
 
@@ -18,9 +25,9 @@ def test_farthest_poses_equal_brute_force():
         nearest = every[expected].min(axis=0)
         nearest[expected] = -1
         expected.append(int(nearest.argmax()))
-    assert farthest(xy, world, 80).tolist() == expected
-    assert farthest(xy, world, 7).tolist() == expected[:7]
-    assert sorted(farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all at the same position
+    assert select_farthest(xy, world, 80).tolist() == expected
+    assert select_farthest(xy, world, 7).tolist() == expected[:7]
+    assert sorted(select_farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all at the same position
 
 
 @pytest.mark.parametrize("apart_m", [0.5, 3.0, 40.0, 1e6])
@@ -31,13 +38,13 @@ def test_poses_apart_equal_brute_force(apart_m):
     for i in range(300):
         if all(world[i] != world[j] or np.hypot(*(xy[i] - xy[j])) >= apart_m for j in expected):
             expected.append(i)
-    assert apart(xy, world, apart_m).tolist() == expected
+    assert select_apart(xy, world, apart_m).tolist() == expected
 
 
 @pytest.mark.parametrize("count", range(1, 16))
 def test_balanced_subset_has_equal_labels_where_possible(count):
     labels = np.array(["low"] * 2 + ["medium"] * 8 + ["high"] * 5)
-    chosen = balanced(labels, count)
+    chosen = select_balanced(labels, count)
     assert len(set(chosen.tolist())) == count
     taken = {name: int((labels[chosen] == name).sum()) for name in ("low", "medium", "high")}
     full = {name for name in taken if taken[name] == (labels == name).sum()}
@@ -46,15 +53,15 @@ def test_balanced_subset_has_equal_labels_where_possible(count):
 
 
 def test_evenly_spreads_indices_over_range():
-    assert evenly(10, 10).tolist() == list(range(10))
-    assert evenly(10, 2).tolist() == [2, 7]
-    assert len(evenly(5, 0)) == 0
+    assert select_evenly(10, 10).tolist() == list(range(10))
+    assert select_evenly(10, 2).tolist() == [2, 7]
+    assert len(select_evenly(5, 0)) == 0
 
 
 def test_worlds_are_shared_by_kitti360_drives_only():
     table = pa.table({"sequence": ["a", "b"], "x_m": [0.0, 1.0], "y_m": [0.0, 0.0]})
-    assert len(set(poses(table, np.array(["kitti360", "kitti360"]))[1])) == 1
-    assert len(set(poses(table, np.array(["town", "town"]))[1])) == 2
+    assert len(set(read_poses(table, np.array(["kitti360", "kitti360"]))[1])) == 1
+    assert len(set(read_poses(table, np.array(["town", "town"]))[1])) == 2
 
 
 def test_selection_reads_two_shards(tmp_path):
@@ -63,7 +70,7 @@ def test_selection_reads_two_shards(tmp_path):
     Shard(str(tmp_path), "town", "train", 1).write(scenes[4:])
 
     def rows(**options) -> list[list[int]]:
-        return [r for _, r in Selection(str(tmp_path), "town", "train", **options).shards()]
+        return [r for _, r in SceneSubset(str(tmp_path), "town", "train", **options).shards()]
 
     assert rows() == [[0, 1, 2, 3], [0, 1, 2, 3, 4]]
     assert rows(limit=3, pick="first") == [[0, 1, 2]]
@@ -79,4 +86,4 @@ def test_selection_reads_two_shards(tmp_path):
 )
 def test_selection_rejects_wrong_options(options, message):
     with pytest.raises(ValueError, match=message):
-        Selection("nowhere", **options)
+        SceneSubset("nowhere", **options)

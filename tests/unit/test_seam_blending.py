@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from helpers import random_scene
 
-from models.composition.seam_blending import REACH_M, STEEPEST, continued, spread
+from models.composition.seam_blending import BLEND_M, MAX_SLOPE, blend_ground, extrapolate_ground
 from models.scene import KITTI_GROUND_CLASSES, Grid
 
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)
 ROAD, SIDEWALK = (KITTI_GROUND_CLASSES.index(name) for name in ("road", "sidewalk"))
 NEW = np.zeros((64, 64), bool)
 NEW[:32] = True  # what lies more than 16 m ahead
-REACH = round(REACH_M / GRID.resolution_m)
+REACH = round(BLEND_M / GRID.resolution_m)
 
 
 def street(left_px: int, height_m: float):
@@ -27,7 +27,7 @@ def street(left_px: int, height_m: float):
 
 def test_blend_ground_aligns_shifted_street():
     known, made = street(20, 0.0), street(23, 0.2)
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     for c in (ROAD, SIDEWALK):
         assert np.array_equal(bent.occupied[c, 31], known.occupied[c, 32])  # across the border: the same columns
         assert np.abs(bent.height_m[c, 31] - known.height_m[c, 32]).max() < 0.003
@@ -44,9 +44,9 @@ def test_blend_ground_aligns_shifted_street():
 def test_blend_ground_removes_step_at_seam():
     known, made = street(20, 0.0), street(20, 0.0)
     made.height_m[:, :32] += 0.3 * made.occupied[:, :32]
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     for c, column in ((ROAD, 26), (SIDEWALK, 5)):
-        assert abs(bent.height_m[c, 31, column] - known.height_m[c, 32, column]) < STEEPEST * GRID.resolution_m + 0.005
+        assert abs(bent.height_m[c, 31, column] - known.height_m[c, 32, column]) < MAX_SLOPE * GRID.resolution_m + 0.005
         assert np.allclose(bent.height_m[c, : 32 - REACH], made.height_m[c, : 32 - REACH])
 
 
@@ -54,7 +54,7 @@ def test_blend_ground_starts_new_class_at_known_height():
     known, made = street(64, 0.3), street(64, 0.0)  # sidewalk everywhere: known at 0.4 m, generated at 0.1 m
     made.occupied[SIDEWALK, :32], made.occupied[ROAD, :32] = False, True
     made.height_m[SIDEWALK, :32], made.height_m[ROAD, :32] = 0, 0.1
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     assert not bent.occupied[SIDEWALK, :32].any() and bent.occupied[ROAD, :32].all()
     assert np.abs(bent.height_m[ROAD, 31] - 0.4).max() < 0.005
     assert np.allclose(bent.height_m[ROAD, : 32 - REACH], 0.1)
@@ -62,29 +62,29 @@ def test_blend_ground_starts_new_class_at_known_height():
 
 def test_blend_ground_keeps_known_and_matching_pixels():
     known, made = street(20, 0.0), street(23, 0.2)
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     for name in ("occupied", "height_m"):
         assert np.array_equal(getattr(bent, name)[:, ~NEW], getattr(made, name)[:, ~NEW])
-    same = continued(known, known, NEW)
+    same = blend_ground(known, known, NEW)
     assert np.array_equal(same.occupied, known.occupied) and np.allclose(same.height_m, known.height_m, atol=1e-6)
     assert np.array_equal(same.center_m, known.center_m)
     known.height_m[:] += 0.2 * GRID.resolution_m * np.arange(64)[:, None] * known.occupied  # a hill of 20 %
-    assert np.allclose(continued(known, known, NEW).height_m, known.height_m, atol=1e-5)
+    assert np.allclose(blend_ground(known, known, NEW).height_m, known.height_m, atol=1e-5)
 
 
 @pytest.mark.parametrize("mask", [np.zeros((64, 64), bool), np.ones((64, 64), bool)])
 def test_blend_ground_without_seam_changes_nothing(mask):
     made = street(23, 0.2)
-    assert continued(made, street(20, 0.0), mask) is made
+    assert blend_ground(made, street(20, 0.0), mask) is made
 
 
 def test_blend_ground_fades_out_road_into_void():
     known, made = street(20, 0.0), street(20, 0.0)
     made = replace(made, occupied=made.occupied & False, height_m=made.height_m * 0)
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     ahead = bent.occupied[ROAD, :32].any(axis=1)
     assert ahead[31] and not ahead[: 32 - REACH].any()
-    other = continued(known, made, NEW)  # the reverse: known void, generated street
+    other = blend_ground(known, made, NEW)  # the reverse: known void, generated street
     assert not other.occupied[:, 31].any() and np.array_equal(other.occupied[:, 0], known.occupied[:, 0])
     for scene in (bent, other):
         assert not scene.height_m[~scene.occupied].any()
@@ -95,7 +95,7 @@ def test_blend_ground_keeps_object_height_above_ground():
     center = np.tile(np.float32([18.0, 3.0, 1.0]), (12, 1))
     center[6:, 0] = 31.0
     made = replace(made, center_m=center)
-    bent = continued(made, known, NEW)
+    bent = blend_ground(made, known, NEW)
     above_m = [scene.center_m[:, 2] - scene.ground_under()[0] for scene in (made, bent)]
     assert np.allclose(*above_m, atol=1e-6)
     assert (bent.center_m[:6, 2] < 0.75).all() and np.array_equal(bent.center_m[6:], made.center_m[6:])
@@ -104,6 +104,6 @@ def test_blend_ground_keeps_object_height_above_ground():
 def test_blend_ground_ignores_unknown_pixels():
     known = street(20, 0.0)
     half = replace(known, occupied=known.occupied & ~NEW, height_m=np.where(NEW, 0, known.height_m).astype(np.float32))
-    for scene in (spread(half, NEW), spread(known, np.zeros_like(NEW))):
+    for scene in (extrapolate_ground(half, NEW), extrapolate_ground(known, np.zeros_like(NEW))):
         assert np.array_equal(scene.occupied, known.occupied) and np.array_equal(scene.height_m, known.height_m)
-    assert spread(half, np.ones_like(NEW)) is half
+    assert extrapolate_ground(half, np.ones_like(NEW)) is half

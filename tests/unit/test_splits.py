@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from pipelines.schema.splits import no_split, num_segments, split_poses
+from pipelines.schema.splits import count_segments, make_no_split, split_poses
 
 
 def winding_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray) -> np.ndarray:
@@ -87,13 +87,13 @@ def test_split_keeps_waiting_car_in_its_segment():
 @pytest.mark.parametrize(("total_m", "count"), [(10, 1), (99, 1), (100, 2), (320, 6), (5000, 100), (73_700, 100)])
 def test_split_of_short_drive_has_fewer_segments_and_warns(total_m, count, caplog):
     with caplog.at_level(logging.WARNING):
-        assert num_segments(total_m) == count
+        assert count_segments(total_m) == count
     assert ("instead of the paper's 100" in caplog.text) == (count < 100)
     assert ("nothing is left to train on" in caplog.text) == (total_m < 25)
 
 
 def test_split_none_trains_on_everything():
-    split = no_split({"a": np.zeros((3, 3)), "b": np.zeros((0, 3))})
+    split = make_no_split({"a": np.zeros((3, 3)), "b": np.zeros((0, 3))})
     assert split["a"].tolist() == ["train"] * 3
     assert split["b"].tolist() == []
 

@@ -12,11 +12,11 @@ from lxml import etree
 from scipy.integrate import cumulative_trapezoid
 
 from models.scene import ELLIPSOID, Grid, Scene
-from pipelines.geometry.centerlines import drive, road_network
-from pipelines.io.mesh_export import GROUND, scene_triangles
-from pipelines.io.opendrive import lanes_of, reference_lines, scene_opendrive
-from pipelines.preprocess.sources.town.generator import town_drive
-from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shaded
+from pipelines.geometry.centerlines import extract_road_network, plan_drive
+from pipelines.io.mesh_export import GROUND, triangulate_scene
+from pipelines.io.opendrive import export_opendrive, fit_reference_lines, list_lanes
+from pipelines.preprocess.sources.town.generator import generate_town
+from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shade_view
 from pipelines.schema.palette import CATEGORY_IDS, EMPTY
 
 SMALL = Lens().resized(176, 47)
@@ -24,7 +24,7 @@ SMALL = Lens().resized(176, 47)
 
 @pytest.fixture(scope="module")
 def town_scenes() -> list[Scene]:
-    return [town_drive(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
+    return [generate_town(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
 
 
 def rays(camera: StreetCamera) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_street_view_equals_ray_casting(seed):
     # Rays hit outer faces only, as in the renderer: a camera inside a box sees out of it.
     camera = StreetCamera.at([1.0, 2.0, 3.0], 0.2, -0.1, SMALL)
     view, way = StreetRenderer(scene).view(camera), rays(camera)
-    soup = scene_triangles(scene)
+    soup = triangulate_scene(scene)
     flat = scene.category[soup.primitive.clip(0)] != ELLIPSOID
     flat |= soup.primitive == GROUND
     corners = soup.corners_m[flat]
@@ -88,7 +88,7 @@ def test_street_view_normals_face_camera_and_are_deterministic(town_scenes):
     assert ((view.normal * rays(camera)).sum(axis=-1)[seen] < 1e-4).all()
     for one, other in zip(view, again, strict=True):
         assert np.array_equal(one, other)
-    assert shaded(view).shape == (47, 176, 3) and len(np.unique(shaded(view).reshape(-1, 3), axis=0)) > 50
+    assert shade_view(view).shape == (47, 176, 3) and len(np.unique(shade_view(view).reshape(-1, 3), axis=0)) > 50
 
 
 def test_street_view_clips_at_near_plane():
@@ -150,7 +150,7 @@ SIDE = np.array([[30.0, 3.0], [30.0, 60.0]])
 
 @pytest.mark.parametrize("way, width_m", [(STRAIGHT, 6.5), (OBLIQUE, 7.0), (ARC, 6.0)])
 def test_centerlines_of_single_road_equal_its_axis(way, width_m):
-    network = road_network(scene_of_roads([way], width_m))
+    network = extract_road_network(scene_of_roads([way], width_m))
     (road,) = network.roads
     assert (road.start, road.end, len(network.nodes_m)) == (-1, -1, 0)
     assert off_m(road.xyz_m[:, :2], [way]).max() < 0.6
@@ -162,7 +162,7 @@ def test_centerlines_of_single_road_equal_its_axis(way, width_m):
 
 
 def test_centerlines_split_at_side_street():
-    network = road_network(scene_of_roads([STRAIGHT, SIDE], 6.5))
+    network = extract_road_network(scene_of_roads([STRAIGHT, SIDE], 6.5))
     assert len(network.roads) == 3 and len(network.nodes_m) == 1
     assert np.linalg.norm(network.nodes_m[0, :2] - [30, 3]) < 1.5
     assert len(network.leaving(0)) == 3 and sorted(r.start + r.end for r in network.roads) == [-1, -1, -1]
@@ -173,29 +173,29 @@ def test_centerlines_split_at_side_street():
 def test_centerlines_have_one_node_per_crossing_without_spurs():
     across = np.array([[34.0, -60.0], [34.0, 60.0]])
     scene = scene_of_roads([STRAIGHT, across], 7.0)
-    network = road_network(scene)
+    network = extract_road_network(scene)
     assert len(network.roads) == 4 and len(network.nodes_m) == 1 and len(network.leaving(0)) == 4
     rough = scene.occupied.copy()
     rng = np.random.default_rng(0)
     rough[0] &= rng.random(rough[0].shape) > 0.02  # pinholes
     rough[0, 5:9, 5:9] = True  # an island
-    spotted = road_network(replace(scene, occupied=rough, height_m=np.where(rough, scene.height_m, 0)))
+    spotted = extract_road_network(replace(scene, occupied=rough, height_m=np.where(rough, scene.height_m, 0)))
     assert len(spotted.roads) == 4
     nothing = np.zeros_like(scene.occupied)
-    assert road_network(replace(scene, occupied=nothing, height_m=np.zeros_like(scene.height_m))).roads == ()
+    assert extract_road_network(replace(scene, occupied=nothing, height_m=np.zeros_like(scene.height_m))).roads == ()
 
 
 def test_route_goes_straight_and_keeps_right():
-    network = road_network(scene_of_roads([STRAIGHT, SIDE], 6.0))
-    way = drive(network)
-    assert len(drive(replace(network, roads=()))) == 0
+    network = extract_road_network(scene_of_roads([STRAIGHT, SIDE], 6.0))
+    way = plan_drive(network)
+    assert len(plan_drive(replace(network, roads=()))) == 0
     assert way[0, 0] < 2 and way[-1, 0] > 60  # past the side street
     inner = way[(way[:, 0] > 5) & ((way[:, 0] < 20) | (way[:, 0] > 42))]
     assert np.abs(inner[:, 1] - 1.5).max() < 0.5  # a quarter of 6 m right of y = 3
     assert (np.diff(way[:, 0]) > 0).all()
-    left = drive(network, right=-0.25)
+    left = plan_drive(network, right=-0.25)
     assert left[10:20, 1].mean() > 4
-    back = drive(network, start_m=(64.0, 3.0))
+    back = plan_drive(network, start_m=(64.0, 3.0))
     assert back[0, 0] > 60 and back[-1, 0] < 4 and back[10:15, 1].mean() > 3.5  # right is the other side
 
 
@@ -235,10 +235,10 @@ def sampled(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
 def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
     counted = 0
     for scene in [*town_scenes, scene_of_roads([STRAIGHT, SIDE], 12.5)]:
-        content = scene_opendrive(scene)
+        content = export_opendrive(scene)
         schema.assertValid(etree.fromstring(content))
-        network, root = road_network(scene), ET.fromstring(content)
-        lines = reference_lines(network)
+        network, root = extract_road_network(scene), ET.fromstring(content)
+        lines = fit_reference_lines(network)
         roads = root.findall("road")
         assert root.find("header/offset").get("hdg") is not None and len(roads) >= len(lines)
         for element, road, line in zip(roads, network.roads, lines, strict=False):
@@ -254,13 +254,13 @@ def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
                 for side in ("left", "right")
             ]
             assert sum(width_m) == pytest.approx(line.width_m[0], rel=1e-6)
-            assert len(element.findall("lanes/laneSection/right/lane")) == lanes_of(line)
+            assert len(element.findall("lanes/laneSection/right/lane")) == list_lanes(line)
             counted += 1
     assert counted > 8
 
 
 def test_opendrive_junction_connects_lanes_of_its_roads(schema):
-    root = ET.fromstring(scene_opendrive(scene_of_roads([STRAIGHT, SIDE], 6.5)))
+    root = ET.fromstring(export_opendrive(scene_of_roads([STRAIGHT, SIDE], 6.5)))
     roads = {road.get("id"): road for road in root.findall("road")}
     (junction,) = root.findall("junction")
     connections = junction.findall("connection")
@@ -289,4 +289,4 @@ def test_opendrive_rejects_scene_without_road():
     scene = random_scene(0, 4)
     nothing = np.zeros_like(scene.occupied)
     with pytest.raises(ValueError, match="test-0000 has no road to export"):
-        scene_opendrive(replace(scene, occupied=nothing, height_m=np.zeros_like(scene.height_m)))
+        export_opendrive(replace(scene, occupied=nothing, height_m=np.zeros_like(scene.height_m)))

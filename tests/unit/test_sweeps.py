@@ -3,32 +3,32 @@
 import numpy as np
 import pytest
 
-from pipelines.evaluation.reference_sweep import references, sweep
+from pipelines.evaluation.reference_sweep import list_references, sweep_references
 from pipelines.evaluation.sampler_sweep import (
-    as_good_as,
-    reference_row,
-    sampler_charts,
-    sampler_html,
-    sampler_row,
-    sampler_table,
+    build_sampler_table,
+    draw_sampler_charts,
+    find_reference_row,
+    is_as_good_as,
+    make_sampler_row,
+    render_sampler_html,
 )
 from pipelines.metrics.intervals import Estimate
-from pipelines.schema.scene_subset import apart, farthest
+from pipelines.schema.scene_subset import select_apart, select_farthest
 
 
 def test_reference_sizes_fit_both_sides():
     rng = np.random.default_rng(0)
     xy, world = rng.uniform(0, 100, (200, 2)), np.zeros(200, int)
-    got = list(references(xy, world, (10, 50, 150, 400), (30.0, 1.0, 1e-6), least=4, most=120))
+    got = list(list_references(xy, world, (10, 50, 150, 400), (30.0, 1.0, 1e-6), least=4, most=120))
     assert [(one.strategy, one.setting) for one in got][:2] == [("farthest", 10), ("farthest", 50)]
     assert [one.setting for one in got if one.strategy == "apart"] == [30.0]  # more than 120 of 1 m
-    assert np.array_equal(got[0].rows, farthest(xy, world, 10)) and np.array_equal(got[1].rows[:10], got[0].rows)
-    assert np.array_equal(got[-1].rows, apart(xy, world, 30.0))
+    assert np.array_equal(got[0].rows, select_farthest(xy, world, 10)) and np.array_equal(got[1].rows[:10], got[0].rows)
+    assert np.array_equal(got[-1].rows, select_apart(xy, world, 30.0))
 
 
 def test_reference_sweep_rejects_unfit_references():
     with pytest.raises(ValueError, match="no reference fits 5 real and 4 generated"):
-        sweep(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(4), [], (3,))
+        sweep_references(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(4), [], (3,))
 
 
 # -------------------------------------------------------------------------------------------------------- samplers
@@ -50,7 +50,7 @@ def row_of(sampler: str, steps: int, frechet: Estimate, cars: float = 10.0, scal
         "validity": validity | {"sunken": {"generated": None}},
     }
     scores |= {f"random_{name}_k3": Estimate(0.3, 0.2, 0.4) for name in ("precision", "recall")}
-    return sampler_row(sampler, steps, scaling, 2.0, scores)
+    return make_sampler_row(sampler, steps, scaling, 2.0, scores)
 
 
 def test_sampler_sweep_compares_with_ddpm_of_most_steps():
@@ -58,20 +58,23 @@ def test_sampler_sweep_compares_with_ddpm_of_most_steps():
     near, far = row_of("dpm++", 20, Estimate(2.8, 2.4, 3.2)), row_of("ddpm", 10, Estimate(9.0, 8.0, 10.0))
     rows = [far, paper, near]
     assert near["seconds_per_scene"] == 2 and near["layout_frechet_high"] == 3.2 and near["sunken"] is None
-    assert reference_row(rows) is paper and reference_row([near, row_of("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
-    assert as_good_as(near, paper) and not as_good_as(far, paper)
-    assert as_good_as(row_of("dpm++", 20, Estimate(0.5, 0.4, 0.6)), paper)  # a better score also counts as equal
+    assert (
+        find_reference_row(rows) is paper
+        and find_reference_row([near, row_of("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
+    )
+    assert is_as_good_as(near, paper) and not is_as_good_as(far, paper)
+    assert is_as_good_as(row_of("dpm++", 20, Estimate(0.5, 0.4, 0.6)), paper)  # a better score also counts as equal
     assert (near["count_category"], near["count_ratio"], near["count_ratio_low"]) == (
         "car",
         0.5,
         0.45,
     )  # humans are few
     more = [row_of("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
-    assert [as_good_as(row, paper) for row in more] == [True, True, False]
-    assert [row[-1] for row in sampler_table(rows).rows] == ["no", "–", "yes"]
-    (layout, *_), page = sampler_charts(rows), sampler_html(rows, [], 1, ["how"])
+    assert [is_as_good_as(row, paper) for row in more] == [True, True, False]
+    assert [row[-1] for row in build_sampler_table(rows).rows] == ["no", "–", "yes"]
+    (layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
     assert page.count("<svg") == 4 and "as good as ddpm of 250" in page
     scaled = row_of("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
-    assert reference_row([*rows, scaled]) is paper  # the paper does not scale the noise
-    assert sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
+    assert find_reference_row([*rows, scaled]) is paper  # the paper does not scale the noise
+    assert build_sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"

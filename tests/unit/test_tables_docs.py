@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT, random_scene
 
-from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, yaw_rotation
+from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
-from pipelines.generation.batch_edit import EditRequest, edited
+from pipelines.generation.batch_edit import EditRequest, edit_shard
 from pipelines.preprocess.sources import argoverse2, kitti360
-from pipelines.preprocess.sources.town.generator import town_drive
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.runtime import storage
-from pipelines.schema.density_labels import density, density_thresholds
+from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 from pipelines.schema.tables import (
     CATEGORY_MEANING,
     EDITS,
@@ -34,9 +34,9 @@ from pipelines.schema.tables import (
     REJECTS,
     SCENES,
     Shard,
-    latents_schema,
+    make_latents_schema,
+    make_rejects_table,
     read_scenes,
-    rejects_table,
 )
 
 PAGE = ROOT / "docs/tables.md"
@@ -46,7 +46,7 @@ SCHEMAS = {
     "rasters": RASTERS,
     "rejects": REJECTS,
     "edits": EDITS,
-    "latents": latents_schema((4, 8, 8)),
+    "latents": make_latents_schema((4, 8, 8)),
 }
 SETUP, COLUMNS = "Questions", "On disk"  # headings whose SQL block is no query
 
@@ -109,7 +109,9 @@ def labelled(scenes: list[Scene]) -> list[Scene]:
         count = np.array([np.isin(s.category, group).sum() for s in scenes])
         volume = np.array([s.volume_m3[np.isin(s.category, group)].sum() for s in scenes])
         training = np.array([s.split == "train" for s in scenes])
-        labels[name] = density(count, volume, density_thresholds(count[training], volume[training])).tolist()
+        labels[name] = classify_density(
+            count, volume, compute_density_thresholds(count[training], volume[training])
+        ).tolist()
     return [replace(s, **{name: labels[name][k] for name in labels}) for k, s in enumerate(scenes)]
 
 
@@ -138,7 +140,7 @@ def invented(scene: Scene, index: int) -> Scene:
 @pytest.fixture(scope="module")
 def town() -> list[Scene]:
     """Two drives: the first has training and then test scenes, the second training scenes only."""
-    drives = [town_drive(seed) for seed in (0, 1)]
+    drives = [generate_town(seed) for seed in (0, 1)]
     plan = [(0, k, "train" if k < 10 else "test") for k in range(16)] + [(1, k, "train") for k in range(8)]
     return labelled([drives[d].scene(k, split) for d, k, split in plan])
 
@@ -164,8 +166,8 @@ def root(town, fake, rejects, tmp_path_factory) -> Path:
             Shard(f"{path}/real", "town", split, number).write(members)
     Shard(f"{path}/generated", "generated-docs", "generated", 0).write(fake)
     shard = Shard(f"{path}/real", "town", "train", 0)
-    storage.write_parquet(rejects_table(rejects), shard.path("rejects"))
-    _, changes = edited(town[0], EditRequest((Remove(Select(where="length_m > 3")),), "", "docs"))
+    storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
+    _, changes = edit_shard(town[0], EditRequest((Remove(Select(where="length_m > 3")),), "", "docs"))
     storage.write_parquet(pa.concat_tables(changes), shard.path("edits"))
     moments = pa.FixedShapeTensorArray.from_numpy_ndarray(np.zeros((len(shard.scenes()), 4, 8, 8), np.float16))
     ids = shard.read("scenes", ["scene_id"])["scene_id"].combine_chunks()
@@ -219,7 +221,7 @@ def steps_m(drive: list[Scene]) -> np.ndarray:
 
 def world_m(scene: Scene) -> np.ndarray:
     """(n, 3) centres in the world."""
-    return scene.center_m.astype(float) @ yaw_rotation(scene.world_yaw_rad).T + scene.world_xyz_m
+    return scene.center_m.astype(float) @ make_yaw_rotation(scene.world_yaw_rad).T + scene.world_xyz_m
 
 
 def of(scene: Scene, *names: str) -> np.ndarray:
@@ -310,7 +312,7 @@ def test_tables_page_objects_seen_again(answers, town):
     for k, name in enumerate(CATEGORIES):
         if name in answer.index:
             assert answer.loc[name].tolist() == [seen_again[k], moved[k], mistaken[k]]
-    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
+    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.translate.sum() > 0
 
 
 def test_tables_page_scene_contents(answers, town, fake):
@@ -428,7 +430,7 @@ def test_label_scenes_keeps_column_descriptions(root, tmp_path):
     from pipelines.schema.dataset import Statistics, label_scenes
 
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
-    thresholds = density_thresholds(np.arange(4), np.arange(4.0))
+    thresholds = compute_density_thresholds(np.arange(4), np.arange(4.0))
     final = str(tmp_path / "final.parquet")
     storage.write_parquet(label_scenes(staged, Statistics(thresholds, thresholds, None)), final)
     assert_explained(final, SCENES)

@@ -5,16 +5,16 @@ import pytest
 import torch
 from helpers import random_scene, small_spec
 
-from models.geometry.cholesky import scatter_matrix
+from models.geometry.cholesky import compute_scatter_matrix
 from models.layout import Bounds, LayoutSpec
 from models.scene import CATEGORIES, Grid
-from models.tensors import DecodedLayout, compact_layout, ground_on_grid, layout_batch, scene_from_layout
+from models.tensors import DecodedLayout, decode_layout, encode_layout, make_layout_batch, resample_scene_ground
 
 WIDE = Bounds((-40.0,) * 6, (40.0,) * 6)
 
 
 def round_trip(scene, spec):
-    layout = compact_layout(scene, spec)
+    layout = encode_layout(scene, spec)
     decoded = DecodedLayout(
         layout["occupied"].astype(np.float32),
         (layout["height"] / 65535).astype(np.float32),
@@ -22,7 +22,7 @@ def round_trip(scene, spec):
         layout["real"].astype(np.float32),
         spec.slot_category,
     )
-    return scene_from_layout(decoded, spec, scene)
+    return decode_layout(decoded, spec, scene)
 
 
 def test_layout_round_trip_keeps_primitives_and_pixels():
@@ -34,8 +34,8 @@ def test_layout_round_trip_keeps_primitives_and_pixels():
     assert np.array_equal(back.category, scene.category[order])
     assert np.allclose(back.center_m, scene.center_m[order], atol=1e-4)
     # The scatter matrix, not R: a square footprint has no yaw.
-    want = scatter_matrix(scene.rotation[order], scene.size_m[order])
-    assert np.allclose(scatter_matrix(back.rotation, back.size_m), want, atol=1e-3)
+    want = compute_scatter_matrix(scene.rotation[order], scene.size_m[order])
+    assert np.allclose(compute_scatter_matrix(back.rotation, back.size_m), want, atol=1e-3)
     assert np.array_equal(back.occupied, scene.occupied)
     assert np.abs(back.height_m - scene.height_m).max() < 16 / 65535
     assert (back.size_m[:, 0] >= back.size_m[:, 1]).all()
@@ -43,14 +43,14 @@ def test_layout_round_trip_keeps_primitives_and_pixels():
 
 def test_layout_round_trips_empty_scene():
     scene = random_scene(0, n=0)
-    layout = compact_layout(scene, small_spec(256))
+    layout = encode_layout(scene, small_spec(256))
     assert not layout["real"].any()
     assert len(round_trip(scene, small_spec(256))) == 0
 
 
 def test_layout_keeps_nearest_of_overfull_category():
     scene = random_scene(1, n=100, category=np.full(100, 3, np.int8))
-    layout = compact_layout(scene, small_spec(32, slots=7))
+    layout = encode_layout(scene, small_spec(32, slots=7))
     assert layout["real"].sum() == 7 and layout["real"][21:28].all()
     spec = small_spec(32, slots=7)
     centers = spec.center_bounds_m.restore(layout["features"][21:28, :3])
@@ -60,24 +60,24 @@ def test_layout_keeps_nearest_of_overfull_category():
 
 def test_layout_coarse_ground_is_majority():
     scene = random_scene(2)
-    height, occupied = ground_on_grid(scene, scene.ground_classes, Grid(rows=128, cols=128, resolution_m=0.5))
+    height, occupied = resample_scene_ground(scene, scene.ground_classes, Grid(rows=128, cols=128, resolution_m=0.5))
     count = scene.occupied.reshape(5, 128, 2, 128, 2).sum(axis=(2, 4))
     assert np.array_equal(occupied, count >= 2)
     block = scene.height_m[1, :2, :2][scene.occupied[1, :2, :2]]
     if occupied[1, 0, 0]:
         assert np.isclose(height[1, 0, 0], block.mean())
-    fine, mask = ground_on_grid(scene, scene.ground_classes, Grid(rows=512, cols=512, resolution_m=0.125))
+    fine, mask = resample_scene_ground(scene, scene.ground_classes, Grid(rows=512, cols=512, resolution_m=0.125))
     assert np.array_equal(mask[:, ::2, 1::2], scene.occupied) and np.array_equal(fine[:, ::2, ::2], scene.height_m)
 
 
 def test_layout_missing_ground_class_is_empty():
     spec = LayoutSpec(ground_classes=("road", "crossing"))
-    layout = compact_layout(random_scene(3), spec)
+    layout = encode_layout(random_scene(3), spec)
     assert layout["occupied"][0].any() and not layout["occupied"][1].any()
 
 
 def test_layout_batch_is_normalized():
-    batch = layout_batch([random_scene(i) for i in range(3)], small_spec())
+    batch = make_layout_batch([random_scene(i) for i in range(3)], small_spec())
     assert batch.height.shape == (3, 5, 32, 32) and batch.features.shape == (3, 66, 9)
     for value in (batch.height, batch.occupied, batch.features):
         assert value.dtype == torch.float32 and value.min() >= 0 and value.max() <= 1

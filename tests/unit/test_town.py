@@ -15,21 +15,20 @@ from pipelines.preprocess.sources.town.generator import (
     DISTRICTS,
     TEST_SEEDS_START,
     TRAIN_SEEDS_START,
-    measure,
-    sample_of,
-    take,
-    town_drive,
-    town_plan,
+    generate_town,
+    plan_town_parts,
+    select_poses,
     write_kitti360,
 )
-from pipelines.preprocess.sources.town.land import clip_ears, outlines_of
+from pipelines.preprocess.sources.town.land import clip_ears, trace_outlines
+from pipelines.preprocess.sources.town.reference_statistics import make_sample, measure_town
 
 SMALL = Grid(resolution_m=1.0, rows=64, cols=64)
 
 
 @pytest.fixture(scope="module")
 def drives():
-    return [town_drive(seed) for seed in range(4)]
+    return [generate_town(seed) for seed in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -38,21 +37,21 @@ def thousand():
     relief = []
 
     def scenes():
-        for seed, split, count in town_plan(num_train=0, num_test=1_000):
-            drive = town_drive(seed)
-            for k, index in enumerate(take(len(drive), count)):
+        for seed, split, count in plan_town_parts(num_train=0, num_test=1_000):
+            drive = generate_town(seed)
+            for k, index in enumerate(select_poses(len(drive), count)):
                 scene = drive.scene(int(index), split)
                 if k % 10 == 0:
                     relief.append(np.ptp(scene.surface()[0][scene.occupied.any(axis=0)]))
                 yield scene
 
-    return sample_of(scenes()), np.array(relief)
+    return make_sample(scenes()), np.array(relief)
 
 
 def test_town_scenes_have_target_statistics(thousand):
     sample, _ = thousand
     assert len(sample.counts) == 1_000
-    missed = [f"{r.what} ({r.label}): {r.measured:.2f}, target {r.target:g}" for r in measure(sample) if not r.ok]
+    missed = [f"{r.what} ({r.label}): {r.measured:.2f}, target {r.target:g}" for r in measure_town(sample) if not r.ok]
     assert not missed, "\n".join(missed)
 
 
@@ -87,7 +86,7 @@ def test_town_vegetation_and_relief_are_in_stated_ranges(thousand):
 
 
 def test_town_depends_on_seed(drives):
-    again = town_drive(1)
+    again = generate_town(1)
     for name in ("center_m", "rotation", "size_m", "category", "timestamp", "frame", "world_from_imu", "instance_id"):
         assert np.array_equal(getattr(again, name), getattr(drives[1], name)), name
     assert np.array_equal(again.ground.vertices_m, drives[1].ground.vertices_m)
@@ -233,39 +232,41 @@ def test_cell_outlines_equal_unions():
             parts = [union] if union.geom_type == "Polygon" else list(getattr(union, "geoms", []))
             if any(len(part.interiors) for part in parts):
                 continue
-            found = [shapely.Polygon(outline) for v, outline in outlines_of(cells, s, t) if v == value]
+            found = [shapely.Polygon(outline) for v, outline in trace_outlines(cells, s, t) if v == value]
             assert np.isclose(sum(p.area for p in found), union.area)
             assert np.isclose(shapely.union_all(found).area, union.area)
 
 
 def test_plan_town_covers_request_with_different_towns():
     for num_train, num_test in ((10_000, 1_000), (48, 16), (1, 1), (0, 5), (257, 0)):
-        plan = town_plan(num_train, num_test)
+        plan = plan_town_parts(num_train, num_test)
         for split, wanted in (("train", num_train), ("test", num_test)):
             assert sum(count for _, s, count in plan if s == split) == wanted
         assert len({seed for seed, _, _ in plan}) == len(plan)
         assert all(1 <= count <= 200 for _, _, count in plan)
         assert all((seed >= TEST_SEEDS_START) == (split == "test") for seed, split, _ in plan)
         assert all(seed >= TRAIN_SEEDS_START for seed, _, _ in plan)
-    assert len([1 for _, split, _ in town_plan(48, 16) if split == "train"]) >= 8
+    assert len([1 for _, split, _ in plan_town_parts(48, 16) if split == "train"]) >= 8
     with pytest.raises(ValueError, match="-3"):
-        town_plan(num_train=-3)
+        plan_town_parts(num_train=-3)
 
 
 def test_take_spreads_over_drive():
-    assert take(250, 250).tolist() == list(range(250))
-    some = take(251, 7)
+    assert select_poses(250, 250).tolist() == list(range(250))
+    some = select_poses(251, 7)
     assert len(set(some)) == 7 and some[0] < 30 and some[-1] > 220
-    assert take(5, 0).tolist() == []
+    assert select_poses(5, 0).tolist() == []
     with pytest.raises(ValueError, match="9 scenes"):
-        take(8, 9)
+        select_poses(8, 9)
 
 
 def test_plan_town_shows_every_density_when_small():
     labels = []
-    for seed, split, count in town_plan(48, 0):
-        drive = town_drive(seed)
-        labels += [drive.scene(int(index), split, SMALL).counts()[:2].sum() for index in take(len(drive), count)]
+    for seed, split, count in plan_town_parts(48, 0):
+        drive = generate_town(seed)
+        labels += [
+            drive.scene(int(index), split, SMALL).counts()[:2].sum() for index in select_poses(len(drive), count)
+        ]
     assert np.percentile(labels, 10) < 60 and np.percentile(labels, 90) > 150
     assert set(DISTRICTS) == {"centre", "suburb", "green"}
 
@@ -273,7 +274,7 @@ def test_plan_town_shows_every_density_when_small():
 def test_town_round_trips_kitti360_format(tmp_path, drives):
     drive = drives[2]
     write_kitti360(drive, tmp_path, defects=True, seed=3)
-    name = kitti360.sequences(tmp_path)
+    name = kitti360.list_sequences(tmp_path)
     assert name == ["0002"]
     read, report = kitti360.read_drive(tmp_path, name[0])
     assert report.duplicates > 50 and sum(report.dropped.values()) == 12

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers import random_scene, save_npz
 
-from pipelines.geometry.voxels import VoxelGrid, voxelise
-from pipelines.io.voxel_import import FULL, SHAPES, read_voxels, voxel_picture, write_voxels
-from pipelines.rendering.render import bev_picture
+from pipelines.geometry.voxels import VoxelGrid, voxelize
+from pipelines.io.voxel_import import FULL, SHAPES, draw_voxels, read_voxels, write_voxels
+from pipelines.rendering.render import render_bev
 from pipelines.schema.palette import CLASS_COLORS
 
 
@@ -29,7 +29,7 @@ def test_read_voxels_round_trips_own_deterministic_files(tmp_path, town_scenes):
         path = tmp_path / "deep" / f"{k}.npz"
         write_voxels(str(path), scene)
         got, first = read_voxels(str(path)), path.read_bytes()
-        assert got.dtype == np.uint8 and np.array_equal(got, voxelise(scene, VoxelGrid()))
+        assert got.dtype == np.uint8 and np.array_equal(got, voxelize(scene, VoxelGrid()))
         write_voxels(str(path), scene)
         assert path.read_bytes() == first and len(first) < 200_000
     with pytest.raises(ValueError, match="cannot be read back"):
@@ -41,7 +41,7 @@ def test_read_voxels_round_trips_empty_scene(tmp_path):
     path = str(tmp_path / "empty.npz")
     write_voxels(path, replace(scene, occupied=np.zeros_like(scene.occupied)))
     assert not read_voxels(path).any()
-    assert (voxel_picture(read_voxels(path)) == 255).all()
+    assert (draw_voxels(read_voxels(path)) == 255).all()
 
 
 @pytest.mark.parametrize("shape", SHAPES[1:])
@@ -68,7 +68,7 @@ def test_read_voxels_undoes_every_axis_convention(tmp_path):
 
 def test_voxel_picture_shows_topmost_filled_voxel():
     voxels = random_voxels()
-    picture = voxel_picture(voxels)
+    picture = draw_voxels(voxels)
     for row, col in np.random.default_rng(0).integers(0, 256, (500, 2)):
         seen = [k for k in voxels[row, col] if k]
         assert np.array_equal(picture[row, col], CLASS_COLORS[seen[-1]] if seen else [255, 255, 255])
@@ -79,7 +79,7 @@ def test_voxel_picture_agrees_with_picture_of_primitives(town_scenes):
     """They differ where a primitive covers no voxel centre."""
     tall = VoxelGrid(bottom_m=-10.0, top_m=22.0, levels=64)
     for scene in town_scenes[:3]:
-        same = (voxel_picture(voxelise(scene, tall)) == bev_picture(scene)).all(axis=2)
+        same = (draw_voxels(voxelize(scene, tall)) == render_bev(scene)).all(axis=2)
         assert same.mean() > 0.99
 
 

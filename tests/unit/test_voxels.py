@@ -9,8 +9,8 @@ from helpers import random_rotations, random_scene
 
 import pipelines.geometry.voxels
 from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
-from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, outside, voxelise
-from pipelines.io.mesh_export import scene_from_unit, unit_cuboid
+from pipelines.geometry.voxels import PRECEDENCE, VoxelGrid, count_outside, voxelize
+from pipelines.io.mesh_export import compute_placements, make_unit_cuboid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_ID, EMPTY
 
 # 24 x 20 columns of 0.5 m, 16 levels of 0.5 m.
@@ -62,16 +62,16 @@ def literal(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.05, np.pi])
 def test_voxelise_equals_brute_force(seed, tilt_rad):
     scene = objects(seed, tilt_rad=tilt_rad)
-    got = voxelise(scene, SMALL)
+    got = voxelize(scene, SMALL)
     np.testing.assert_array_equal(got, literal(scene, SMALL))
     assert got.dtype == np.uint8 and 0.05 < (got != EMPTY).mean() < 0.95
 
 
 def test_voxelise_is_independent_of_chunks(monkeypatch):
     scene = objects(8, n=50)
-    whole = voxelise(scene, SMALL)
+    whole = voxelize(scene, SMALL)
     monkeypatch.setattr(pipelines.geometry.voxels, "PART_COLUMNS", 100)
-    np.testing.assert_array_equal(voxelise(scene, SMALL), whole)
+    np.testing.assert_array_equal(voxelize(scene, SMALL), whole)
 
 
 def test_voxelise_equals_brute_force_for_extreme_shapes():
@@ -79,7 +79,7 @@ def test_voxelise_equals_brute_force_for_extreme_shapes():
     scene = objects(1, n=200)
     size_m = rng.choice([0.02, 0.3, 1.0, 14.0], (200, 3)).astype(np.float32)
     scene = replace(scene, size_m=size_m, rotation=random_rotations(rng, 200).astype(np.float32))
-    np.testing.assert_array_equal(voxelise(scene, SMALL), literal(scene, SMALL))
+    np.testing.assert_array_equal(voxelize(scene, SMALL), literal(scene, SMALL))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,22 +87,22 @@ def test_voxelise_boxes_equal_trimesh(seed):
     scene = objects(seed, n=12).select(slice(None))
     scene = replace(scene, category=np.full(12, CAR, np.int8))
     inside = np.zeros(int(np.prod(SMALL.shape)), bool)
-    for transform in scene_from_unit(scene):
-        box = trimesh.Trimesh(*unit_cuboid()).apply_transform(transform)
+    for transform in compute_placements(scene):
+        box = trimesh.Trimesh(*make_unit_cuboid()).apply_transform(transform)
         inside |= box.contains(centers_m(SMALL).reshape(-1, 3))
     assert inside.mean() > 0.02
-    np.testing.assert_array_equal((voxelise(scene, SMALL) != EMPTY).reshape(-1), inside)
+    np.testing.assert_array_equal((voxelize(scene, SMALL) != EMPTY).reshape(-1), inside)
 
 
 def test_voxelise_ellipsoids_equal_trimesh_up_to_facets():
     scene = objects(3, n=8)
     scene = replace(scene, category=np.full(8, ELLIPSOID, np.int8), size_m=scene.size_m * 1.5)
-    got = (voxelise(scene, SMALL) != EMPTY).reshape(-1)
+    got = (voxelize(scene, SMALL) != EMPTY).reshape(-1)
     points = centers_m(SMALL).reshape(-1, 3)
 
     def inside(scale: float) -> np.ndarray:
         found = np.zeros(len(points), bool)
-        for transform in scene_from_unit(scene):
+        for transform in compute_placements(scene):
             ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5 * scale)
             found |= ball.apply_transform(transform).contains(points)
         return found
@@ -116,28 +116,28 @@ def test_voxelise_preserves_volume():
     voxels = VoxelGrid(Grid(front_m=8.0, left_m=8.0, resolution_m=0.1, rows=160, cols=160), -4.0, 4.0, 64)
     for category in (CAR, ELLIPSOID):
         scene = replace(objects(5, 1), category=np.array([category], np.int8), center_m=np.zeros((1, 3), np.float32))
-        volume_m3 = (voxelise(scene, voxels) != EMPTY).sum() * 0.1 * 0.1 * voxels.step_m
+        volume_m3 = (voxelize(scene, voxels) != EMPTY).sum() * 0.1 * 0.1 * voxels.step_m
         assert volume_m3 == pytest.approx(scene.volume_m3.sum(), rel=0.02)
 
 
 def test_voxelise_ignores_order_and_prefers_finer_category():
     scene = objects(2, n=60)
     shuffled = scene.select(np.random.default_rng(0).permutation(60))
-    np.testing.assert_array_equal(voxelise(scene, SMALL), voxelise(shuffled, SMALL))
+    np.testing.assert_array_equal(voxelize(scene, SMALL), voxelize(shuffled, SMALL))
     both = place(place(objects(0, 2), 0, [6, 0, 2], [2, 2, 2]), 1, [6, 0, 2], [4, 4, 4], HOUSE)
-    got = voxelise(both, SMALL)
+    got = voxelize(both, SMALL)
     assert (got == CLASS_ID["vehicle_small"]).sum() == 4**3
     assert (got == CLASS_ID["construction_big"]).sum() == 8**3 - 4**3
 
 
 def test_voxelise_counts_center_on_face_as_inside():
     x, y, z = centers_m(SMALL)[3, 5, 7]
-    got = voxelise(one_box([x + 0.5, y, z], [1.0, 0.01, 0.01]), SMALL)  # from the centre of row 3 to that of row 1
+    got = voxelize(one_box([x + 0.5, y, z], [1.0, 0.01, 0.01]), SMALL)  # from the centre of row 3 to that of row 1
     assert np.argwhere(got).tolist() == [[1, 5, 7], [2, 5, 7], [3, 5, 7]]
 
 
 def test_voxelise_index_zero_is_farthest_leftmost_lowest():
-    got = voxelise(one_box([11.75, 4.75, -1.75], [0.2, 0.2, 0.2]), SMALL)
+    got = voxelize(one_box([11.75, 4.75, -1.75], [0.2, 0.2, 0.2]), SMALL)
     assert np.argwhere(got).tolist() == [[0, 0, 0]] and got[0, 0, 0] == CATEGORY_IDS[CAR]
 
 
@@ -168,7 +168,7 @@ def test_voxelise_ground_is_voxel_at_surface(pixels):
     grid = Grid(front_m=12.0, left_m=6.0, resolution_m=12.0 / pixels, rows=pixels, cols=pixels)
     voxels = VoxelGrid(replace(SMALL.columns, left_m=6.0, cols=24), -1.0, -0.2, 8)
     scene = random_scene(4, n=0, grid=grid)
-    got = voxelise(scene, voxels)
+    got = voxelize(scene, voxels)
     np.testing.assert_array_equal(got, literal_ground(scene, voxels))
     assert (got != EMPTY).any(axis=2).mean() > 0.3 and ((got != EMPTY).sum(axis=2) <= 1).all()
 
@@ -177,29 +177,29 @@ def test_voxelise_primitives_override_ground():
     scene = random_scene(4, n=30, grid=SMALL.columns)
     scene = replace(scene, center_m=scene.center_m * np.float32([0.2, 0.2, 0.5]))
     bare, ground = replace(scene, occupied=np.zeros_like(scene.occupied)), scene.select([])
-    primitives = voxelise(bare, SMALL)
+    primitives = voxelize(bare, SMALL)
     np.testing.assert_array_equal(
-        voxelise(scene, SMALL), np.where(primitives != EMPTY, primitives, voxelise(ground, SMALL))
+        voxelize(scene, SMALL), np.where(primitives != EMPTY, primitives, voxelize(ground, SMALL))
     )
 
 
 def test_voxelise_counts_primitives_outside():
     scene = objects(6, n=300)
-    corners = scene_from_unit(scene)[:, :3, :3] @ unit_cuboid()[0].T + scene.center_m[:, :, None]
+    corners = compute_placements(scene)[:, :3, :3] @ make_unit_cuboid()[0].T + scene.center_m[:, :, None]
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5).vertices
-    points = scene_from_unit(scene)[:, :3, :3] @ ball.T + scene.center_m[:, :, None]
+    points = compute_placements(scene)[:, :3, :3] @ ball.T + scene.center_m[:, :, None]
     z = [p[2] if c == ELLIPSOID else q[2] for p, q, c in zip(points, corners, scene.category, strict=True)]
     low_m, high_m = np.array([v.min() for v in z]), np.array([v.max() for v in z])
     near = np.abs(np.stack([low_m, high_m]) - np.array([[[-2.0]], [[6.0]]])).min(axis=(0, 1)) < 0.01
     scene, low_m, high_m = scene.select(~near), low_m[~near], high_m[~near]
-    got = outside(scene, SMALL)
+    got = count_outside(scene, SMALL)
     for c in range(len(CATEGORIES)):
         own = scene.category == c
         partly = own & ((low_m < -2) | (high_m > 6))
         wholly = own & ((high_m < -2) | (low_m > 6))
         assert got.objects[c].tolist() == [own.sum(), partly.sum(), wholly.sum()]
     assert got.objects[:, 2].sum() > 5 and got.ground.tolist() == [0, 0]
-    assert (outside(scene, SMALL) + got).objects.sum() == 2 * got.objects.sum()
+    assert (count_outside(scene, SMALL) + got).objects.sum() == 2 * got.objects.sum()
 
 
 def test_voxelise_counts_and_drops_ground_outside():
@@ -208,21 +208,21 @@ def test_voxelise_counts_and_drops_ground_outside():
     high = replace(scene, height_m=np.where(scene.occupied, np.float32(6.0), 0))
     known = scene.occupied.any(axis=0).sum()
     for moved in (low, high):
-        assert not voxelise(moved, SMALL).any()
-        assert outside(moved, SMALL).ground.tolist() == [known, known]
-    assert outside(scene, SMALL).ground.tolist() == [known, 0]
+        assert not voxelize(moved, SMALL).any()
+        assert count_outside(moved, SMALL).ground.tolist() == [known, known]
+    assert count_outside(scene, SMALL).ground.tolist() == [known, 0]
 
 
 @pytest.mark.parametrize("levels", [1, 7, 33, 64])
 def test_voxelise_accepts_up_to_64_levels(levels):
     voxels = replace(SMALL, levels=levels)
     scene = objects(7)
-    np.testing.assert_array_equal(voxelise(scene, voxels), literal(scene, voxels))
+    np.testing.assert_array_equal(voxelize(scene, voxels), literal(scene, voxels))
 
 
 def test_voxelise_empty_scene_is_empty_with_defaults_of_paper():
     assert VoxelGrid().shape == (256, 256, 32) and VoxelGrid().step_m == 0.25
-    assert not voxelise(objects(0, n=0), SMALL).any()
+    assert not voxelize(objects(0, n=0), SMALL).any()
 
 
 @pytest.mark.parametrize("options", [{"levels": 0}, {"levels": 65}, {"bottom_m": 7.0}, {"top_m": np.nan}])

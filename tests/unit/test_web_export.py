@@ -6,12 +6,12 @@ import io
 import numpy as np
 from PIL import Image
 
-from pipelines.io.web_export import web_scene
-from pipelines.schema.palette import CLASS_COLORS, ground_ids
+from pipelines.io.web_export import export_web_scene
+from pipelines.schema.palette import CLASS_COLORS, list_ground_ids
 
 
 def test_web_scene_equals_scene(gallery_scenes):
-    scene, content = gallery_scenes[0], web_scene(gallery_scenes[0])
+    scene, content = gallery_scenes[0], export_web_scene(gallery_scenes[0])
     assert len(content["primitives"]) == len(scene)
     for index, primitive in enumerate(content["primitives"]):
         assert np.allclose(primitive["center_m"], scene.center_m[index], atol=1e-3)
@@ -27,4 +27,4 @@ def test_web_scene_equals_scene(gallery_scenes):
     picture = Image.open(io.BytesIO(base64.b64decode(ground["picture"].split(",")[1]))).convert("RGBA")
     pixels = np.asarray(picture)
     assert np.array_equal(pixels[..., 3] > 0, winner >= 0)
-    assert np.array_equal(pixels[winner >= 0][:, :3], CLASS_COLORS[ground_ids(scene)[winner[winner >= 0]]])
+    assert np.array_equal(pixels[winner >= 0][:, :3], CLASS_COLORS[list_ground_ids(scene)[winner[winner >= 0]]])
