@@ -81,7 +81,8 @@ def home(tmp_path_factory, cluster) -> Path:
     """A $PRITTI_HOME of its own, in which the smoke presets have run once: data, models, latents."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
-    from jobs.train_dit import Config, train
+    from jobs.implementation.train_dit import train
+    from jobs.train_dit import Config
 
     train(Config(preset="smoke"))
     return path
@@ -95,8 +96,9 @@ def smoke(tmp_path_factory, cluster) -> Path:
     import torch
 
     import jobs.support.trainer
+    from jobs.implementation.train_dit import train
     from jobs.support.trainer import as_tensors
-    from jobs.train_dit import Config, train
+    from jobs.train_dit import Config
     from pipelines.training.data_loader import batches
 
     def fit_here(run, num_workers: int, output: str) -> str:

@@ -8,7 +8,8 @@ import pytest
 import safetensors.numpy
 from golden_recipe import random_state_dict
 
-from jobs.evaluate_scenes import Config, evaluate
+from jobs.evaluate_scenes import Config
+from jobs.implementation.evaluate_scenes import evaluate
 from pipelines.evaluation.evaluate import compare, memorisation
 from pipelines.evaluation.features import Looks, chosen_scenes, describe
 from pipelines.metrics.adm_npz import write_npz
@@ -34,9 +35,9 @@ def test_tables_and_their_pictures_score_the_same(smoke, weights, tmp_path):
     data = str(smoke / "datasets/smoke")
     test = chosen_scenes(Selection(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([bev_picture(scene)]) for scene in test), SAMPLES)
-    options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3), "actors": 1}
+    options = {"real": data, "max_scenes": SAMPLES, "inception": weights, "k": (1, 3), "num_actors": 1}
     as_tables = evaluate(
-        Config(generated=data, generated_split="test", balance=False, output=str(tmp_path / "tables"), **options)
+        Config(generated=data, generated_split="test", balance_labels=False, output=str(tmp_path / "tables"), **options)
     )["generation"]
     as_pictures = evaluate(Config(generated=str(tmp_path / "test.npz"), output=str(tmp_path / "npz"), **options))[
         "generation"
@@ -111,9 +112,9 @@ def test_degenerate_features_get_the_right_number_or_a_clear_error(cluster):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"samples": 1}, "--samples is 1, expected 2 or more"),
+        ({"max_scenes": 1}, "--max-scenes is 1, expected 2 or more"),
         ({"supersample": 0}, "--supersample is 0"),
-        ({"reference": "apart", "apart_m": 0.0}, "apart_m is 0"),
+        ({"reference": "min-distance", "min_distance_m": 0.0}, "apart_m is 0"),
         ({"inception": "nowhere.pth"}, "nowhere.pth: no such file"),
         ({"generated": "nowhere.npz"}, "nowhere.npz: no such file"),
     ],

@@ -28,7 +28,8 @@ def town_scenes() -> list[Scene]:
 
 @pytest.fixture(scope="module")
 def page(town_scenes, tmp_path_factory, cluster) -> Path:
-    from jobs.inspect_scenes import Gallery, write_gallery
+    from jobs.implementation.inspect_scenes import write_gallery
+    from jobs.inspect_scenes import Gallery
 
     root = tmp_path_factory.mktemp("gallery")
     Shard(str(root), "town", "test", 0).write(town_scenes)

@@ -16,7 +16,8 @@ from scenes import random_scene
 from scipy.spatial import ConvexHull
 from test_report import Page as PlainPage
 
-from jobs.inspect_scenes import OneScene, Report, Sheet, draw_scenes, draw_sheet, write_page
+from jobs.implementation.inspect_scenes import draw_scenes, draw_sheet, write_dataset_report
+from jobs.inspect_scenes import OneScene, Report, Sheet
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, ELLIPSOID, Grid
 from pipelines.io.mesh_export import cuboid_triangles, ellipsoid_triangles
@@ -217,7 +218,7 @@ def test_pictures_made_by_ray_are_those_of_render(cluster, town, tmp_path):
     for k, (above, oblique) in zip(chosen, painted, strict=True):
         assert np.array_equal(above, bev_picture(scenes[names[k]], 96, supersample=2))
         assert np.array_equal(oblique, picture_3d(scenes[names[k]], 80, 60))
-    config = Sheet(dataset=town, split="train", sort="vegetation", size=96, output=str(tmp_path / "sheet.png"))
+    config = Sheet(dataset=town, split="train", sort="vegetation", size_px=96, output=str(tmp_path / "sheet.png"))
     sheet = np.asarray(Image.open(draw_sheet(config)))
     order = Catalogue.read(town, split="train").choose(8, "vegetation")
     picture = bev_picture(scenes[Catalogue.read(town, split="train").column("scene_id")[order[0]]], 96, supersample=2)
@@ -317,7 +318,7 @@ def test_maps_of_many_sequences_fit_the_page(sequences):
 
 
 def test_a_generated_directory_has_a_page_without_dataset_json(generated, tmp_path):
-    path = write_page(Report(dataset=generated, pictures=0, output=str(tmp_path / "page.html")))
+    path = write_dataset_report(Report(dataset=generated, num_examples=0, output=str(tmp_path / "page.html")))
     page = Page(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
     for absent in ("p95", "slots", "Split map", "Label thresholds", "Rejected"):
@@ -327,7 +328,9 @@ def test_a_generated_directory_has_a_page_without_dataset_json(generated, tmp_pa
 
 
 def test_the_report_shows_scenes(cluster, town, tmp_path):
-    path = write_page(Report(dataset=town, source="town", split="test", pictures=2, output=str(tmp_path / "p.html")))
+    path = write_dataset_report(
+        Report(dataset=town, source="town", split="test", num_examples=2, output=str(tmp_path / "p.html"))
+    )
     page = Page(Path(path).read_text("utf-8"))
     images = page.all("img")
     assert len(images) == 4 and all(image["src"].startswith("data:image/") for image in images)
@@ -342,8 +345,8 @@ def test_the_report_shows_scenes(cluster, town, tmp_path):
 
 
 def test_scenes_are_written_without_ray(generated, tmp_path, monkeypatch):
-    monkeypatch.setattr("jobs.inspect_scenes.start_ray", None)
-    written = draw_scenes(OneScene(dataset=generated, count=2, seed=1, glb=True, output=str(tmp_path)))
+    monkeypatch.setattr("jobs.implementation.inspect_scenes.start_ray", None)
+    written = draw_scenes(OneScene(dataset=generated, max_scenes=2, seed=1, glb=True, output=str(tmp_path)))
     assert sorted(path.rsplit(".", 1)[1] for path in written) == ["glb", "glb", "png", "png"]
     names = [path.rsplit("/", 1)[1].removesuffix(".png") for path in written if path.endswith(".png")]
     assert set(names) <= {f"generated-x-0-{k}" for k in range(4)} and len(set(names)) == 2
@@ -351,7 +354,7 @@ def test_scenes_are_written_without_ray(generated, tmp_path, monkeypatch):
     assert sum(re.fullmatch(r"[a-z_]+_\d{4}", node) is not None for node in nodes) == 9
     (again,) = draw_scenes(OneScene(ids=(names[0],), dataset=generated, output=str(tmp_path / "again")))
     assert Path(again).read_bytes() == (tmp_path / f"{names[0]}.png").read_bytes()
-    with pytest.raises(ValueError, match="--count is 0, expected at least 1"):
-        draw_scenes(OneScene(dataset=generated, count=0))
+    with pytest.raises(ValueError, match="--max-scenes is 0, expected at least 1"):
+        draw_scenes(OneScene(dataset=generated, max_scenes=0))
     with pytest.raises(ValueError, match="no split=test; there are source="):
         draw_scenes(OneScene(dataset=generated, split="test"))

@@ -12,23 +12,31 @@ from models.pretrained import CHECKSUMS, WEIGHTS, checksums, pipeline_path, rele
 def evaluated(smoke) -> Path:
     """Scores of the smoke model's own scenes and reconstructions."""
     from jobs import evaluate_scenes, sample_scenes
+    from jobs.implementation.evaluate_scenes import evaluate
+    from jobs.implementation.sample_scenes import sample
 
-    sample_scenes.sample(
+    sample(
         sample_scenes.Config(
-            num_scenes=6, run="judged", sampler="dpm++", steps=2, noise_scaling=1.01, existence_threshold=0.25
+            num_scenes=6,
+            run="judged",
+            sampler="dpm++",
+            num_inference_steps=2,
+            noise_scaling=1.01,
+            existence_threshold=0.25,
         )
     )
     real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
     config = evaluate_scenes.Config(
-        real=real, real_split="test", run="judged", lvae=lvae, limit=4, pictures=0, actors=1
+        real=real, real_split="test", run="judged", lvae=lvae, max_reconstructed_scenes=4, num_examples=0, num_actors=1
     )  # fmt: skip
-    evaluate_scenes.evaluate(config)
+    evaluate(config)
     return smoke / "evaluations/judged"
 
 
 def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
-    from jobs.publish_model import Config, publish
-    from jobs.support.options import pipeline_directory
+    from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
+    from jobs.support.model_directories import pipeline_directory
     from pipelines.generation.sample import load_pipeline
 
     output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
@@ -61,7 +69,8 @@ def test_a_model_is_published_with_its_card_and_found_again(smoke, evaluated):
 
 
 def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_path):
-    from jobs.publish_model import Config, publish
+    from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
 
     with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
         publish(Config(name="none", evaluation=str(tmp_path)))
@@ -92,11 +101,12 @@ def test_without_its_own_evaluation_nothing_is_published(smoke, evaluated, tmp_p
 
 
 def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monkeypatch, tmp_path):
-    from jobs.publish_model import Config, publish
+    from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
 
     first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
-    monkeypatch.setattr("jobs.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
+    monkeypatch.setattr("jobs.implementation.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
     config = Config(
         model=str(smoke / "models/pritti-smoke"), evaluation=str(evaluated), output=str(tmp_path / "second"), register=False
     )  # fmt: skip
@@ -112,9 +122,10 @@ def test_weights_that_nothing_tells_of_are_not_published(smoke, evaluated, monke
 def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_path):
     import torch
 
-    from jobs.publish_model import history
+    from jobs.implementation.publish_model import history
+    from jobs.implementation.train_dit import prepare
     from jobs.support.trainer import as_tensors, tag_weights
-    from jobs.train_dit import Config, prepare
+    from jobs.train_dit import Config
     from pipelines.generation.sample import load_pipeline
     from pipelines.training.data_loader import batches
     from pipelines.training.latents import weights_digest
@@ -142,20 +153,20 @@ def test_a_run_begins_with_trained_weights_and_both_runs_are_told_of(smoke, tmp_
     sampling = load_pipeline(complete(str(more))).config
     assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # as where it began
     with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
-        prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
+        prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
         prepare(Config(preset="smoke", name="other", start_from="town"))
 
 
 def test_a_password_in_the_tracking_uri_is_not_shown():
-    from jobs.support.tracking import shown
+    from jobs.support.tracking import hide_credentials
 
-    assert shown("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
-    assert shown("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
+    assert hide_credentials("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
+    assert hide_credentials("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
 
 
 def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
-    from jobs.support.options import pipeline_directory
+    from jobs.support.model_directories import pipeline_directory
 
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
         with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
@@ -163,7 +174,7 @@ def test_a_name_that_is_no_model_is_told_which_there_are(smoke, tmp_path):
 
 
 def test_without_a_name_the_only_trained_model_is_meant_or_the_released_one(tmp_path, monkeypatch):
-    from jobs.support.options import pipeline_directory
+    from jobs.support.model_directories import pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
     assert pipeline_directory("") == pipeline_path("town")

@@ -195,7 +195,8 @@ def test_the_page_shows_truth_beside_reconstruction(dataset, rebuilt):
 
 
 def test_one_mlflow_run_per_output_directory(tmp_path, monkeypatch):
-    from jobs.support.tracking import client, publish_scores, tracking_uri
+    from jobs.support.scores import publish_scores
+    from jobs.support.tracking import client, tracking_uri
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)

@@ -124,7 +124,8 @@ def test_a_painting_depends_on_picture_prompt_and_seed(weights):
 
 
 def test_a_drive_is_painted_and_goes_on(weights, tmp_path, cluster):
-    from jobs.paint_streets import Config, paint
+    from jobs.implementation.paint_streets import paint
+    from jobs.paint_streets import Config
 
     drive = tmp_path / "streets" / "drive" / "scene-1"
     (drive / "class_id").mkdir(parents=True)
@@ -134,7 +135,7 @@ def test_a_drive_is_painted_and_goes_on(weights, tmp_path, cluster):
         "streets": str(tmp_path / "streets" / "drive"),
         "diffusion": weights[0],
         "controlnet": weights[1],
-        "steps": 1,
+        "num_inference_steps": 1,
     }
     assert paint(Config(**options)) == (options["streets"], 2)
     files = {path.name: path.stat().st_mtime_ns for path in (drive / "photo").iterdir()}
@@ -150,7 +151,8 @@ def test_a_drive_is_painted_and_goes_on(weights, tmp_path, cluster):
 
 
 def test_missing_weights_are_said_clearly(weights, tmp_path):
-    from jobs.paint_streets import Config, paint
+    from jobs.implementation.paint_streets import paint
+    from jobs.paint_streets import Config
 
     with pytest.raises(ValueError, match="--diffusion is missing"):
         paint(Config(controlnet=weights[1]))

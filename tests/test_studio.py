@@ -120,9 +120,10 @@ def tables(tmp_path_factory) -> Path:
 def address(tables, cluster) -> str:
     from ray import serve as ray_serve
 
-    from jobs.serve_studio import Config, serve
+    from jobs.implementation.serve_studio import serve
+    from jobs.serve_studio import Config
 
-    yield serve(Config(str(tables / "model"), (str(tables / "tables"),), port=free_port(), threads=1))
+    yield serve(Config(str(tables / "model"), (str(tables / "tables"),), port=free_port(), num_threads=1))
     ray_serve.shutdown()
 
 
@@ -231,7 +232,8 @@ def test_with_a_token_nobody_enters_without_it(tables):
 
 
 def test_a_taken_port_and_a_missing_model_are_said_at_once(tables, tmp_path):
-    from jobs.serve_studio import Config, serve
+    from jobs.implementation.serve_studio import serve
+    from jobs.serve_studio import Config
 
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -137,7 +137,8 @@ def test_a_missing_file_and_wrong_axes_are_named(tmp_path):
 
 
 def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     meshes, output = tmp_path / "meshes", tmp_path / "out"
     for k, scene in enumerate(town_scenes):
@@ -174,15 +175,18 @@ def test_meshes_become_tables_that_the_evaluator_reads(cluster, tmp_path, town_s
 
 def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
-    from jobs.evaluate_scenes import evaluate
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.implementation.evaluate_scenes import evaluate
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(scene_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
-    scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores"), actors=1))
+    scores = evaluate(
+        EvaluateConfig(real, "test", output, balance_labels=False, output=str(tmp_path / "scores"), num_actors=1)
+    )
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
     assert generation["random_frechet"]["value"] < 1e-4  # the very same pictures
@@ -190,7 +194,8 @@ def test_imported_scenes_are_scored_like_any_other(smoke, tmp_path):
 
 
 def test_voxels_become_pictures(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     for k, scene in enumerate(town_scenes[:3]):
         write_voxels(str(tmp_path / "in" / f"scene{k}.npz"), scene)
@@ -214,7 +219,8 @@ def test_voxels_become_pictures(cluster, tmp_path, town_scenes):
 
 
 def test_an_import_of_nothing_is_an_error(cluster, tmp_path):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     (tmp_path / "a.glb").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"none of the 1 files could be read; the first: .*a\.glb"):
@@ -251,7 +257,8 @@ def voxel_files(tmp_path_factory, town_scenes):
 
 
 def test_voxel_scores_are_those_of_all_scenes_together(cluster, tmp_path, voxel_files):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     root, voxels = voxel_files
     config = Config(str(root / "truth"), str(root / "rebuilt"), str(root / "stored"), output=str(tmp_path))
@@ -282,7 +289,8 @@ def test_voxel_scores_are_those_of_all_scenes_together(cluster, tmp_path, voxel_
 
 
 def test_the_truth_may_be_a_dataset_and_a_perfect_reconstruction_scores_1(cluster, tmp_path, town_scenes):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     for split, part in (("test", town_scenes[:3]), ("train", town_scenes[3:4])):
         Shard(str(tmp_path / "data"), "town", split, 0).write(part)
@@ -294,14 +302,15 @@ def test_the_truth_may_be_a_dataset_and_a_perfect_reconstruction_scores_1(cluste
     assert scores["left_out"] == {"truths": 0, "reconstructions": 0} and "stored_bytes" not in scores
     turned = evaluate(replace(config, axes=("x+", "y-", "z+")))
     assert turned["voxels"]["miou"] < 0.5
-    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*by --partial"):
+    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*by --allow-missing"):
         evaluate(replace(config, split=""))
-    partial = evaluate(replace(config, split="", partial=True))
+    partial = evaluate(replace(config, split="", allow_missing=True))
     assert partial["scenes"] == 3 and partial["left_out"] == {"truths": 1, "reconstructions": 0}
 
 
 def test_a_broken_reconstruction_and_names_without_counterpart_are_named(cluster, tmp_path, voxel_files):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     root, _ = voxel_files
     for name in ("s0", "s9"):
@@ -309,4 +318,4 @@ def test_a_broken_reconstruction_and_names_without_counterpart_are_named(cluster
     with pytest.raises(ValueError, match=r"truth lack 1 of 5 names: s9; reconstructions lack 3 of 5 names: s1, s2, s3"):
         evaluate(Config(str(root / "truth"), str(tmp_path)))
     with pytest.raises(Exception, match=r"s0\.npz: class ids \[99\]"):
-        evaluate(Config(str(root / "truth"), str(tmp_path), partial=True))
+        evaluate(Config(str(root / "truth"), str(tmp_path), allow_missing=True))
