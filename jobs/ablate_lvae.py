@@ -8,8 +8,8 @@
     jobs/ablate_lvae.py augmentation        mirrored scenes and moved vehicles
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --num-seeds 5
 
-Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML); scores also go to MLflow. Run the same
-command again to resume: finished trials are kept.
+Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML); scores also go to MLflow. Run the
+same command again to resume: finished trials are kept.
 """
 
 from __future__ import annotations
@@ -27,24 +27,23 @@ class Encoding:
     """Measure how well a small object autoencoder reconstructs boxes in each encoding."""
 
     train_sizes: tuple[int, ...] = (1200, 2500, 5000, 10_000)
-    """Training set sizes with the paper's boxes, vehicles; the sets of a seed are nested (default: 1200 2500 5000 10000)."""
+    """Training set sizes with the paper's boxes, vehicles; the sets of a seed are nested."""
     any_footprint_train_sizes: tuple[int, ...] = (5000,)
-    """Training set sizes with boxes of any footprint, including square ones, whose scatter matrix has no yaw (default:
-    5000)."""
+    """Training set sizes with boxes of any footprint, including square ones, whose scatter matrix has no yaw."""
     yaw_only_train_sizes: tuple[int, ...] = (1200, 2500)
-    """Training set sizes with vehicles of which only the numbers that depend on yaw are regressed (default: 1200 2500)."""
+    """Training set sizes with vehicles of which only the numbers that depend on yaw are regressed."""
     num_seeds: int = 5
-    """Number of seeds (default: 5)."""
+    """Number of seeds."""
     epochs: int = 20
-    """Training epochs (default: 20)."""
+    """Training epochs."""
     batch_size: int = 32
-    """Batch size (default: 32)."""
+    """Batch size."""
     learning_rate: float = 5e-4
-    """Learning rate (default: 5e-4)."""
+    """Learning rate."""
     num_test_boxes: int = 2000
-    """Number of boxes of the shared test set (default: 2000)."""
+    """Number of boxes of the shared test set."""
     num_noisy_boxes: int = 1000
-    """Number of boxes per footprint and noise level in the table of yaw errors (default: 1000)."""
+    """Number of boxes per footprint and noise level in the table of yaw errors."""
     max_concurrent_trials: int | None = None
     """Maximum number of concurrent trials (default: one per CPU)."""
     output: str = ""
@@ -56,28 +55,27 @@ class Branches:
     """Train the layout VAE whole, without latent split, without objects and without ground, for equally many steps."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-light or av2 (default: town)."""
+    """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
-    """Training time in minutes on this machine, converted to steps by one measurement: of the first variant in studies at
-    equal steps, of each variant in studies at equal time (default: 10)."""
+    """Training time in minutes, converted to steps by one measurement (one per variant in equal-time studies)."""
     steps: int | None = None
     """Training steps; replaces --minutes (default: from --minutes)."""
     num_seeds: int = 3
-    """Number of seeds; every variant is trained with seed 0, then every variant with seed 1, and so on (default: 3)."""
+    """Number of seeds; every variant is trained with seed 0, then every variant with seed 1, and so on."""
     only_variants: tuple[str, ...] = ()
     """Train and report only these variants, by name; others can be added later (default: all)."""
     batch_size: int | None = None
     """Global batch size over all workers (default: as in the preset)."""
     num_workers: int = 1
-    """Number of Ray Train workers; use one per GPU (default: 1)."""
+    """Number of Ray Train workers; use one per GPU."""
     max_scenes: int | None = None
     """Maximum number of held-out scenes to evaluate, evenly over the split (default: all)."""
     num_checkpoints: int = 4
-    """Number of checkpoints and validations per training, the points of the curves (default: 4)."""
+    """Number of checkpoints and validations per training, the points of the curves."""
     name: str = "branches"
-    """Name of the study and of its runs (default: branches)."""
+    """Name of the study and of its runs."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/ablations/<name>)."""
 
@@ -87,11 +85,11 @@ class Decoders(Branches):
     """Compare the cell decoder with the paper's DETR decoder, with and without shortcuts, at equal time."""
 
     preset: tyro.conf.Positional[str] = "demo"
-    """Preset: smoke, demo, town, kitti360, kitti360-light or av2 (default: demo)."""
+    """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     num_checkpoints: int = 12
-    """Number of checkpoints and validations per training, the points of the curves (default: 12)."""
+    """Number of checkpoints and validations per training, the points of the curves."""
     name: str = "decoders"
-    """Name of the study and of its runs (default: decoders)."""
+    """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +97,9 @@ class Ground(Branches):
     """Train the ground branch alone, from the paper's networks down to a hundredth of them, at equal time."""
 
     num_checkpoints: int = 8
-    """Number of checkpoints and validations per training, the points of the curves (default: 8)."""
+    """Number of checkpoints and validations per training, the points of the curves."""
     name: str = "ground"
-    """Name of the study and of its runs (default: ground)."""
+    """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class Augmentation(Branches):
     """Train with mirrored scenes, moved vehicles, or both, for equally many steps; matters most for few scenes."""
 
     name: str = "augmentation"
-    """Name of the study and of its runs (default: augmentation)."""
+    """Name of the study and of its runs."""
 
 
 Config = (

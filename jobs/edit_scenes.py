@@ -11,8 +11,8 @@
     jobs/edit_scenes.py replay edits.json --input DIR                  a list of edits, one after another
 
 An edit applies to the primitives that match all selection options; --where "true" selects every primitive. Writes the
-same tables with source=edited-<run>, edits/ with the changes of each step, edited-<run>.json with the list for `replay`,
-and <run>.html with pictures.
+same tables with source=edited-<run>, edits/ with the changes of each step, edited-<run>.json with the list for
+`replay`, and <run>.html with pictures.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class EditOptions(SceneOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/edited/<run>)."""
     run: str = "edited"
-    """Name of the run: scenes get source=edited-<run> (default: edited)."""
+    """Name of the run: scenes get source=edited-<run>."""
     num_examples: int = 8
-    """Number of scenes shown on the page, before and after (default: 8)."""
+    """Number of scenes shown on the page, before and after."""
 
     def output_directory(self) -> str:
         return absolute(self.output) if self.output else home("edited", self.run)
@@ -54,8 +54,7 @@ class SelectOptions(EditOptions):
     polygon_m: tuple[float, ...] = ()
     """Select primitives whose centre is in a polygon: x y of its corners in metres, x ahead, y left (default: all)."""
     where: str = ""
-    """Select primitives by an SQL condition on columns of the primitives table, such as "length_m > 4 and y_m < 0"; "true"
-    selects all (default: none)."""
+    """Select by an SQL condition on columns of the primitives table; "true" selects all (default: none)."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Duplicate(SelectOptions):
     """Copy primitives."""
 
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Offset of the copies in metres: x (ahead), y (left), z (up) (default: 0 0 0)."""
+    """Offset of the copies in metres: x (ahead), y (left), z (up)."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,9 @@ class Translate(SelectOptions):
     """Move primitives."""
 
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Offset in metres: x (ahead), y (left), z (up); with --frame object along each primitive's length, width and height
-    (default: 0 0 0)."""
+    """Offset in metres: x (ahead), y (left), z (up), or along each primitive's own axes with --frame object."""
     frame: Literal["scene", "object"] = "scene"
-    """Axes of the offset: those of the scene, or of each primitive (default: scene)."""
+    """Axes of the offset: those of the scene, or of each primitive."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class Rotate(SelectOptions):
     """Rotate primitives about the vertical axis."""
 
     angle_deg: float = 0.0
-    """Angle in degrees, counter-clockwise seen from above (default: 0)."""
+    """Angle in degrees, counter-clockwise seen from above."""
     pivot_m: tuple[float, float] | None = None
     """x and y of the rotation axis in metres (default: the centre of each primitive)."""
 
@@ -97,9 +95,9 @@ class Scale(SelectOptions):
     """Scale primitives."""
 
     factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors of length, width and height (default: 1 1 1)."""
+    """Factors of length, width and height."""
     anchor: Literal["bottom", "centre"] = "bottom"
-    """Point of a primitive that keeps its position (default: bottom)."""
+    """Point of a primitive that keeps its position."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ class Relabel(SelectOptions):
     """Change the category of primitives."""
 
     to: str = "object"
-    """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids (default: object)."""
+    """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids."""
     class_name: str | None = None
     """The dataset's class name (default: the class name of the category)."""
 
@@ -117,8 +115,7 @@ class Snap(SelectOptions):
     """Put primitives on the ground; primitives over unknown ground keep their position."""
 
     slab_offset_m: float = 0.3
-    """Offset in metres of the ground heights above the surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2 (default:
-    0.3)."""
+    """Offset in metres of the ground heights above the surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2."""
 
 
 @dataclass(frozen=True)
@@ -126,17 +123,17 @@ class Repair(SelectOptions):
     """Repair the faults that evaluate_scenes counts: floating, sunken and overlapping objects."""
 
     where: str = "true"
-    """Select primitives by an SQL condition on columns of the primitives table (default: true, which selects all)."""
+    """Select primitives by an SQL condition on columns of the primitives table."""
     slab_offset_m: float = 0.3
-    """Offset in metres of the ground heights above the surface, as for snap (default: 0.3)."""
+    """Offset in metres of the ground heights above the surface, as for snap."""
     ground: Literal["both", "floating", "sunken", "none"] = "both"
-    """Which objects to put on the ground (default: both)."""
+    """Which objects to put on the ground."""
     max_push_m: float = 0.25
-    """Maximum distance in metres by which an overlapping object is pushed (default: 0.25)."""
+    """Maximum distance in metres by which an overlapping object is pushed."""
     min_shrink: float = 0.95
-    """Smallest factor by which an object may be scaled where pushing is not enough (default: 0.95)."""
+    """Smallest factor by which an object may be scaled where pushing is not enough."""
     drop: bool = True
-    """Remove the lower-confidence object of two that still overlap (default: on)."""
+    """Remove the lower-confidence object of two that still overlap."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ class Config:
     output: str = ""
     """Directory to write latents/ and latents.json to (default: the dataset directory)."""
     num_actors: int = 1
-    """Number of models that run in parallel; use one per GPU (default: 1)."""
+    """Number of models that run in parallel; use one per GPU."""
     batch_size: int = 16
-    """Scenes per batch (default: 16)."""
+    """Scenes per batch."""
 
 
 if __name__ == "__main__":

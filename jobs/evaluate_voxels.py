@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Evaluate the voxel reconstructions of any method: IoU, mIoU, IoU per class, size on disk.
+"""Evaluate voxel reconstructions of any method: IoU, mIoU, IoU per class, size on disk.
 
     jobs/evaluate_voxels.py --ground-truth TRUTH --reconstructed DIR           two directories of .npz, same names
     jobs/evaluate_voxels.py --ground-truth DATASET --split test --reconstructed DIR    files named by scene_id
@@ -24,8 +24,7 @@ class Config:
     reconstructed: str
     """Directory or quoted pattern of the reconstructed voxels, .npz."""
     compressed: str = ""
-    """Directory or quoted pattern of the method's compressed scenes, such as latents: any files, named by scene; their size
-    is reported (default: none)."""
+    """Directory or pattern of the method's compressed scenes, any files, whose size is reported (default: none)."""
     split: str = ""
     """Read only scenes of this split of the dataset (default: all splits)."""
     axes: tuple[str, str, str] | None = None
@@ -33,9 +32,9 @@ class Config:
     ground_truth_axes: tuple[str, str, str] | None = None
     """Directions of the ground-truth files' three axes (default: x- y- z+)."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
-    """Lowest and highest z in metres of a dataset's voxels; the reconstructions must have the same (default: -1.5 6.5)."""
+    """Lowest and highest z in metres of a dataset's voxels; the reconstructions must have the same."""
     allow_missing: bool = False
-    """Evaluate the scenes that all sides have instead of stopping at a missing counterpart (default: off)."""
+    """Evaluate the scenes that all sides have instead of stopping at a missing counterpart."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/voxels)."""
 

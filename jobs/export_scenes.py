@@ -22,11 +22,11 @@ from jobs.support.options import SceneOptions
 @dataclass(frozen=True)
 class Config(SceneOptions):
     formats: tuple[Literal["glb", "ply", "npz", "xodr"], ...] = ("glb",)
-    """File formats to write (default: glb)."""
+    """File formats to write."""
     output: str = ""
     """Directory to write to (default: export/ in the input directory)."""
     overwrite: bool = False
-    """Replace existing files (default: off)."""
+    """Replace existing files."""
 
 
 if __name__ == "__main__":

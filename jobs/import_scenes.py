@@ -3,12 +3,13 @@
 
     jobs/import_scenes.py DIR --name theirs                     meshes in class colours, as the paper's authors publish
     jobs/import_scenes.py 'DIR/night-*.glb' --name night --axes y+ z+ x+
-    jobs/import_scenes.py DIR --format npz --name semcity       voxel grids of 256 x 256 x 32, 128 x 128 x 16, 64 x 64 x 8
+    jobs/import_scenes.py DIR --format npz --name semcity       voxel grids, of 256 x 256 x 32 or coarser
 
 GLB meshes become scene tables with source=imported-<name>: score them with evaluate_scenes --generated OUTPUT. Voxel
 grids become OUTPUT/<name>.npz, uint8 pictures from above as arr_0: score them with evaluate_scenes --generated
-OUTPUT/<name>.npz. Unreadable files are listed with the reason in OUTPUT/rejects. docs/imports.md specifies the files. Run
-the same command again to resume after an interruption or to read repaired files.
+OUTPUT/<name>.npz. Unreadable files are listed with the reason in OUTPUT/rejects. docs/imports.md specifies the files.
+An axis is x (forward), y (left) or z (up), with + or -; GLB files of this package contain their axes. Run the same
+command again to resume after an interruption or to read repaired files.
 """
 
 from __future__ import annotations
@@ -26,12 +27,11 @@ class Config:
     files: Annotated[str, tyro.conf.Positional]
     """Directory, searched recursively, or a quoted pattern such as 'DIR/*.glb'."""
     name: str = "scenes"
-    """Name of the import: scenes get source=imported-<name> (default: scenes)."""
+    """Name of the import: scenes get source=imported-<name>."""
     format: Literal["glb", "npz"] = "glb"
-    """File format: glb for semantic meshes, npz for voxel grids of class ids (default: glb)."""
+    """File format: glb for semantic meshes, npz for voxel grids of class ids."""
     axes: tuple[str, str, str] | None = None
-    """Directions of the files' three axes: x forward, y left, z up, each with + or - (default: x+ y- z- for meshes, as the
-    paper's authors publish; x- y- z+ for voxels). GLB files of this package contain their axes."""
+    """Directions of the files' axes, such as x+ y- z- (default: x+ y- z- for meshes, x- y- z+ for voxels)."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/imported/<name>)."""
 

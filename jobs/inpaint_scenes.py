@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Regenerate part of scenes: inside a polygon, beyond a line, or around objects.
 
-    jobs/inpaint_scenes.py --polygon-m 10 -20 50 -20 50 5 10 5           a rectangle: x y of its corners, x ahead, y left
+    jobs/inpaint_scenes.py --polygon-m 10 -20 50 -20 50 5 10 5           a rectangle: corners x y, x ahead, y left
     jobs/inpaint_scenes.py --half-plane 1 0 32 --num-variants 4          everything at least 32 m ahead, four variants
     jobs/inpaint_scenes.py --primitives 3 17 --contents objects          objects around primitives 3 and 17, same ground
     jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects       new objects on the given ground
     jobs/inpaint_scenes.py --polygon-m ... --guided                      fast, with smoother seams
 
-Regions are enlarged to whole latent cells. Writes the same tables with source=generated-<run>, a GLB file per scene, and
-<run>.html.
+Regions are enlarged to whole latent cells. Writes the same tables with source=generated-<run>, a GLB file per scene,
+and <run>.html.
 """
 
 from __future__ import annotations
@@ -27,22 +27,21 @@ class Config(RePaintOptions):
     half_plane: tuple[float, ...] = ()
     """Direction x y, and the distance in metres along it at which the region begins (default: none)."""
     primitives: tuple[int, ...] = ()
-    """Regenerate the surroundings of these primitives, by number in the scene's rows of the primitives table, from 0
-    (default: none)."""
+    """Regenerate the surroundings of these primitives, by row in the primitives table, from 0 (default: none)."""
     margin_m: float = 1.0
-    """Margin around --primitives in metres (default: 1)."""
+    """Margin around --primitives in metres."""
     invert_region: bool = False
-    """Regenerate everything outside the region instead (default: off)."""
+    """Regenerate everything outside the region instead."""
     contents: Literal["both", "ground", "objects"] = "both"
-    """What to regenerate in the region (default: both)."""
+    """What to regenerate in the region."""
     num_variants: int = 1
-    """Number of results per scene (default: 1)."""
+    """Number of results per scene."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/inpainted)."""
     run: str = "inpainted"
-    """Name of the run: scenes get source=generated-<run> (default: inpainted)."""
+    """Name of the run: scenes get source=generated-<run>."""
     num_examples: int = 8
-    """Number of scenes shown on the page (default: 8)."""
+    """Number of scenes shown on the page."""
 
     def output_directory(self) -> str:
         return absolute(self.output) if self.output else home("inpainted")

@@ -8,8 +8,8 @@
     jobs/inspect_scenes.py report --dataset DIR                            one self-contained HTML page
     jobs/inspect_scenes.py gallery --dataset DIR --max-scenes 200          an HTML page with filters and scenes in 3D
 
-Works for real and generated scenes and reads the tables only. Files are written to $PRITTI_HOME/inspect/<dataset> unless
---output is given.
+Works for real and generated scenes and reads the tables only. Files are written to $PRITTI_HOME/inspect/<dataset>
+unless --output is given.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class OneScene(DatasetOptions):
     ids: tyro.conf.Positional[tuple[str, ...]] = ()
     """Scene ids (default: --max-scenes random scenes)."""
     max_scenes: int = 1
-    """Maximum number of random scenes if no id is given (default: 1)."""
+    """Maximum number of random scenes if no id is given."""
     seed: int = 0
-    """Random seed for the choice of scenes (default: 0)."""
+    """Random seed for the choice of scenes."""
     glb: bool = False
-    """Also write each scene's mesh as <id>.glb (default: off)."""
+    """Also write each scene's mesh as <id>.glb."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/inspect/<dataset>)."""
 
@@ -55,20 +55,19 @@ class Sheet(DatasetOptions):
     """Draw a contact sheet of many scenes."""
 
     max_scenes: int = 64
-    """Maximum number of scenes (default: 64)."""
+    """Maximum number of scenes."""
     sort: str = "drive"
-    """Order of the scenes: drive (by sequence and frame), random, vegetation, vehicles, primitives, or a numeric column of
-    the scenes table, such as num_pole or road_area_m2 (default: drive)."""
+    """drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table, such as num_pole."""
     pick: Literal["uniform", "lowest", "highest"] = "uniform"
-    """Which of the sorted scenes: evenly over all, the first or the last (default: uniform)."""
+    """Which of the sorted scenes: evenly over all, the first or the last."""
     view: Literal["bev", "3d"] = "bev"
-    """View: bird's-eye or oblique (default: bev)."""
+    """View: bird's-eye or oblique."""
     size_px: int = 256
-    """Width of each picture in pixels (default: 256)."""
+    """Width of each picture in pixels."""
     num_columns: int = 0
-    """Number of columns; 0 chooses an aspect ratio of about 5 : 4 (default: 0)."""
+    """Number of columns; 0 chooses an aspect ratio of about 5 : 4."""
     seed: int = 0
-    """Random seed for --sort random (default: 0)."""
+    """Random seed for --sort random."""
     output: str = ""
     """PNG file to write (default: $PRITTI_HOME/inspect/<dataset>/sheet.png)."""
 
@@ -78,7 +77,7 @@ class Report(DatasetOptions):
     """Write one HTML page: totals, splits, counts, sizes, ground, labels, rejects, example scenes."""
 
     num_examples: int = 8
-    """Number of scenes shown, from least to most vegetation; with 0 the job runs without Ray (default: 8)."""
+    """Number of scenes shown, from least to most vegetation; with 0 the job runs without Ray."""
     output: str = ""
     """HTML file to write (default: $PRITTI_HOME/inspect/<dataset>/report.html)."""
 
@@ -88,9 +87,9 @@ class Gallery(DatasetOptions):
     """Write one HTML page to publish: scenes in 3D with filters by label and statistics; about 35 kB per scene."""
 
     max_scenes: int = 100
-    """Maximum number of scenes, evenly over the dataset (default: 100)."""
+    """Maximum number of scenes, evenly over the dataset."""
     title: str = "Scenes"
-    """Title of the page (default: Scenes)."""
+    """Title of the page."""
     output: str = ""
     """HTML file to write (default: $PRITTI_HOME/inspect/<dataset>/gallery.html)."""
 

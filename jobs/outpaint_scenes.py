@@ -8,9 +8,9 @@
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
 
 By default one block on each side, as in the paper: four sides in one batch, then four corners. Writes the same tables
-with source=generated-<run>, one scene and one GLB file per input scene, and block_tables/ with the known share of each
-block. A block is generated as soon as the blocks that it depends on are complete; the result does not depend on the
-number of actors.
+with source=generated-<run>, one scene and one GLB file per input scene, and block_tables/ with the known share of
+each block. A block is generated as soon as the blocks that it depends on are complete; the result does not depend on
+the number of actors.
 """
 
 from __future__ import annotations
@@ -27,28 +27,25 @@ class Config(RePaintOptions):
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/outpainted)."""
     run: str = "outpainted"
-    """Name of the run: scenes get source=generated-<run> (default: outpainted)."""
+    """Name of the run: scenes get source=generated-<run>."""
     extent_m: tuple[float, float] | None = None
-    """Length (ahead) and width in metres of the result, with the scene in its middle; replaces the four numbers of blocks
-    (default: none)."""
+    """Length (ahead) and width in metres of the result; replaces the numbers of blocks (default: none)."""
     blocks_ahead: int = 1
-    """Number of blocks ahead of the scene (default: 1)."""
+    """Number of blocks ahead of the scene."""
     blocks_behind: int = 1
-    """Number of blocks behind the scene (default: 1)."""
+    """Number of blocks behind the scene."""
     blocks_left: int = 1
-    """Number of blocks to the left of the scene (default: 1)."""
+    """Number of blocks to the left of the scene."""
     blocks_right: int = 1
-    """Number of blocks to the right of the scene (default: 1)."""
+    """Number of blocks to the right of the scene."""
     overlap: float = 0.5
-    """Overlap of neighbouring blocks, as a share of a block (default: 0.5)."""
+    """Overlap of neighbouring blocks, as a share of a block."""
     order: Literal["outward", "colours"] = "outward"
-    """Order of the blocks: from the scene outward (the paper), or by a colouring of the block grid with four colours, which
-    generates most blocks concurrently and needs an overlap below 0.5 (default: outward)."""
+    """From the scene outward (the paper), or concurrently by a four-colouring; the latter needs overlap < 0.5."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Source of the known latents of a block: its neighbours, re-encoded in the block's frame, or the shifted latents of its
-    neighbours (the paper) (default: reencode)."""
+    """Known latents of a block: its neighbours re-encoded in its frame, or their shifted latents (the paper)."""
     batch_size: int = 4
-    """Blocks of a scene per batch; changes blocks only by rounding (default: 4)."""
+    """Blocks of a scene per batch; changes blocks only by rounding."""
 
     def output_directory(self) -> str:
         return absolute(self.output) if self.output else home("outpainted")

@@ -4,9 +4,9 @@
     jobs/paint_streets.py --streets DIR/streets/drive --diffusion SD_DIR --controlnet CONTROLNET_DIR
     jobs/paint_streets.py ... --prompt "a quiet street in autumn, photograph" --num-inference-steps 30 --num-actors 2
 
-Both models are local directories in diffusers' layout, as safetensors; the job downloads nothing. It needs the package
-transformers (pip install 'pritti-on-ray[photos]') and, in practice, a GPU. Writes photo/ next to each drive's images,
-photos.png and photos.webp. Existing frames are kept.
+Both models are local directories in diffusers' layout, as safetensors; the job downloads nothing. It needs the
+package transformers (pip install 'pritti-on-ray[photos]') and, in practice, a GPU. Writes photo/ next to each drive's
+images, photos.png and photos.webp. Existing frames are kept.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ class Config:
     diffusion: str = ""
     """Directory of a Stable Diffusion pipeline, 1.x or 2.x (required)."""
     controlnet: str = ""
-    """Directory of a ControlNet for it, trained on semantic images in the KITTI-360 or Cityscapes palette (required)."""
+    """Directory of a ControlNet trained on semantic images in the KITTI-360 or Cityscapes palette (required)."""
     prompt: str = "a photograph of a residential street, daylight"
-    """Text prompt (default: a photograph of a residential street, daylight)."""
+    """Text prompt."""
     negative_prompt: str = ""
     """Negative text prompt (default: none)."""
     num_inference_steps: int = 30
-    """Denoising steps (default: 30)."""
+    """Denoising steps."""
     guidance_scale: float = 7.5
-    """Classifier-free guidance scale; 1 switches guidance off (default: 7.5)."""
+    """Classifier-free guidance scale; 1 switches guidance off."""
     controlnet_conditioning_scale: float = 1.0
-    """Weight of the semantic image (default: 1)."""
+    """Weight of the semantic image."""
     seed: int = 0
-    """Random seed of the noise, which is the same for every frame (default: 0)."""
+    """Random seed of the noise, which is the same for every frame."""
     num_actors: int = 1
-    """Number of pipelines that run in parallel; use one per GPU (default: 1)."""
+    """Number of pipelines that run in parallel; use one per GPU."""
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
     jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/own_drives.md
 
-Writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to resume after an
-interruption.
+Writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to resume
+after an interruption.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ class Town:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/town)."""
     num_train: int = 10_000
-    """Number of training scenes (default: 10000)."""
+    """Number of training scenes."""
     num_test: int = 1_000
-    """Number of test scenes, from separate towns (default: 1000)."""
+    """Number of test scenes, from separate towns."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total (default:
-    p95)."""
+    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,11 @@ class Kitti360:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/kitti360)."""
     make_split: bool = True
-    """Split into training and test segments as in the paper, 100 segments; --no-make-split trains on every pose (default:
-    on)."""
+    """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total (default:
-    p95)."""
+    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
     skip_unreadable: bool = False
-    """Skip sequences with unreadable XML, and list them in rejects, instead of stopping (default: off)."""
+    """Skip sequences with unreadable XML, and list them in rejects, instead of stopping."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ class Av2:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/av2)."""
     skip_unreadable: bool = False
-    """Skip logs with unreadable files, and list them in rejects, instead of stopping (default: off)."""
+    """Skip logs with unreadable files, and list them in rejects, instead of stopping."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +74,11 @@ class Own:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/own)."""
     make_split: bool = True
-    """Split into training and test segments along the distance driven, as in the paper, unless there is a splits.json;
-    --no-make-split trains on every pose (default: on)."""
+    """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total (default:
-    p95)."""
+    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
     skip_unreadable: bool = False
-    """Skip unreadable drives, and list them in rejects, instead of stopping (default: off)."""
+    """Skip unreadable drives, and list them in rejects, instead of stopping."""
 
 
 Config = (

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Render street views along the roads of scenes: semantic, instance and depth images, poses.
+"""Render street views along roads of scenes: semantic, instance and depth images, poses.
 
     jobs/render_streets.py                                          the first generated scene
     jobs/render_streets.py --input DIR --split test --max-scenes 8 --spacing-m 0.5
     jobs/render_streets.py --input OUTPAINTED --max-frames 200      a longer drive
     jobs/render_streets.py --width-px 1408 --height-px 376          KITTI-360's own size
 
-The camera follows the centreline of the road mask, on the right half of the road, with the lens of KITTI-360's image_00.
-Writes per scene, under OUTPUT/streets/<run>/<scene_id>/: the PNGs semantic/, class_id/, instance/ (number of the
-primitive + 1), depth/ (16 bits, 256 per metre, 0 beyond the range) and shaded/, cameras.json (poses, intrinsics, class
-ids), sheet.png and drive.webp.
+The camera follows the centreline of the road mask, on the right half of the road, with the lens of KITTI-360's
+image_00. Writes per scene, under OUTPUT/streets/<run>/<scene_id>/: the PNGs semantic/, class_id/, instance/ (number
+of the primitive + 1), depth/ (16 bits, 256 per metre, 0 beyond the range) and shaded/, cameras.json (poses,
+intrinsics, class ids), sheet.png and drive.webp.
 """
 
 from __future__ import annotations
@@ -23,24 +23,23 @@ from jobs.support.options import SceneOptions
 @dataclass(frozen=True)
 class Config(SceneOptions):
     max_scenes: int | None = 1
-    """Maximum number of scenes, taken from the first (default: 1)."""
+    """Maximum number of scenes, taken from the first."""
     output: str = ""
     """Directory in which streets/ is written (default: the input directory)."""
     run: str = "drive"
-    """Name of the run, a directory under streets/ (default: drive)."""
+    """Name of the run, a directory under streets/."""
     spacing_m: float = 1.0
-    """Distance between two frames in metres (default: 1)."""
+    """Distance between two frames in metres."""
     camera_height_m: float = 1.55
-    """Height of the camera above the road in metres (default: 1.55 as in KITTI-360)."""
+    """Height of the camera above the road in metres, as in KITTI-360."""
     pitch_deg: float = 0.0
-    """Pitch of the camera in degrees; positive looks up (default: 0)."""
+    """Pitch of the camera in degrees; positive looks up."""
     width_px: int = 704
-    """Image width in pixels; the field of view does not depend on it (default: 704)."""
+    """Image width in pixels; the field of view does not depend on it."""
     height_px: int = 188
-    """Image height in pixels (default: 188)."""
+    """Image height in pixels."""
     lateral_offset: float = 0.25
-    """Offset of the camera to the right of the centreline, as a share of the road's width; negative is left (default:
-    0.25)."""
+    """Offset of the camera to the right of the centreline, as a share of the road's width; negative is left."""
     max_frames: int | None = None
     """Maximum number of frames per scene (default: to the end of the road)."""
 

@@ -4,9 +4,9 @@
     jobs/run_demo.py                        15 minutes on two cores, all files under runs/demo
     jobs/run_demo.py --lvae-steps 20000 --dit-steps 50000 --output DIR       longer training, better scenes
 
-Generates scenes with the released model, then preprocesses the town, trains the layout VAE, encodes latents, trains the
-diffusion transformer, samples, outpaints a scene and evaluates. It needs no data, no GPU and no network. Run the same
-command again to resume after an interruption.
+Generates scenes with the released model, then preprocesses the town, trains the layout VAE, encodes latents, trains
+the diffusion transformer, samples, outpaints a scene and evaluates. It needs no data, no GPU and no network. Run the
+same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -19,34 +19,33 @@ from jobs.support.cli import run
 @dataclass(frozen=True)
 class Config:
     output: str = "runs/demo"
-    """Directory of all files: data, runs, models, MLflow, report.html (default: runs/demo)."""
+    """Directory of all files: data, runs, models, MLflow, report.html."""
     preset: str = "demo"
-    """Model preset; smoke runs through in two minutes (default: demo)."""
+    """Model preset; smoke runs through in two minutes."""
     num_train: int = 1200
-    """Number of training scenes of the town (default: 1200)."""
+    """Number of training scenes of the town."""
     num_test: int = 200
-    """Number of test scenes of the town (default: 200)."""
+    """Number of test scenes of the town."""
     lvae_steps: int = 500
-    """Training steps of the layout VAE (default: 500)."""
+    """Training steps of the layout VAE."""
     lvae_batch_size: int = 8
-    """Batch size of the layout VAE (default: 8)."""
+    """Batch size of the layout VAE."""
     dit_steps: int = 1700
-    """Training steps of the diffusion transformer (default: 1700)."""
+    """Training steps of the diffusion transformer."""
     dit_batch_size: int = 8
-    """Batch size of the diffusion transformer; many small steps give recognisable scenes sooner than few large ones
-    (default: 8)."""
+    """Batch size of the diffusion transformer; many small steps give recognisable scenes sooner than few large ones."""
     num_released_scenes: int = 12
-    """Number of scenes to generate with the released model before training (default: 12)."""
+    """Number of scenes to generate with the released model before training."""
     num_scenes: int = 48
-    """Number of scenes to generate with the trained model (default: 48)."""
+    """Number of scenes to generate with the trained model."""
     num_inference_steps: int = 100
-    """Denoising steps of sampling (default: 100; paper: 250)."""
+    """Denoising steps of sampling (paper: 250)."""
     outpaint_inference_steps: int = 50
-    """Denoising steps of outpainting with --guided (default: 50; paper: 250, each repeated ten times)."""
+    """Denoising steps of outpainting with --guided (paper: 250, each repeated ten times)."""
     num_actors: int = 2
-    """Number of models that run in parallel when encoding, sampling and evaluating (default: 2)."""
+    """Number of models that run in parallel when encoding, sampling and evaluating."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Serve a studio in the browser to generate, edit, inpaint and extend scenes.
 
-    jobs/serve_studio.py                                      http://127.0.0.1:8600, the scenes in $PRITTI_HOME/generated
+    jobs/serve_studio.py                             http://127.0.0.1:8600, scenes of $PRITTI_HOME/generated
     jobs/serve_studio.py --datasets DIR DIR --model DIR
-    jobs/serve_studio.py --host 0.0.0.0 --host-names studio.example.org     for other machines: prints an address with a token
+    jobs/serve_studio.py --host 0.0.0.0 --host-names studio.example.org     prints an address with a token
 
-Runs on Ray Serve. Every visitor has a separate scene and edit history; the network serves one visitor at a time. The page
-and its viewer come from this process; nothing is fetched from elsewhere. Stop the studio with Ctrl-C.
+Runs on Ray Serve. Every visitor has a separate scene and edit history; the network serves one visitor at a time. The
+page and its viewer come from this process; nothing is fetched from elsewhere. Stop the studio with Ctrl-C.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Config:
     datasets: tuple[str, ...] = ()
     """Dataset directories to open scenes from (default: $PRITTI_HOME/generated, if it has scenes)."""
     host: str = "127.0.0.1"
-    """Address to listen on; every address but a loopback address requires a token (default: 127.0.0.1)."""
+    """Address to listen on; every address but a loopback address requires a token."""
     port: int = 8600
-    """Port to listen on (default: 8600)."""
+    """Port to listen on."""
     host_names: tuple[str, ...] = ()
     """Host names, besides --host, under which visitors reach the studio (default: none)."""
     token: str = ""

@@ -5,8 +5,8 @@
     jobs/sweep_samplers.py --samplers ddpm dpm++ --num-inference-steps 10 250 --num-scenes 64
     jobs/sweep_samplers.py --samplers dpm++ --num-inference-steps 20 --noise-scalings 1 1.005 1.01      for a new model
 
-Writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and samplers.html.
-Run the same command again to resume after an interruption.
+Writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and
+samplers.html. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ class Config:
     real: str = ""
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"
-    """Split of the real scenes (default: test)."""
+    """Split of the real scenes."""
     samplers: tuple[str, ...] = ("ddpm", "ddim", "dpm++")
-    """Samplers to compare: ddpm, ddim, dpm++ or sde-dpm++ (default: ddpm ddim dpm++)."""
+    """Samplers to compare: ddpm, ddim, dpm++ or sde-dpm++."""
     num_inference_steps: tuple[int, ...] = (10, 20, 50, 100, 250)
-    """Numbers of denoising steps to compare (default: 10 20 50 100 250)."""
+    """Numbers of denoising steps to compare."""
     noise_scalings: tuple[float, ...] = ()
-    """Divisors of the predicted noise to compare (default: the value that the model was published with; 1 with ddpm)."""
+    """Divisors of the predicted noise to compare (default: published value; 1 with ddpm)."""
     num_scenes: int = 256
-    """Number of scenes per setting, and of real scenes (default: 256)."""
+    """Number of scenes per setting, and of real scenes."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
     guidance_scale: float = 1.0
-    """Classifier-free guidance scale; 1 switches guidance off (default: 1)."""
+    """Classifier-free guidance scale; 1 switches guidance off."""
     batch_size: int = 8
-    """Scenes per batch and pipeline; changes scenes only by rounding (default: 8)."""
+    """Scenes per batch and pipeline; changes scenes only by rounding."""
     num_examples: int = 4
-    """Number of scenes of each setting shown on the page (default: 4)."""
+    """Number of scenes of each setting shown on the page."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/samplers)."""
     num_actors: int = 1
-    """Number of pipelines that run in parallel; use one per GPU (default: 1)."""
+    """Number of pipelines that run in parallel; use one per GPU."""
 
 
 if __name__ == "__main__":

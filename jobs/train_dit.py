@@ -25,22 +25,21 @@ class Config:
     """Options of a training run; missing values come from the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2 (default: town)."""
+    """Preset: smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     latents: str = ""
     """Directory with latents.json (default: the dataset directory)."""
     label_kind: Literal["vegetation", "vehicle", "joint", "none"] = "vegetation"
-    """Kind of label that the model is conditioned on (default: vegetation)."""
+    """Kind of label that the model is conditioned on."""
     name: str = ""
     """Name of the run; a run name is bound to its options (default: dit-<preset>)."""
     output: str = ""
     """Directory to write the trained pipeline to (default: $PRITTI_HOME/models/pritti-<name or preset>)."""
     num_workers: int = 1
-    """Number of Ray Train workers; use one per GPU (default: 1)."""
+    """Number of Ray Train workers; use one per GPU."""
     start_from: str = ""
-    """Initialise with the weights of this trained pipeline: a directory, a name, models:/NAME/VERSION or the id of an MLflow
-    run (default: random weights)."""
+    """Initialise with the weights of this pipeline, named as --model of other jobs (default: random weights)."""
     steps: int | None = None
     """Training steps (default: as in the preset)."""
     batch_size: int | None = None
@@ -56,18 +55,17 @@ class Config:
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     timestep_sampling: Literal["uniform", "logit-normal"] = "uniform"
-    """Distribution of training timesteps: uniform (the paper), or logit-normal, which favours the middle timesteps, where the
-    positions of objects are decided (default: uniform)."""
+    """Distribution of training timesteps: uniform (the paper), or logit-normal, which favours the middle ones."""
     gradient_accumulation_steps: int = 1
-    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory (default: 1)."""
+    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """Floating-point precision; auto is bf16 on GPUs that support it, else fp32 (default: auto)."""
+    """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
-    """Compile the model with torch.compile, which takes a minute; useful on GPUs (default: off)."""
+    """Compile the model with torch.compile, which takes a minute; useful on GPUs."""
     checkpoint_every: int | None = None
     """Steps between checkpoints (default: a twentieth of the run, at least four)."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
 
 
 if __name__ == "__main__":

@@ -6,8 +6,11 @@
     jobs/train_lvae.py kitti360 --dataset DIR --num-workers 4
     jobs/train_lvae.py demo --train-object-decoder-of town --name lvae-decoder     a new object decoder for a pipeline
 
-Writes the model to $PRITTI_HOME/models/lvae-<preset>. Losses and pictures go to MLflow ($MLFLOW_TRACKING_URI, default an
-sqlite file under $PRITTI_HOME). Run the same command again to resume.
+--train-object-decoder-of keeps the encoders and the ground decoder of a pipeline. Its transformer stays valid,
+because the latents do not change; the pipeline with the new decoder is written to $PRITTI_HOME/models/pritti-<name>.
+
+Writes the model to $PRITTI_HOME/models/lvae-<preset>. Losses and pictures go to MLflow ($MLFLOW_TRACKING_URI, default
+an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ class Config:
     """Options of a training run; missing values come from the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
-    """Preset: smoke, demo, town, kitti360, kitti360-light or av2 (default: town)."""
+    """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     name: str = ""
@@ -33,11 +36,9 @@ class Config:
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
     train_object_decoder_of: str = ""
-    """Train only a new object decoder for this trained pipeline, named as for --model; its encoders and ground decoder are
-    kept. The pipeline's transformer stays valid, because the latents do not change. The pipeline with the new decoder is
-    written to $PRITTI_HOME/models/pritti-<name> (default: train the whole layout VAE)."""
+    """Train only a new object decoder for this pipeline, named as --model of other jobs (default: train all)."""
     num_workers: int = 1
-    """Number of Ray Train workers; use one per GPU (default: 1)."""
+    """Number of Ray Train workers; use one per GPU."""
     steps: int | None = None
     """Training steps (default: as in the preset)."""
     batch_size: int | None = None
@@ -47,22 +48,21 @@ class Config:
     kl_weight: float | None = None
     """Weight of the KL divergence, summed over the latent (default: as in the preset; paper: 1e-6)."""
     latent_noise: float | None = None
-    """Standard deviation of the noise on latents, relative to each channel's, with which decoders learn to tolerate errors
-    in sampled latents (default: as in the preset; paper: 0)."""
+    """Noise on latents during training, in channel standard deviations (default: as in the preset; paper: 0)."""
     gradient_accumulation_steps: int = 1
-    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory (default: 1)."""
+    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """Floating-point precision; auto is bf16 on GPUs that support it, else fp32 (default: auto)."""
+    """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
-    """Compile the model with torch.compile, which takes a minute; useful on GPUs (default: off)."""
+    """Compile the model with torch.compile, which takes a minute; useful on GPUs."""
     checkpoint_every: int | None = None
     """Steps between checkpoints (default: a twentieth of the run, at least four)."""
     flip: bool = False
-    """Augmentation: mirror half of the scenes left to right (default: off)."""
+    """Augmentation: mirror half of the scenes left to right."""
     jitter: bool = False
-    """Augmentation: move the vehicle by up to 1 m and rotate it by up to 2.5 degrees, as in SLEDGE (default: off)."""
+    """Augmentation: move the vehicle by up to 1 m and rotate it by up to 2.5 degrees, as in SLEDGE."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def test_the_job_asks_for_repair(smoke, tmp_path, monkeypatch):
     from jobs.sample_scenes import Config
 
     asked = []
-    monkeypatch.setattr("pipelines.generation.sample.sample_scenes", lambda request, *_: asked.append(request))
+    monkeypatch.setattr("jobs.implementation.sample_scenes.sample_scenes", lambda request, *_: asked.append(request))
     for repair in (False, True):
         sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, num_glb=0, repair=repair))
     assert [request.repair for request in asked] == [False, True]
@@ -169,9 +169,9 @@ def test_outpainting_and_evaluation(smoke, samples, tmp_path):
 
     row, guided = sweep_seams(
         SweepConfig(
-            model,
-            str(samples),
-            "generated-samples",
+            model=model,
+            input=str(samples),
+            source="generated-samples",
             settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
             output=str(tmp_path / "sweep"),
         )

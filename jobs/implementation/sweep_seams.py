@@ -26,7 +26,7 @@ from pipelines.schema.tables import read_scenes
 def sweep_seams(config: Config) -> list[dict]:
     """Outpaint and measure every setting, write all files, and return a row per setting."""
     require_positive(config, "num_actors", "batch_size")
-    model = pipeline_directory(config.neighbour_latentsl)
+    model = pipeline_directory(config.model)
     if not config.settings:
         raise ValueError("--settings is empty: expected five numbers per setting")
 

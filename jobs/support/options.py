@@ -35,25 +35,27 @@ class GenerationOptions(SceneOptions):
     """Which scenes to change, with which pipeline."""
 
     max_scenes: int | None = 1
-    """Maximum number of scenes, taken from the first (default: 1)."""
+    """Maximum number of scenes, taken from the first."""
     model: ModelOption = ""
     label: str = ""
     """Density label to generate for (default: the label of each scene)."""
     seed: int = 0
-    """Random seed (default: 0)."""
+    """Random seed."""
     guidance_scale: float = 1.0
-    """Classifier-free guidance scale; 1 switches guidance off (default: 1)."""
+    """Classifier-free guidance scale; 1 switches guidance off."""
     num_actors: int = 1
-    """Number of pipelines that run in parallel; use one per GPU (default: 1)."""
+    """Number of pipelines that run in parallel; use one per GPU."""
 
 
 @dataclass(frozen=True)
 class RePaintOptions(GenerationOptions):
-    """Which scenes to change, with which pipeline and RePaint settings (paper, Sec. 3.3 and supplement B.3)."""
+    """Which scenes to change, with which pipeline and RePaint settings (paper, Sec. 3.3 and supplement B.3).
+
+    With --guided seams show less, more objects are kept, and the work is 24 times less than with the paper's settings.
+    """
 
     guided: bool = False
-    """Use 50 steps with pseudoinverse guidance, little noise and no resampling instead of the paper's settings. Seams show
-    less, more objects are kept, and the work is 24 times less. The options below override single settings."""
+    """Use 50 steps with pseudoinverse guidance, eta 0.3 and no resampling; the options below override it."""
     num_inference_steps: int | None = None
     """Denoising steps, not counting the steps that RePaint repeats (default: 250 as in the paper; 50 with --guided)."""
     jump_length: int | None = None
@@ -61,7 +63,6 @@ class RePaintOptions(GenerationOptions):
     num_resamplings: int | None = None
     """Number of times that RePaint passes each step, R in the paper (default: 10; 1 with --guided)."""
     pseudoinverse_guidance: float | None = None
-    """Weight of pseudoinverse guidance towards the known region; above 0 a step costs about twice as much (default: 0; 1
-    with --guided)."""
+    """Weight of pseudoinverse guidance towards the known region (default: 0; 1 with --guided)."""
     eta: float | None = None
     """Share of DDPM's noise that a step adds, 0 to 1 (default: 1 as in the paper; 0.3 with --guided)."""
