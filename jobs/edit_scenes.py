@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Edit objects of scenes: remove, duplicate, translate, rotate, scale, relabel, snap or repair.
+"""Edit objects: remove, duplicate, translate, rotate, scale, relabel, snap or repair.
 
     jobs/edit_scenes.py remove --category human two_wheelers --input DIR
     jobs/edit_scenes.py translate --offset-m 5 0 0 --frame object --where "category = 'vehicle_small' and length_m > 4"

@@ -1,1 +1,1 @@
-"""Bodies of the executables in jobs/: imported after the command line has been parsed."""
+"""Implementations of the executables in jobs/, imported after the command line has been parsed."""

@@ -74,8 +74,8 @@ def compare_encodings(config: Encoding) -> str:
     notes = [
         f"{config.num_seeds} seeds, {config.epochs} epochs, batches of {config.batch_size}, learning rate "
         f"{config.learning_rate:g}, {config.num_test_boxes} test boxes, at most "
-        f"{max(r['parameters'] for r in scores):,} parameters; the networks of all encodings differ only in their first "
-        "and last layer.",
+        f"{max(r['parameters'] for r in scores):,} parameters; the networks of all encodings differ only in "
+        "their first and last layer.",
         describe_machine(),
     ]
     write_encoding_report(config, output, rows, losses, notes, tracker)

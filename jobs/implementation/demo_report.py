@@ -21,11 +21,11 @@ from pipelines.schema.tables import read_scenes
 SHOWN = 4
 
 MEANINGS = {
-    "ground_iou": "pixels on which truth and reconstruction agree that a ground class is there, over all that either claims; 1 is perfect (the paper on KITTI-360: 0.9996)",
-    "height_rmse_m": "typical error of the reconstructed ground height, in metres, where there is ground",
-    "height_mse_normalised": "the same squared, heights scaled to [0, 1] by the data's range (the paper: 0.0075)",
-    "ap3d": "average precision of reconstructed boxes over ten IoU thresholds 0.05 to 0.50, all categories but ellipsoids (the paper: 0.621)",
-    "ap3d_50": "the same at IoU 0.50 (the paper: 0.470)",
+    "ground_iou": "IoU of the ground classes over all pixels; 1 is perfect (paper, on KITTI-360: 0.9996)",
+    "height_rmse_m": "root mean squared error of the ground height in metres, where there is ground",
+    "height_mse_normalised": "mean squared error of heights scaled to [0, 1] by the data's range (paper: 0.0075)",
+    "ap3d": "average precision of boxes over ten IoU thresholds, 0.05 to 0.50, without ellipsoids (paper: 0.621)",
+    "ap3d_50": "average precision at IoU 0.50 (paper: 0.470)",
 }
 
 
@@ -100,9 +100,9 @@ def introduction_sections(
         Text(
             "What this is",
             [
-                "A layout VAE and a diffusion transformer were trained from random weights on a procedural town, on this "
-                f"machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. The method is the "
-                "paper's; the models are small and the training is short. Longer runs of the same command are better.",
+                "A layout VAE and a diffusion transformer were trained from random weights on a procedural "
+                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. The "
+                "method is the paper's; the models are small and the training is short. Longer runs of the same command are better.",
             ],
         ),
         KeyFigures(
@@ -138,7 +138,7 @@ def scene_sections(config: Config, real: list[Scene], generated: list[Scene]) ->
         *released,
         scene_pictures(
             "Real scenes",
-            "Held-out scenes of the town, 64 x 64 m, from the side and from above. The car is at the bottom edge and faces up.",
+            "Held-out scenes of the town, 64 x 64 m, in 3D and from above. The car is at the bottom edge, facing up.",
             one_per_label(real, SHOWN),
             "real",
         ),
@@ -165,8 +165,8 @@ def outpainting_pictures(scene: Scene) -> Pictures:
             ),
         ],
         columns=2,
-        note="One generated scene, extended in two passes: four sides, then four corners. Each block overlaps the known "
-        "region by half.",
+        note="One generated scene, extended in two passes: four sides, then four corners. Each block overlaps the "
+        "known region by half.",
     )
 
 

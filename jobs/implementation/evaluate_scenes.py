@@ -57,7 +57,7 @@ def evaluate(config: Config) -> dict:
 
 
 def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> dict:
-    """Return what was evaluated: both sides, the sampling options if one run generated all scenes, the LVAE's weights."""
+    """Return what was evaluated: sides, sampling options if one run generated all scenes, weights of the LVAE."""
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
     about["lvae_weights"] = weights_digest(load_lvae(absolute(config.lvae))) if config.lvae else None
     made = sides.get("generated")
@@ -127,7 +127,7 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
         counts[name] = sum(len(rows) for _, rows in side.shards())
     if sizes["real"] != sizes["generated"]:
         raise ValueError(
-            f"real pictures are {sizes['real']} pixels, generated pictures {sizes['generated']}: expected equal sizes"
+            f"real pictures are {sizes['real']} pixels, generated ones {sizes['generated']}: expected equal sizes"
         )
     return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
 
@@ -144,7 +144,8 @@ def describe_protocol(config: Config, sides: dict[str, Side], looks: Looks) -> l
         "generated": "labels in equal parts as far as they go" if config.balance_labels else "evenly spread",
     }
     words = [
-        f"{name.capitalize()}: {side.limit} of {side.root}, {'the first' if isinstance(side, PictureFile) else chosen[name]}."
+        f"{name.capitalize()}: {side.limit} of {side.root}, "
+        f"{'the first' if isinstance(side, PictureFile) else chosen[name]}."
         for name, side in sides.items()
     ]
     drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"

@@ -30,7 +30,8 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
         step_m = BLOCK_M * (1 - config.overlap)
         if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
             raise ValueError(
-                f"--extent-m is {config.extent_m}, --overlap {config.overlap}: expected at least {BLOCK_M} m, and 0 to 1"
+                f"--extent-m is {config.extent_m}, --overlap {config.overlap}: "
+                f"expected at least {BLOCK_M} m, and 0 to 1"
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
         counts = sides[0], sides[0], sides[1], sides[1]
@@ -73,6 +74,6 @@ def main(config: Config) -> None:
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
     if bare := pc.sum(pc.less(blocks["known_ground"], HARDLY_KNOWN)).as_py():
         print(
-            f"{bare} of {len(blocks)} blocks had almost no known ground; outpainting fails there, as the paper reports: "
+            f"{bare} of {len(blocks)} blocks had almost no known ground, where outpainting fails (as in the paper): "
             f"known_ground below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
         )

@@ -137,7 +137,7 @@ def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Trainin
     parameters = sum(value.numel() for value in model.parameters())
     runs = [find_training(experiment, stage, weights_digest(model), parameters)]
     while start := runs[0].options.get("start_from"):
-        runs.insert(0, find_training(experiment, stage, start, None))  # its network may have been another
+        runs.insert(0, find_training(experiment, stage, start, None))  # its network may differ
     name = experiment.removeprefix("pritti-")
     later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
     return [replace(runs[0], name=name), *later]
@@ -157,7 +157,8 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
         if record := read_published_training(digest):
             return Training(**record | {"stage": stage})
         raise ValueError(
-            f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); set MLFLOW_TRACKING_URI"
+            f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); "
+            "set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
     return Training(

@@ -47,7 +47,8 @@ def sweep_references(config: Config) -> list[dict]:
     storage.write_json(rows, storage.join(output, "sweep.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "sweep.parquet"))
     how = [
-        f"Real: {dataset.root}, split {config.real_split}. Generated: {sides['generated'].root}, labels in equal parts.",
+        f"Real: {dataset.root}, split {config.real_split}. "
+        f"Generated: {sides['generated'].root}, labels in equal parts.",
         "Features: Inception pool3." if config.inception else "Features: a fixed untrained network's; no Inception.",
         "In brackets: 95 % intervals over the judged scenes, neighbourhoods held fixed.",
     ]

@@ -167,7 +167,8 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
         built = lvae.config[key]
         if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
             raise ValueError(
-                f"--train-object-decoder-of {model}: its {key} is {built}, this preset's {wanted}; choose its own preset"
+                f"--train-object-decoder-of {model}: its {key} is {built}, this preset's {wanted}; "
+                "choose its own preset"
             )
     if lvae.spec.fingerprint() != spec.fingerprint():
         raise ValueError(

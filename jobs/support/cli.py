@@ -1,4 +1,4 @@
-"""What every executable needs before heavy packages are imported: paths, the command line, and error messages."""
+"""Paths, command line and error messages: all that an executable needs before heavy packages are imported."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from pipelines.runtime import provenance, storage
 
 
 def tracking_uri() -> str:
-    """$MLFLOW_TRACKING_URI, or an sqlite file under $PRITTI_HOME."""
+    """Return $MLFLOW_TRACKING_URI, or the URI of an sqlite file under $PRITTI_HOME."""
     return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home('mlflow.db')}"
 
 
@@ -36,7 +36,7 @@ def client(uri: str):
 
 
 class Tracker:
-    """Writes to one MLflow run. Picklable: workers open their own client."""
+    """Writes to one MLflow run. It can be pickled: each worker opens its own client."""
 
     def __init__(self, uri: str, run_id: str) -> None:
         self.uri, self.run_id = uri, run_id
@@ -88,17 +88,17 @@ class Tracker:
         self.client.set_tag(self.run_id, key, value)
 
     def picture(self, image, path: str) -> None:
-        """A picture (H, W, 3) uint8 as an artifact."""
+        """Log a picture (H, W, 3) uint8 as an artifact."""
         self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
 
     def artifacts(self, directory: str, path: str) -> None:
         self.client.log_artifacts(self.run_id, directory, path)
 
     def history(self, name: str) -> list[tuple[int, float]]:
-        """(step, value) of a metric, in order; a resumed run's repeated steps once."""
+        """Return (step, value) of a metric in order; of steps that a resumed run repeats, the last value."""
         values = {m.step: m.value for m in self.client.get_metric_history(self.run_id, name)}
         return sorted(values.items())
 
     def finish(self, status: str) -> None:
-        """FINISHED, FAILED or KILLED."""
+        """Set the status of the run: FINISHED, FAILED or KILLED."""
         self.client.set_terminated(self.run_id, status)
