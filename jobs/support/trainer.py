@@ -112,7 +112,7 @@ def with_scene_ids(error: NotFinite, stream: Stream) -> str:
         stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
     ]
     return (
-        f"{error}. Scenes: {', '.join(ids)}; inspect them with jobs/inspect_scenes.py scene ID" if ids else str(error)
+        f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
     )
 
 
