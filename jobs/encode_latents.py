@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
-"""Scenes -> latents with a trained LVAE: DIR/latents/..., aligned with DIR/scenes, and DIR/latents.json.
+"""Encode scenes to latents with a trained layout VAE.
 
-    jobs/encode_latents.py                                     the town dataset with the town LVAE
-    jobs/encode_latents.py --dataset DIR --lvae MODEL --actors 8
+    jobs/encode_latents.py                                     the town dataset with the town layout VAE
+    jobs/encode_latents.py --dataset DIR --lvae MODEL --num-actors 8
 
-Run it again with the same options to go on after an interruption.
+Writes latents/, aligned with the scenes/ table, and latents.json. Run the same command again to resume after an
+interruption.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.support.cli import absolute, home, run, start_ray
+from jobs.support.cli import run
 
 
 @dataclass(frozen=True)
@@ -19,37 +20,14 @@ class Config:
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/town)."""
     lvae: str = ""
-    """Trained LVAE (default: $PRITTI_HOME/models/lvae-town)."""
+    """Directory of the trained layout VAE (default: $PRITTI_HOME/models/lvae-town)."""
     output: str = ""
-    """Where latents/ and latents.json go (default: the dataset directory)."""
-    actors: int = 1
-    """Models at work at once; one per GPU."""
+    """Directory to write latents/ and latents.json to (default: the dataset directory)."""
+    num_actors: int = 1
+    """Number of models that run in parallel; use one per GPU."""
     batch_size: int = 16
-
-
-def encode(config: Config) -> dict:
-    """Encode and return the content of latents.json."""
-    from pipelines.schema.dataset import Dataset
-
-    dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
-    from rich.progress import Progress
-
-    from pipelines.training.latents import encode_latents
-
-    lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
-    output = absolute(config.output) if config.output else dataset.root
-    start_ray()
-    with Progress() as bar:
-        shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))
-        return encode_latents(
-            dataset, lvae, output, config.actors, config.batch_size, lambda row: bar.advance(shown, int(row["count"]))
-        )
-
-
-def main(config: Config) -> None:
-    content = encode(config)
-    print(f"latents of {sum(content['scenes'].values())} scenes, shape {content['shape']}")
+    """Scenes per batch."""
 
 
 if __name__ == "__main__":
-    run(main, Config, description=__doc__)
+    run("encode_latents")

@@ -1,25 +1,23 @@
 #!/usr/bin/env python3
-"""Do the lines between pasted and generated parts show? Outpainted scenes against lines nearby, and real scenes likewise.
+"""Measure how visible the seams of outpainted scenes are.
 
     jobs/evaluate_seams.py --generated DIR                               scenes of jobs/outpaint_scenes.py
     jobs/evaluate_seams.py --generated DIR --rows-m 32 96 --cols-m 32 96
     jobs/evaluate_seams.py --generated DIR --real DIR --real-rows-m 16 32 48
 
-A ratio of 1 means that a line does not show: as many changes of class, as great steps of height, as many cut and doubled
-objects as on parallel lines 4 to 16 m away. Real scenes, cut across the street, give the level to compare with. Lines
-along the vehicle's own street are no fair ones there: a street has its borders at its sides.
+Each score is a ratio between the seam and parallel lines 4 to 16 m away: changes of class, steps of height, cut
+objects and duplicate objects. A ratio of 1 means that the seam does not show. Lines across the street in real scenes
+give the level to compare with. Lines along the street are not comparable: the borders of a street run along it.
 
-Writes metrics.json, metrics.parquet, seams.parquet (a row per scene) and seams.html, and to MLflow. At least 200 seams make a result.
+Writes metrics.json, metrics.parquet, seams.parquet (a row per scene) and seams.html; the scores also go to MLflow. A
+result needs at least 200 seams.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jobs.support.cli import absolute, home, run, start_ray
-
-ENOUGH_SEAMS = 200
-SHOWN = 6
+from jobs.support.cli import run
 
 
 @dataclass(frozen=True)
@@ -27,82 +25,24 @@ class Config:
     generated: str = ""
     """Dataset directory of the outpainted scenes (default: $PRITTI_HOME/outpainted)."""
     run: str = ""
-    """Only source generated-<run> (default: whatever is there)."""
+    """Read only outpainted scenes of source generated-<run> (default: all sources)."""
     rows_m: tuple[float, ...] = ()
-    """Seams across the drive, in metres from a scene's far edge (default: where its middle 64 m begin and end)."""
+    """Seams across the street: metres from a scene's far edge (default: the borders of its middle 64 m)."""
     cols_m: tuple[float, ...] = ()
-    """Seams along the drive, in metres from a scene's left edge (default: likewise)."""
+    """Seams along the street: metres from a scene's left edge (default: the borders of its middle 64 m)."""
     real: str = ""
-    """Dataset directory of real scenes (default: $PRITTI_HOME/datasets/town)."""
+    """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"
+    """Split of the real scenes."""
     real_rows_m: tuple[float, ...] = (16.0, 32.0, 48.0)
-    """Lines across the drive at which real scenes are looked at."""
-    limit: int | None = None
-    """At most so many scenes on each side, spread evenly."""
+    """Lines across the street in real scenes: distances in metres from a scene's far edge."""
+    max_scenes: int | None = None
+    """Maximum number of scenes on each side, evenly over each (default: all)."""
     output: str = ""
-    """Where everything goes (default: $PRITTI_HOME/evaluations/seams)."""
-    actors: int = 2
-
-
-def evaluate_seams(config: Config) -> dict:
-    """Score, write and return the ratios of both sides."""
-    from rich.progress import Progress
-
-    from jobs.support.tracking import publish_scores
-    from pipelines.evaluation.evaluate import plain
-    from pipelines.evaluation.seams import Lines, join_sides, measure, seams_html, seams_table
-    from pipelines.runtime import storage
-    from pipelines.schema.scene_subset import Selection
-
-    output = absolute(config.output) if config.output else home("evaluations", "seams")
-    source = f"generated-{config.run}" if config.run else None
-    sides = {
-        "generated": (
-            Selection(
-                absolute(config.generated) if config.generated else home("outpainted"), source, None, config.limit
-            ),
-            Lines(config.rows_m, config.cols_m),
-        ),
-        "real": (
-            Selection(
-                absolute(config.real) if config.real else home("datasets", "town"),
-                None,
-                config.real_split,
-                config.limit,
-            ),
-            Lines(config.real_rows_m, ()),
-        ),
-    }
-    for selection, _ in sides.values():
-        selection.shards()  # what is not there is said before anything starts
-    start_ray()
-    with Progress() as bar:
-        measured = {}
-        for name, (selection, lines) in sides.items():
-            task = bar.add_task(f"look at {name}", total=sum(len(rows) for _, rows in selection.shards()))
-            measured[name] = measure(selection, lines, config.actors, lambda task=task: bar.advance(task))
-    scores = join_sides(measured)
-    storage.write_parquet(seams_table(measured), storage.join(output, "seams.parquet"))
-    html = seams_html(plain(scores), *sides["generated"], SHOWN)
-    storage.write_text(html, storage.join(output, "seams.html"))
-    tags = {name: selection.root for name, (selection, _) in sides.items()}
-    return publish_scores(output, scores, tags, ["seams.html"])
-
-
-def main(config: Config) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from pipelines.evaluation.seams import shown_rows
-
-    scores = evaluate_seams(config)
-    lines = Table("across seams over nearby lines", "generated", "real")
-    for row in shown_rows(scores):
-        lines.add_row(*row)
-    Console().print(lines)
-    if (count := scores["seams"]["generated"]) < ENOUGH_SEAMS:
-        print(f"only {count} seams: fewer than {ENOUGH_SEAMS} say little; outpaint more scenes")
+    """Directory to write to (default: $PRITTI_HOME/evaluations/seams)."""
+    num_actors: int = 2
+    """Number of actors that run in parallel."""
 
 
 if __name__ == "__main__":
-    run(main, Config, description=__doc__)
+    run("evaluate_seams")

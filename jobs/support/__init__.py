@@ -1,1 +1,1 @@
-"""What the jobs share: command line, options, trainer, tracking."""
+"""What the jobs share: command line, options, Ray session, training, tracking."""

@@ -1,4 +1,4 @@
-"""What rank 0 looks at while a model trains: losses on held-out scenes and pictures of the same few every time."""
+"""Validation on rank 0 during training: losses on held-out scenes, and pictures of the same few scenes each time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHOWN = 4
 
 @lru_cache(maxsize=2)
 def held_out_scenes(root: str, source: str, count: int) -> tuple[Scene, ...]:
-    """The first test scenes of a dataset; training scenes where there is no test split."""
+    """Return the first test scenes of a dataset, or training scenes if there is no test split."""
     try:
         return tuple(read_scenes(root, source, "test", count))
     except ValueError:
@@ -44,8 +44,10 @@ class ReconstructionCheck:
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Losses of a sampled latent, as in training; ground IoU, height error and AP3D of the mean, as the evaluator
-        takes them; pictures: truth above reconstruction.
+        """Return metrics and pictures.
+
+        Losses are those of a sampled latent, as in training. Ground IoU, height error and AP3D are those of the mean
+        latent, as in the evaluation. The pictures show ground truth above reconstruction.
         """
         model, scenes = trainer.averaged().eval(), list(held_out_scenes(self.root, self.source, self.count))
         spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
@@ -79,7 +81,7 @@ class ReconstructionCheck:
 
 @dataclass(frozen=True)
 class SamplingCheck:
-    """Validation of stage 2: loss on held-out latents, and the same few noises sampled every time."""
+    """Validation of stage 2: loss on held-out latents, and samples from the same noise each time."""
 
     root: str
     source: str
@@ -91,7 +93,7 @@ class SamplingCheck:
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Validation loss (same noise every time) and pictures of SHOWN generated scenes."""
+        """Return the validation loss, with the same noise each time, and pictures of SHOWN generated scenes."""
         dit, device = trainer.averaged().eval(), trainer.device
         arrays = held_out_latents(self.root, self.source, self.latents, self.label, self.count)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
@@ -116,12 +118,13 @@ class SamplingCheck:
 
 @lru_cache(maxsize=1)
 def cached_lvae(directory: str) -> LayoutVAE:
+    """Return a layout VAE, which is loaded once per process."""
     return load_lvae(directory)
 
 
 @lru_cache(maxsize=1)
 def held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
-    """The first latents of the test split (training split where there is none), with their labels."""
+    """Return the first latents of the test split, or of the training split if there is none, with their labels."""
     try:
         shards = find_shards(root, source=source, split="test")
     except ValueError:

@@ -1,20 +1,24 @@
-"""Published models in MLflow: a run with the pipeline's files, and a version of a registered model that points to it."""
+"""Published models in MLflow: a run with the pipeline's files, and a registered model version that points to it."""
 
 from __future__ import annotations
 
+import json
 import os
+import tempfile
+from pathlib import Path
+
+from mlflow.exceptions import MlflowException
 
 from jobs.support.cli import home
-from jobs.support.tracking import client, shown, tracking_uri
+from jobs.support.tracking import client, hide_credentials, tracking_uri
+from models.pretrained import CHECKSUMS, INDEX, checksums
 
 EXPERIMENT = "pritti-zoo"
 PIPELINE = "pipeline"  # artifact directory of a publishing run
 
 
-def registered(name: str, run_id: str) -> str:
-    """Register a publishing run's pipeline as the next version of a model; models:/NAME/VERSION."""
-    from mlflow.exceptions import MlflowException
-
+def register_version(name: str, run_id: str) -> str:
+    """Register the pipeline of a publishing run as the next version of a model; return models:/NAME/VERSION."""
     api = client(tracking_uri())
     try:
         api.get_registered_model(name)
@@ -25,20 +29,15 @@ def registered(name: str, run_id: str) -> str:
     return f"models:/{name}/{version.version}"
 
 
-def downloaded(reference: str) -> str:
-    """The directory with the pipeline that models:/NAME/VERSION or the id of a publishing run means.
+def download_pipeline(reference: str) -> str:
+    """Copy a published pipeline to $PRITTI_HOME/registry, unless it is there, and return its directory.
 
-    Copied to $PRITTI_HOME/registry once, whole or not at all. Raises ValueError for what MLflow does not know, or for
-    files that are not those that were published.
+    Args:
+        reference: models:/NAME/VERSION or the id of a publishing run.
+
+    Raises:
+        ValueError: MLflow does not know the reference, or the files do not match the published checksums.
     """
-    import json
-    import tempfile
-    from pathlib import Path
-
-    from mlflow.exceptions import MlflowException
-
-    from models.pretrained import CHECKSUMS, INDEX, checksums
-
     api = client(tracking_uri())
     try:
         run_id = reference
@@ -53,10 +52,11 @@ def downloaded(reference: str) -> str:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             if checksums(whole) != json.loads(Path(whole, CHECKSUMS).read_text()):
                 raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS}; publish it again")
-            if not os.path.exists(directory):  # or another process was quicker
+            if not os.path.exists(directory):  # another process may have finished first
                 os.rename(whole, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(
-            f"{reference}: no published pipeline in {shown(tracking_uri())} ({shown(str(error))}); jobs/publish_model.py makes them"
+            f"{reference}: no published pipeline in {hide_credentials(tracking_uri())} "
+            f"({hide_credentials(str(error))}); publish one with jobs/publish_model.py"
         ) from error
     return directory

@@ -1,44 +1,42 @@
-"""MLflow, from the driver and from rank 0 only: one run per training run, found again when it resumes."""
+"""MLflow tracking from the driver and from rank 0: one MLflow run per training run, reused when it resumes."""
 
 from __future__ import annotations
 
+import logging
 import os
 import re
-from collections.abc import Mapping, Sequence
-from math import isfinite
+import time
 from pathlib import Path
+
+from PIL import Image
 
 from jobs.support.cli import home
 from pipelines.runtime import provenance, storage
 
-METRICS_PER_CALL = 1000  # MLflow's limit
-
 
 def tracking_uri() -> str:
-    """$MLFLOW_TRACKING_URI, or an sqlite file under $PRITTI_HOME."""
+    """Return $MLFLOW_TRACKING_URI, or the URI of an sqlite file under $PRITTI_HOME."""
     return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home('mlflow.db')}"
 
 
-def shown(uri: str) -> str:
-    """A tracking URI for messages: without the user and password that it may hold."""
+def hide_credentials(uri: str) -> str:
+    """Remove user and password from a URI, for messages."""
     return re.sub(r"//[^/@]*@", "//", uri)
 
 
 def client(uri: str):
-    """An MLflow client. Quiet, and without a call home."""
+    """Return an MLflow client without log noise and telemetry."""
     os.environ.setdefault("DO_NOT_TRACK", "true")
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    import logging
+    from mlflow import MlflowClient  # reads the variables above when it is imported
 
-    from mlflow import MlflowClient
-
-    for name in ("alembic", "mlflow"):  # which mlflow's import has set
+    for name in ("alembic", "mlflow"):  # importing mlflow sets their levels
         logging.getLogger(name).setLevel(logging.WARNING)
     return MlflowClient(tracking_uri=uri)
 
 
 class Tracker:
-    """Writes to one MLflow run. Picklable: workers open their own client."""
+    """Writes to one MLflow run. It can be pickled: each worker opens its own client."""
 
     def __init__(self, uri: str, run_id: str) -> None:
         self.uri, self.run_id = uri, run_id
@@ -54,9 +52,9 @@ class Tracker:
 
     @classmethod
     def start(cls, experiment: str, name: str, parameters: dict, record: str | None = None) -> Tracker:
-        """The MLflow run that the file `record` names, so that a resumed run goes on in it, or a new one.
+        """Return the MLflow run that the file `record` names, for a resumed run, or a new one.
 
-        Called once, in the driver: two processes creating the database at once would break it.
+        Call this once, in the driver: two processes that create the database concurrently break it.
         """
         uri = tracking_uri()
         if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
@@ -81,9 +79,7 @@ class Tracker:
         return cls(uri, run_id)
 
     def metrics(self, values: dict[str, float], step: int) -> None:
-        import time
-
-        from mlflow.entities import Metric
+        from mlflow.entities import Metric  # after `client` has set MLflow's variables
 
         now = int(time.time() * 1000)
         self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
@@ -92,55 +88,17 @@ class Tracker:
         self.client.set_tag(self.run_id, key, value)
 
     def picture(self, image, path: str) -> None:
-        """A picture (H, W, 3) uint8 as an artifact."""
-        from PIL import Image
-
+        """Log a picture (H, W, 3) uint8 as an artifact."""
         self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
 
     def artifacts(self, directory: str, path: str) -> None:
         self.client.log_artifacts(self.run_id, directory, path)
 
     def history(self, name: str) -> list[tuple[int, float]]:
-        """(step, value) of a metric, in order; a resumed run's repeated steps once."""
+        """Return (step, value) of a metric in order; of steps that a resumed run repeats, the last value."""
         values = {m.step: m.value for m in self.client.get_metric_history(self.run_id, name)}
         return sorted(values.items())
 
     def finish(self, status: str) -> None:
-        """FINISHED, FAILED or KILLED."""
+        """Set the status of the run: FINISHED, FAILED or KILLED."""
         self.client.set_terminated(self.run_id, status)
-
-
-def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files: Sequence[str] = ()) -> dict:
-    """Nested scores as metrics.json (returned) and metrics.parquet of `output`, and with tags and files to MLflow.
-
-    One MLflow run per output directory, brought up to date. Parquet: a row per score, with the ends of its 95 % interval
-    where it has one; in MLflow the ends are metrics of their own, NAME.low and NAME.high.
-    """
-    import pyarrow as pa
-
-    from pipelines.evaluation.evaluate import flattened, plain
-    from pipelines.metrics.intervals import Estimate
-
-    rows, known = [], {}
-    for name, value in flattened(scores).items():
-        score = value if isinstance(value, Estimate) else Estimate(value, None, None)
-        rows.append({"metric": name} | score._asdict())
-        named = {"": score.value, ".low": score.low, ".high": score.high}
-        known |= {name + end: number for end, number in named.items() if number is not None}
-    nested = plain(scores)
-    storage.write_json(nested, storage.join(output, "metrics.json"))
-    schema = pa.schema({"metric": pa.string(), "value": pa.float64(), "low": pa.float64(), "high": pa.float64()})
-    storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join(output, "metrics.parquet"))
-
-    run_name = output.rstrip("/").rsplit("/", 1)[-1]
-    tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join(output, "mlflow.json"))
-    for key, value in tags.items():
-        tracker.tag(key, value)
-    finite = [(name, number) for name, number in known.items() if isfinite(number)]
-    for start in range(0, len(finite), METRICS_PER_CALL):
-        tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
-    if "://" not in output:  # MLflow takes local files only
-        for file in ("metrics.json", *files):
-            tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
-    tracker.finish("FINISHED")
-    return nested

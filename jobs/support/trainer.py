@@ -1,6 +1,6 @@
-"""Feeds models/training.py through Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
+"""Train with Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
 
-Resume = the same command again: Ray Train finds the run of the same name and hands its last checkpoint back.
+The same command resumes a run: Ray Train finds the run of the same name and returns its last checkpoint.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import ray.train.torch
 import torch
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 
-from jobs.support.cli import root_cause, run_packed, start_ray
+from jobs.support.cli import root_cause
+from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
 from models.training import NotFinite, Optimisation, Trainer
 from pipelines.runtime import storage
@@ -29,15 +30,15 @@ from pipelines.training.data_loader import READER_CPUS, Reader, Stream, batches
 from pipelines.training.latents import weights_digest
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
-RETRIES = 2  # of workers that fail, from the last checkpoint
+RETRIES = 2  # restarts from the last checkpoint after a worker failure
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """One training run, as its workers receive it. Everything in it pickles.
+    """One training run, as its workers receive it. All fields can be pickled.
 
-    `build(device, wrap)` makes the Trainer; `validate(trainer)` returns metrics and pictures (names to arrays) and
-    runs on rank 0 at every checkpoint; `identity` is what a resumed run must share with the one it continues.
+    `build(device, wrap)` returns the Trainer. `validate(trainer)` returns metrics and pictures (names to arrays) and
+    runs on rank 0 at every checkpoint. `identity` holds the options that a resumed run must share.
     """
 
     name: str
@@ -61,7 +62,7 @@ def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 
 def train_worker(run: TrainingRun, threads: int) -> None:
-    """What every worker runs: batches -> steps, with a log line, a checkpoint and a validation now and then."""
+    """Train in one worker: read batches, step, and log, checkpoint and validate at intervals."""
     logging.getLogger("ray.train").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
     context = ray.train.get_context()
@@ -76,7 +77,7 @@ def train_worker(run: TrainingRun, threads: int) -> None:
     local = run.stream.batch_size // world
     positions = range(rank * local, (rank + 1) * local)
     started, logged, waited = time.perf_counter(), trainer.steps_done, 0.0
-    feed = timed(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
+    feed = measure_waiting(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds
         try:
@@ -105,7 +106,7 @@ def train_worker(run: TrainingRun, threads: int) -> None:
 
 
 def with_scene_ids(error: NotFinite, stream: Stream) -> str:
-    """The message of a loss that is not finite, with the scenes that are to blame."""
+    """Return the message of a non-finite loss, with the ids of the scenes that caused it."""
     shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
     ids = [
         stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
@@ -115,8 +116,8 @@ def with_scene_ids(error: NotFinite, stream: Stream) -> str:
     )
 
 
-def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:
-    """Items with the seconds that each was waited for."""
+def measure_waiting(iterator: Iterator) -> Iterator[tuple[Any, float]]:
+    """Yield items with the seconds spent waiting for each."""
     while True:
         started = time.perf_counter()
         try:
@@ -127,7 +128,7 @@ def timed(iterator: Iterator) -> Iterator[tuple[Any, float]]:
 
 
 def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
-    """Save a checkpoint (rank 0) and tell Ray Train; every worker must call it."""
+    """Save a checkpoint (rank 0) and report it to Ray Train; every worker must call this."""
     metrics = {"step": trainer.steps_done, "loss": loss}
     if rank != 0:
         ray.train.report(metrics)
@@ -147,15 +148,16 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
 
 
 def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
-    """Say in MLflow which weights a run has made so far: jobs/publish_model.py finds the run by them."""
+    """Tag an MLflow run with its current weights, by which jobs/publish_model.py finds it."""
     tracker.tag("weights", weights_digest(model))
     tracker.tag("steps", str(steps))
 
 
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:
-    """Train to the end and put the model (EMA weights if there are any) into `output`; returns `output`.
+    """Train to the end and write the model (EMA weights, if enabled) to `output`, which is returned.
 
-    Raises ValueError for a number of workers that does not fit, or for a loss that is not finite.
+    Raises:
+        ValueError: The cluster cannot hold that many workers, or a loss is not finite.
     """
     start_ray(training=True)
     scaling = scaling_for(num_workers, run.stream.batch_size)
@@ -190,21 +192,26 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
 
 def scaling_for(num_workers: int, batch_size: int) -> ScalingConfig:
-    """Workers that fit the cluster and leave room for reading. Raises ValueError: too many would wait for ever."""
+    """Return the scaling of workers that fit the cluster and leave CPUs for reading.
+
+    Raises:
+        ValueError: There are too many workers, which would wait without end.
+    """
     cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
     per_worker = 1.0 if cpus > 2 * num_workers else 0.5
     most = int((cpus - READER_CPUS) // per_worker)
     if not 1 <= num_workers <= most:
-        raise ValueError(f"--workers is {num_workers}, this cluster of {cpus:.0f} CPUs has room for 1 to {most}")
+        raise ValueError(f"--num-workers is {num_workers}, this cluster of {cpus:.0f} CPUs has room for 1 to {most}")
     if batch_size < 1 or batch_size % num_workers:
-        raise ValueError(f"--batch-size {batch_size} does not divide by --workers {num_workers}")
+        raise ValueError(f"--batch-size {batch_size} does not divide by --num-workers {num_workers}")
     return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
 
 
-def claim(name: str, storage_path: str, identity: dict) -> str:
-    """Claim a run's name for one set of options; where its MLflow run is recorded.
+def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
+    """Bind a run name to its options; return the path of the record of its MLflow run.
 
-    Raises ValueError if it belongs to another set and has checkpoints already.
+    Raises:
+        ValueError: The name belongs to a run with other options, which has checkpoints.
     """
     directory = storage.join(storage_path, name)
     record = storage.join(directory, "identity.json")
@@ -215,13 +222,13 @@ def claim(name: str, storage_path: str, identity: dict) -> str:
                 f"run {name!r} was started with {key}={made.get(key)}, asked for {identity.get(key)}; "
                 "use the same options to resume, or another --name for a new run"
             )
-        storage.delete_directory(directory)  # nothing was trained yet
+        storage.delete_directory(directory)  # it has no checkpoint
     storage.write_json(identity, record)
     return storage.join(directory, "mlflow.json")
 
 
 def publish_directory(directory: str, output: str) -> None:
-    """Copy a saved model or pipeline into place, file by file; what says that it is complete comes last."""
+    """Copy a saved model or pipeline file by file; the files that mark it as complete come last."""
     paths = [
         os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
     ]
@@ -232,8 +239,12 @@ def publish_directory(directory: str, output: str) -> None:
             )
 
 
-def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:
-    """The settings with every change that is not None. Raises ValueError for a change that is not positive."""
+def override_settings(settings: Optimisation, **changes: Any) -> Optimisation:
+    """Return the settings with every change that is not None.
+
+    Raises:
+        ValueError: A change is not positive.
+    """
     changes = {name: value for name, value in changes.items() if value is not None}
     for name, value in changes.items():
         if value <= 0:
@@ -241,6 +252,6 @@ def settings_with(settings: Optimisation, **changes: Any) -> Optimisation:
     return replace(settings, **changes)
 
 
-def identity_of(settings: Optimisation, **more: Any) -> dict:
-    """What makes a run the same run: its optimisation and whatever else determines its weights."""
+def run_identity(settings: Optimisation, **more: Any) -> dict:
+    """Return the options that determine a run's weights: its optimizer settings and `more`."""
     return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more

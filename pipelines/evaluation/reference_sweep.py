@@ -103,7 +103,7 @@ def sweep_references(
     if not chosen:
         raise ValueError(
             f"no reference fits {len(real)} real and {len(generated)} generated scenes; "
-            "give smaller --sizes or greater --apart-m, or generate more"
+            "give smaller --reference-sizes or greater --min-distances-m, or generate more"
         )
     rows = []
     for reference in chosen:

@@ -90,7 +90,7 @@ def pair_files(
             f"{side} lack {len(names)} of {len(every)} names: {', '.join(names[:SHOWN])}{' ...' * (len(names) > SHOWN)}"
             for side, names in missing.items()
         )
-        raise ValueError(f"{told}; name files by scene, or score what there is on all sides by --partial")
+        raise ValueError(f"{told}; name files by scene, or score what there is on all sides by --allow-missing")
     return [VoxelPair(name, truth[name], rebuilt[name], stored[name] if stored else "") for name in sorted(common)]
 
 

@@ -29,8 +29,8 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT
 
+from jobs.implementation.preprocess_scenes import main as preprocess
 from jobs.preprocess_scenes import Kitti360, Town
-from jobs.preprocess_scenes import main as preprocess
 from models.scene import CATEGORIES, Grid
 from pipelines.preprocess import ingest, sharding
 from pipelines.preprocess.shard_writer import write_shard
@@ -341,7 +341,7 @@ def test_preprocess_rejects_drive_without_poses(cluster, raw, tmp_path):
     shutil.copytree(raw["kitti360"], root)
     (xml,) = root.glob("data_3d_bboxes/train_full/*.xml")
     shutil.copy(xml, xml.with_name(xml.name.replace("0007", "0003")))
-    asked = Kitti360(input=str(root), output=str(tmp_path / "out"), split=False)
+    asked = Kitti360(input=str(root), output=str(tmp_path / "out"), make_split=False)
     with pytest.raises(ValueError, match=r"drive_0003_sync/poses\.txt: .*Or add --skip-unreadable"):
         preprocess(asked)
     preprocess(replace(asked, skip_unreadable=True))

@@ -30,9 +30,10 @@ def empty_home(cluster, tmp_path_factory):
 
 
 def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
-    from jobs.ablate_lvae import Encoding, compare_encodings
+    from jobs.ablate_lvae import Encoding
+    from jobs.implementation.ablate_lvae import compare_encodings
 
-    config = Encoding((64, 128), any_sizes=(64,), moving_sizes=(32,), seeds=1, epochs=1, test=300, noisy=20)
+    config = Encoding((64, 128), any_footprint_train_sizes=(64,), yaw_only_train_sizes=(32,), num_seeds=1, epochs=1, num_test_boxes=300, num_noisy_boxes=20)
     output = empty_home / "ablations/encoding"
     assert compare_encodings(config) == str(output)
     assert "mean IoU3D" in capsys.readouterr().out and "octahedral" in (output / "encodings.txt").read_text()
@@ -53,11 +54,12 @@ def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
     assert [p for p, time in kept.items() if p.stat().st_mtime_ns != time] == [redone]
     assert json.loads(redone.read_text())["iou"] == before["iou"]
     with pytest.raises(ValueError, match="holds a study with epochs=1, asked for 2"):
-        compare_encodings(Encoding(sizes=(64,), seeds=1, epochs=2, test=300))
+        compare_encodings(Encoding(train_sizes=(64,), num_seeds=1, epochs=2, num_test_boxes=300))
 
 
 def test_variant_differs_from_preset_only_in_its_switch(empty_home):
-    from jobs.ablate_lvae import Augmentation, Branches, Decoders, prepare_variant
+    from jobs.ablate_lvae import Augmentation, Branches, Decoders
+    from jobs.implementation.ablate_lvae import prepare_variant
     from jobs.support.trainer import as_tensors
     from pipelines.training.data_loader import read_samples
 
@@ -81,7 +83,7 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
 
 
 def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys):
-    import jobs.ablate_lvae as job
+    import jobs.implementation.ablate_lvae as job
 
     trained = []
 
@@ -95,13 +97,13 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
         return described | average_measurements(BRANCHES[variant], reconstruction)
 
     monkeypatch.setattr(job, "train_variant", train_variant)
-    output = job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=2))
+    output = job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=2))
     assert trained == [(seed, variant) for seed in (0, 1) for variant in BRANCHES]
-    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=3))
+    job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))
     assert trained[8:] == [(2, variant) for variant in BRANCHES]
-    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=4, only=("without ground",)))
+    job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=4, only_variants=("without ground",)))
     assert trained[12:] == [(3, "without ground")]
-    job.compare_variants(job.Branches(preset="smoke", steps=7, seeds=3))
+    job.compare_variants(job.Branches(preset="smoke", steps=7, num_seeds=3))
     rows = {row["variant"]: row for row in json.loads((Path(output) / "branches.json").read_text())["rows"]}
     full, bare = rows["full model"], rows["without ground"]
     assert (full["seeds"], full["steps"]) == (3, 7) and abs(full["ground_iou_mean"] - 0.91) < 1e-9
@@ -109,9 +111,9 @@ def test_compare_variants_trains_each_seed_once(empty_home, monkeypatch, capsys)
     assert bare["ground_iou_mean"] is None and rows["without objects"]["ap3d_mean"] is None
     assert "without latent split" in capsys.readouterr().out
     with pytest.raises(ValueError, match="holds a study with steps=7, asked for 8"):
-        job.compare_variants(job.Branches(preset="smoke", steps=8, seeds=2))
-    with pytest.raises(ValueError, match=r"--only \['without sky'\]: expected some of \['full model'"):
-        job.compare_variants(job.Branches(preset="smoke", steps=7, only=("without sky",)))
+        job.compare_variants(job.Branches(preset="smoke", steps=8, num_seeds=2))
+    with pytest.raises(ValueError, match=r"--only-variants \['without sky'\]: expected some of \['full model'"):
+        job.compare_variants(job.Branches(preset="smoke", steps=7, only_variants=("without sky",)))
     with pytest.raises(ValueError, match="unknown preset 'smokes'"):
         job.compare_variants(job.Branches(preset="smokes", name="another"))
     assert not (Path(output).parent / "another").exists()

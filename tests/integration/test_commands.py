@@ -24,8 +24,8 @@ MISTAKES = {
     ("sample_scenes.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here, and none of that name comes with",
     ("publish_model.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here",
     ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
-    ("outpaint_scenes.py", "--actors", "0"): "--actors is 0, expected at least 1",
-    ("inpaint_scenes.py",): "no region: give --polygon-m, --half-plane or --objects",
+    ("outpaint_scenes.py", "--num-actors", "0"): "--num-actors is 0, expected at least 1",
+    ("inpaint_scenes.py",): "no region: give --polygon-m, --half-plane or --primitives",
     ("preprocess_scenes.py", "kitti360", "--input", "nowhere"): "--input nowhere: no such directory",
     ("preprocess_scenes.py", "av2", "--input", "tests"): "tests",
 }

@@ -23,7 +23,8 @@ def table(town_scenes, tmp_path_factory) -> str:
 
 
 def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster):
-    from jobs.edit_scenes import Remove, Replay, edit_scenes
+    from jobs.edit_scenes import Remove, Replay
+    from jobs.implementation.edit_scenes import edit_scenes
 
     options = {"input": table, "output": str(tmp_path / "out"), "run": "bare"}
     trees = Remove(category=("vegetation_ellipsoid", "vegetation_cuboid"), **options)
@@ -49,19 +50,20 @@ def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster)
         edit_scenes(Remove(category=("pole",), **options))
 
     record = str(tmp_path / "out" / "edited-bare.json")
-    again = edit_scenes(Replay(edits=record, **options | {"output": str(tmp_path / "again"), "pictures": 0}))
+    again = edit_scenes(Replay(edits=record, **options | {"output": str(tmp_path / "again"), "num_examples": 0}))
     assert again.table.rows == made.table.rows
     for scene in read_scenes(str(tmp_path / "again"), "edited-bare"):
         assert_same_primitives(scene, edited[scene.scene_id])
 
 
 def test_edit_job_rejects_bad_scene_and_edits_the_rest(table, town_scenes, tmp_path, cluster):
-    from jobs.edit_scenes import Remove, edit_scenes
+    from jobs.edit_scenes import Remove
+    from jobs.implementation.edit_scenes import edit_scenes
 
     last = max(len(scene) for scene in town_scenes) - 1
     fits = sum(len(scene) > last for scene in town_scenes)
     assert 0 < fits < len(town_scenes)
-    made = edit_scenes(Remove(primitives=(last,), input=table, output=str(tmp_path), pictures=0))
+    made = edit_scenes(Remove(primitives=(last,), input=table, output=str(tmp_path), num_examples=0))
     assert (made.scenes, made.rejects) == (fits, 4 - fits)
     rejects = pq.read_table(str(tmp_path / "rejects"), partitioning=None).to_pylist()
     assert {row["scene_id"] for row in rejects} == {s.scene_id for s in town_scenes if len(s) <= last}

@@ -8,7 +8,8 @@ import safetensors.numpy
 from golden.golden_recipe import random_state_dict
 from helpers import kill_ray_workers
 
-from jobs.evaluate_scenes import Config, evaluate
+from jobs.evaluate_scenes import Config
+from jobs.implementation.evaluate_scenes import evaluate
 from pipelines.evaluation.evaluate import compare_datasets, compute_memorisation
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features, load_scenes
 from pipelines.metrics.adm_npz import write_npz
@@ -34,9 +35,9 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
     data = str(smoke / "datasets/smoke")
     test = load_scenes(SceneSubset(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([render_bev(scene)]) for scene in test), SAMPLES)
-    options = {"real": data, "samples": SAMPLES, "inception": weights, "k": (1, 3), "actors": 1}
+    options = {"real": data, "max_scenes": SAMPLES, "inception": weights, "k": (1, 3), "num_actors": 1}
     as_tables = evaluate(
-        Config(generated=data, generated_split="test", balance=False, output=str(tmp_path / "tables"), **options)
+        Config(generated=data, generated_split="test", balance_labels=False, output=str(tmp_path / "tables"), **options)
     )["generation"]
     as_pictures = evaluate(Config(generated=str(tmp_path / "test.npz"), output=str(tmp_path / "npz"), **options))[
         "generation"
@@ -108,9 +109,9 @@ def test_compare_handles_degenerate_features(cluster):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"samples": 1}, "--samples is 1, expected 2 or more"),
+        ({"max_scenes": 1}, "--max-scenes is 1, expected 2 or more"),
         ({"supersample": 0}, "--supersample is 0"),
-        ({"reference": "apart", "apart_m": 0.0}, "apart_m is 0"),
+        ({"reference": "min-distance", "min_distance_m": 0.0}, "apart_m is 0"),
         ({"inception": "nowhere.pth"}, "nowhere.pth: no such file"),
         ({"generated": "nowhere.npz"}, "nowhere.npz: no such file"),
     ],

@@ -15,19 +15,21 @@ from pipelines.schema.tables import find_shards, read_scenes
 
 @pytest.fixture(scope="session")
 def samples(smoke) -> Path:
-    from jobs.sample_scenes import Config, sample
+    from jobs.sample_scenes import Config
+    from jobs.implementation.sample_scenes import sample
 
     model, output = str(smoke / "models/pritti-smoke"), smoke / "generated"
-    sample(Config(model=model, output=str(output), num_scenes=9, steps=10, batch_size=8, glb=1))
+    sample(Config(model=model, output=str(output), num_scenes=9, num_inference_steps=10, batch_size=8, num_glb=1))
     return output
 
 
 def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path):
-    from jobs.sample_scenes import Config, sample
+    from jobs.sample_scenes import Config
+    from jobs.implementation.sample_scenes import sample
     from models.tensors import EXISTENCE_THRESHOLD
 
     model = str(smoke / "models/pritti-smoke")
-    sample(Config(model=model, output=str(tmp_path), num_scenes=9, steps=10, batch_size=1, actors=2))
+    sample(Config(model=model, output=str(tmp_path), num_scenes=9, num_inference_steps=10, batch_size=1, num_actors=2))
     a, b = list(read_scenes(str(samples))), list(read_scenes(str(tmp_path)))
     assert [s.scene_id for s in a] == [s.scene_id for s in b] and len(a) == 9
     assert [s.vegetation_density for s in a] == [*DENSITIES] * 3
@@ -39,14 +41,15 @@ def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path
 
 
 def test_sample_resumes_where_it_stopped(smoke, samples):
-    from jobs.sample_scenes import Config, sample
+    from jobs.sample_scenes import Config
+    from jobs.implementation.sample_scenes import sample
 
     shards = find_shards(str(samples))
     before = [s.scene_id for s in read_scenes(str(samples))]
     kept, lost = Path(shards[0].path("scenes")), Path(shards[1].path("rasters"))
     stamp = kept.stat().st_mtime_ns
     lost.unlink()
-    config = Config(model=str(smoke / "models/pritti-smoke"), output=str(samples), num_scenes=9, steps=10, batch_size=8)
+    config = Config(model=str(smoke / "models/pritti-smoke"), output=str(samples), num_scenes=9, num_inference_steps=10, batch_size=8)
     sample(config)
     assert kept.stat().st_mtime_ns == stamp and lost.exists()
     assert [s.scene_id for s in read_scenes(str(samples))] == before
@@ -59,25 +62,27 @@ def test_sample_resumes_where_it_stopped(smoke, samples):
 
 
 def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
-    from jobs.sample_scenes import Config, sample
+    from jobs.sample_scenes import Config
+    from jobs.implementation.sample_scenes import sample
 
     asked = []
-    monkeypatch.setattr("pipelines.generation.sample.sample_scenes", lambda request, *_: asked.append(request))
+    monkeypatch.setattr("jobs.implementation.sample_scenes.sample_scenes", lambda request, *_: asked.append(request))
     for repair in (False, True):
-        sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, glb=0, repair=repair))
+        sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, num_glb=0, repair=repair))
     assert [request.repair for request in asked] == [False, True]
 
 
 def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
-    from jobs.sweep_samplers import Config, sweep_samplers
+    from jobs.sweep_samplers import Config
+    from jobs.implementation.sweep_samplers import sweep_samplers
 
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
         real=str(smoke / "datasets/smoke"),
         samplers=("dpm++",),
-        steps=(2, 4),
+        num_inference_steps=(2, 4),
         num_scenes=6,
-        pictures=2,
+        num_examples=2,
         output=str(tmp_path),
     )
     rows = sweep_samplers(config)
@@ -102,13 +107,14 @@ def test_sample_glb_has_named_node_per_primitive(samples):
 
 
 def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
-    from jobs.evaluate_scenes import Config, evaluate
+    from jobs.evaluate_scenes import Config
+    from jobs.implementation.evaluate_scenes import evaluate
     from jobs.evaluate_seams import Config as SeamsConfig
-    from jobs.evaluate_seams import evaluate_seams
+    from jobs.implementation.evaluate_seams import evaluate_seams
     from jobs.outpaint_scenes import Config as OutpaintConfig
-    from jobs.outpaint_scenes import outpaint
+    from jobs.implementation.outpaint_scenes import outpaint
     from jobs.sweep_seams import Config as SweepConfig
-    from jobs.sweep_seams import sweep_seams
+    from jobs.implementation.sweep_seams import sweep_seams
 
     model = str(smoke / "models/pritti-smoke")
     options = OutpaintConfig(
@@ -116,9 +122,9 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
         input=str(samples),
         source="generated-samples",
         output=str(tmp_path),
-        steps=8,
+        num_inference_steps=8,
         jump_length=2,
-        resamplings=2,
+        num_resamplings=2,
     )
     outpaint(options)
     large, small = next(read_scenes(str(tmp_path))), next(read_scenes(str(samples), "generated-samples"))
@@ -129,7 +135,7 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert (tmp_path / "glb/outpainted").is_dir()
 
     real = str(smoke / "datasets/smoke")
-    looked = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), actors=1)
+    looked = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), num_actors=1)
     seams = evaluate_seams(looked)
     assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
     query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
@@ -138,9 +144,9 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
 
     row, guided = sweep_seams(
         SweepConfig(
-            model,
-            str(samples),
-            "generated-samples",
+            model=model,
+            input=str(samples),
+            source="generated-samples",
             settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
             output=str(tmp_path / "sweep"),
         )
@@ -155,8 +161,8 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
             real=real,
             generated=str(samples),
             lvae=str(smoke / "models/lvae-smoke"),
-            pictures=0,
-            actors=1,
+            num_examples=0,
+            num_actors=1,
             output=str(tmp_path),
         )
     )
@@ -192,7 +198,8 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
 
 
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
-    from jobs.outpaint_scenes import Config, last_blocks
+    from jobs.outpaint_scenes import Config
+    from jobs.implementation.outpaint_scenes import count_blocks
     from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
     from pipelines.schema.scene_subset import SceneSubset
@@ -236,14 +243,15 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
             assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
     (outward,) = outpaint_scenes(request("outward", order="outward", last=(1, 0, 0, 0)), chosen).to_pylist()[1:]
     assert outward["ahead"] == 1
-    assert last_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != last_blocks(Config(extent_m=(64.0, 65.0)))
-    for wrong in (Config(extent_m=(32.0, 64.0)), Config(ahead=0, behind=0, left=0, right=0), Config(ahead=-1)):
+    assert count_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != count_blocks(Config(extent_m=(64.0, 65.0)))
+    for wrong in (Config(extent_m=(32.0, 64.0)), Config(blocks_ahead=0, blocks_behind=0, blocks_left=0, blocks_right=0), Config(blocks_ahead=-1)):
         with pytest.raises(ValueError, match="expected"):
-            last_blocks(wrong)
+            count_blocks(wrong)
 
 
 def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
-    from jobs.inpaint_scenes import Config, inpaint
+    from jobs.inpaint_scenes import Config
+    from jobs.implementation.inpaint_scenes import inpaint
 
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
@@ -251,12 +259,12 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
         source="generated-samples",
         half_plane=(1.0, 0.0, 32.0),
         contents="objects",
-        variants=2,
-        limit=2,
+        num_variants=2,
+        max_scenes=2,
         output=str(tmp_path),
-        steps=8,
+        num_inference_steps=8,
         jump_length=2,
-        resamplings=2,
+        num_resamplings=2,
     )
     drift = inpaint(config)
     assert 0 <= drift["ground_iou"] <= 1 and 0 <= drift["objects_found"] <= 1

@@ -12,23 +12,26 @@ from models.pretrained import CHECKSUMS_NAME, compute_checksums
 def evaluated(smoke) -> Path:
     """Scores of scenes and reconstructions of the smoke model."""
     from jobs import evaluate_scenes, sample_scenes
+    from jobs.implementation.evaluate_scenes import evaluate
+    from jobs.implementation.sample_scenes import sample
 
-    sample_scenes.sample(
+    sample(
         sample_scenes.Config(
-            num_scenes=6, run="judged", sampler="dpm++", steps=2, noise_scaling=1.01, existence_threshold=0.25
+            num_scenes=6, run="judged", sampler="dpm++", num_inference_steps=2, noise_scaling=1.01, existence_threshold=0.25
         )
     )
     real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
     config = evaluate_scenes.Config(
-        real=real, real_split="test", run="judged", lvae=lvae, limit=4, pictures=0, actors=1
+        real=real, real_split="test", run="judged", lvae=lvae, max_reconstructed_scenes=4, num_examples=0, num_actors=1
     )  # fmt: skip
-    evaluate_scenes.evaluate(config)
+    evaluate(config)
     return smoke / "evaluations/judged"
 
 
 def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
-    from jobs.publish_model import Config, publish
-    from jobs.support.options import pipeline_directory
+    from jobs.publish_model import Config
+    from jobs.implementation.publish_model import publish
+    from jobs.support.model_directories import pipeline_directory
     from pipelines.generation.sample import load_pipeline
 
     output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
@@ -64,7 +67,8 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
 
 
 def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path):
-    from jobs.publish_model import Config, publish
+    from jobs.publish_model import Config
+    from jobs.implementation.publish_model import publish
 
     with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
         publish(Config(name="none", evaluation=str(tmp_path)))
@@ -95,11 +99,12 @@ def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path
 
 
 def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatch, tmp_path):
-    from jobs.publish_model import Config, publish
+    from jobs.publish_model import Config
+    from jobs.implementation.publish_model import publish
 
     first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
-    monkeypatch.setattr("jobs.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
+    monkeypatch.setattr("jobs.implementation.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
     config = Config(
         model=str(smoke / "models/pritti-smoke"), evaluation=str(evaluated), output=str(tmp_path / "second"), register=False
     )  # fmt: skip
@@ -115,9 +120,10 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatc
 def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     import torch
 
-    from jobs.publish_model import history
+    from jobs.implementation.publish_model import history
     from jobs.support.trainer import as_tensors, tag_weights
-    from jobs.train_dit import Config, prepare
+    from jobs.train_dit import Config
+    from jobs.implementation.train_dit import prepare
     from pipelines.generation.sample import load_pipeline
     from pipelines.training.data_loader import iterate_batches
     from pipelines.training.latents import digest_weights
@@ -145,13 +151,13 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     sampling = load_pipeline(complete(str(more))).config
     assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights
     with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
-        prepare(Config(preset="smoke", name="other", start_from=start, label="vehicle"))
+        prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
         prepare(Config(preset="smoke", name="other", start_from="town"))
 
 
 def test_pipeline_directory_rejects_unknown_model(smoke, tmp_path):
-    from jobs.support.options import pipeline_directory
+    from jobs.support.model_directories import pipeline_directory
 
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
         with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):

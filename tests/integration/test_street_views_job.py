@@ -23,13 +23,14 @@ def town_scenes() -> list[Scene]:
 
 def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
     from jobs.export_scenes import Config as ExportConfig
-    from jobs.export_scenes import export
-    from jobs.render_streets import Config, render
+    from jobs.implementation.export_scenes import export
+    from jobs.render_streets import Config
+    from jobs.implementation.render_streets import render
 
     nothing = np.zeros_like(town_scenes[1].occupied)
     bare = replace(town_scenes[1], scene_id="bare", occupied=nothing, height_m=np.zeros(nothing.shape, np.float32))
     Shard(str(tmp_path), "town", "test", 0).write([town_scenes[0], bare])
-    options = Config(input=str(tmp_path), limit=2, spacing_m=8.0, width=176, height=47)
+    options = Config(input=str(tmp_path), max_scenes=2, spacing_m=8.0, width_px=176, height_px=47)
     frames = render(options)
     assert frames["bare"] == 0 and frames[town_scenes[0].scene_id] > 5
     where = tmp_path / "streets" / "drive" / town_scenes[0].scene_id

@@ -58,7 +58,8 @@ def test_train_logs_run_and_model_to_mlflow(home):
 
 
 def test_train_lvae_leaves_finished_run_unchanged(home):
-    from jobs.train_lvae import Config, train
+    from jobs.train_lvae import Config
+    from jobs.implementation.train_lvae import train
 
     before = weights(home / "models/lvae-smoke")
     train(Config(preset="smoke"))
@@ -71,7 +72,8 @@ def test_train_lvae_leaves_finished_run_unchanged(home):
 def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
     """A worker is killed during training; Ray Train starts another from the last checkpoint."""
     from jobs.support.trainer import fit
-    from jobs.train_lvae import Config, prepare
+    from jobs.train_lvae import Config
+    from jobs.implementation.train_lvae import prepare
 
     marker, seen = str(tmp_path / "died"), tmp_path / "validated"
     run = prepare(Config(preset="smoke", name="lvae-killed", checkpoint_every=3))
@@ -95,7 +97,8 @@ def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
 def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
     import jobs.support.trainer
     from jobs.support.trainer import fit
-    from jobs.train_dit import Config, prepare, train
+    from jobs.train_dit import Config
+    from jobs.implementation.train_dit import prepare, train
 
     seen = tmp_path / "validated"
 
@@ -110,7 +113,7 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
         return {}, {}
 
     monkeypatch.setattr(jobs.support.trainer, "RETRIES", 0)
-    run, _ = prepare(Config(preset="smoke", name="dit-two", workers=2, checkpoint_every=2))
+    run, _ = prepare(Config(preset="smoke", name="dit-two", num_workers=2, checkpoint_every=2))
     assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):
         fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
@@ -120,46 +123,50 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
     for name in one:
         assert np.allclose(one[name], two[name], atol=1e-4), name
     assert not list((home / "runs").rglob("*.pkl"))
-    with pytest.raises(ValueError, match=r"--workers is 4, this cluster of 2 CPUs has room for 1 to 3"):
-        train(Config(preset="smoke", name="dit-four", workers=4))
-    with pytest.raises(ValueError, match="--batch-size 7 does not divide by --workers 2"):
-        train(Config(preset="smoke", name="dit-odd", workers=2, batch_size=7))
+    with pytest.raises(ValueError, match=r"--num-workers is 4, this cluster of 2 CPUs has room for 1 to 3"):
+        train(Config(preset="smoke", name="dit-four", num_workers=4))
+    with pytest.raises(ValueError, match="--batch-size 7 does not divide by --num-workers 2"):
+        train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=7))
 
 
 def test_train_lvae_with_two_workers_matches_one(home):
-    from jobs.train_lvae import Config, train
+    from jobs.train_lvae import Config
+    from jobs.implementation.train_lvae import train
 
-    output = train(Config(preset="smoke", name="lvae-two", workers=2))
+    output = train(Config(preset="smoke", name="lvae-two", num_workers=2))
     one, two = weights(home / "models/lvae-smoke"), weights(Path(output))
     distance = max(np.abs(one[name] - two[name]).max() for name in one)
     assert distance < 1e-2, distance
 
 
 def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
-    from jobs.train_lvae import Config, train
+    from jobs.train_lvae import Config
+    from jobs.implementation.train_lvae import train
 
     kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
-    assert train(Config(preset="smoke", name="decoder", freeze_all_but_object_decoder=str(kept))) == str(output)
+    assert train(Config(preset="smoke", name="decoder", train_object_decoder_of=str(kept))) == str(output)
     old, new = weights(kept / "lvae"), weights(output / "lvae")
     changed = {name for name in old if (old[name] != new[name]).any()}
     assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
     assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
     with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
-        train(Config(preset="smoke", name="smoke", freeze_all_but_object_decoder=str(kept)))
+        train(Config(preset="smoke", name="smoke", train_object_decoder_of=str(kept)))
     with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
         train(
             Config(
                 preset="demo",
                 name="other",
                 dataset=str(home / "datasets/smoke"),
-                freeze_all_but_object_decoder=str(kept),
+                train_object_decoder_of=str(kept),
             )
         )
 
 
 def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
-    from jobs.encode_latents import Config, encode
-    from jobs.preprocess_scenes import Town, main
+    from jobs.encode_latents import Config
+    from jobs.implementation.encode_latents import encode
+    from jobs.preprocess_scenes import Town
+    from jobs.implementation.preprocess_scenes import main
 
     main(Town(output=str(tmp_path), num_train=8, num_test=8, seed=5))
     with pytest.raises(ValueError, match=r"lvae-smoke has another LayoutSpec: \w+ is .*, expected .*; use the dataset"):
@@ -168,7 +175,8 @@ def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
 
 
 def test_train_lvae_names_truncated_shard(home, tmp_path):
-    from jobs.train_lvae import Config, train
+    from jobs.train_lvae import Config
+    from jobs.implementation.train_lvae import train
 
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
     for shard in find_shards(str(tmp_path / "data"), split="train"):

@@ -26,7 +26,8 @@ def town_scenes(town_drive_3) -> list:
 
 
 def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.import_scenes import Config
+    from jobs.implementation.import_scenes import import_scenes
 
     meshes, output = tmp_path / "meshes", tmp_path / "out"
     for k, scene in enumerate(town_scenes):
@@ -63,15 +64,16 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
 
 def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
-    from jobs.evaluate_scenes import evaluate
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.implementation.evaluate_scenes import evaluate
+    from jobs.import_scenes import Config
+    from jobs.implementation.import_scenes import import_scenes
 
     scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(export_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
-    scores = evaluate(EvaluateConfig(real, "test", output, balance=False, output=str(tmp_path / "scores"), actors=1))
+    scores = evaluate(EvaluateConfig(real, "test", output, balance_labels=False, output=str(tmp_path / "scores"), num_actors=1))
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
     assert generation["random_frechet"]["value"] < 1e-4  # identical images
@@ -79,7 +81,8 @@ def test_evaluate_scores_imported_scenes(smoke, tmp_path):
 
 
 def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.import_scenes import Config
+    from jobs.implementation.import_scenes import import_scenes
 
     for k, scene in enumerate(town_scenes[:3]):
         write_voxels(str(tmp_path / "in" / f"scene{k}.npz"), scene)
@@ -103,7 +106,8 @@ def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
 
 
 def test_import_rejects_input_without_scenes(cluster, tmp_path):
-    from jobs.import_scenes import Config, import_scenes
+    from jobs.import_scenes import Config
+    from jobs.implementation.import_scenes import import_scenes
 
     (tmp_path / "a.glb").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"none of the 1 files could be read; the first: .*a\.glb"):
@@ -140,7 +144,8 @@ def voxel_files(tmp_path_factory, town_scenes):
 
 
 def test_evaluate_voxels_pools_counts_over_scenes(cluster, tmp_path, voxel_files):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     root, voxels = voxel_files
     config = Config(str(root / "truth"), str(root / "rebuilt"), str(root / "stored"), output=str(tmp_path))
@@ -171,7 +176,8 @@ def test_evaluate_voxels_pools_counts_over_scenes(cluster, tmp_path, voxel_files
 
 
 def test_evaluate_voxels_scores_perfect_reconstruction_as_1(cluster, tmp_path, town_scenes):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     for split, part in (("test", town_scenes[:3]), ("train", town_scenes[3:4])):
         Shard(str(tmp_path / "data"), "town", split, 0).write(part)
@@ -183,14 +189,15 @@ def test_evaluate_voxels_scores_perfect_reconstruction_as_1(cluster, tmp_path, t
     assert scores["left_out"] == {"truths": 0, "reconstructions": 0} and "stored_bytes" not in scores
     turned = evaluate(replace(config, axes=("x+", "y-", "z+")))
     assert turned["voxels"]["miou"] < 0.5
-    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*by --partial"):
+    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*by --allow-missing"):
         evaluate(replace(config, split=""))
-    partial = evaluate(replace(config, split="", partial=True))
+    partial = evaluate(replace(config, split="", allow_missing=True))
     assert partial["scenes"] == 3 and partial["left_out"] == {"truths": 1, "reconstructions": 0}
 
 
 def test_evaluate_voxels_names_broken_and_unmatched_files(cluster, tmp_path, voxel_files):
-    from jobs.evaluate_voxels import Config, evaluate
+    from jobs.evaluate_voxels import Config
+    from jobs.implementation.evaluate_voxels import evaluate
 
     root, _ = voxel_files
     for name in ("s0", "s9"):
@@ -198,4 +205,4 @@ def test_evaluate_voxels_names_broken_and_unmatched_files(cluster, tmp_path, vox
     with pytest.raises(ValueError, match=r"truth lack 1 of 5 names: s9; reconstructions lack 3 of 5 names: s1, s2, s3"):
         evaluate(Config(str(root / "truth"), str(tmp_path)))
     with pytest.raises(Exception, match=r"s0\.npz: class ids \[99\]"):
-        evaluate(Config(str(root / "truth"), str(tmp_path), partial=True))
+        evaluate(Config(str(root / "truth"), str(tmp_path), allow_missing=True))

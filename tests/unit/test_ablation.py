@@ -269,14 +269,14 @@ def test_ground_study_shrinks_networks_at_equal_latents():
 
 
 def test_variant_names_are_valid_for_files_and_mlflow():
-    from jobs.ablate_lvae import slug
+    from jobs.implementation.ablate_lvae import slug
 
     names = [slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
     assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 12
 
 
 def test_study_without_trials_releases_its_directory(tmp_path):
-    from jobs.ablate_lvae import claim
+    from jobs.implementation.ablate_lvae import guard_study as claim
 
     claim(str(tmp_path), {"dataset": "/nowhere"})
     (tmp_path / "mlflow.json").write_text("{}")

@@ -12,7 +12,8 @@ import trimesh
 from helpers import REJECT_REASON, TOWN_SLOTS, SvgPage, random_scene
 from scipy.spatial import ConvexHull
 
-from jobs.inspect_scenes import OneScene, Report, draw_scenes, write_page
+from jobs.inspect_scenes import OneScene, Report
+from jobs.implementation.inspect_scenes import draw_scenes, write_dataset_report as write_page
 from models.scene import CATEGORIES, ELLIPSOID, Grid
 from pipelines.io.mesh_export import triangulate_cuboids, triangulate_ellipsoids
 from pipelines.rendering.render import render_3d, render_bev

@@ -17,7 +17,6 @@ from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from models.tensors import encode_layout, make_layout_batch
 from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
-from models.vae.config import nest_flat_options, override_options
 from models.vae.ground import (
     HEIGHT_WEIGHT,
     LOGITS_PER_PX,
@@ -25,7 +24,6 @@ from models.vae.ground import (
     compute_signed_distance_px,
     compute_smooth_maps,
 )
-from models.vae.config import nest_flat_options, override_options
 from models.vae.losses import (
     compute_height_loss,
     compute_kl_loss,
@@ -33,9 +31,7 @@ from models.vae.losses import (
     compute_object_losses,
     compute_occupancy_loss,
 )
-from models.vae.config import nest_flat_options, override_options
 from models.vae.matching import MatchWeights, match_primitives
-from models.vae.config import nest_flat_options, override_options
 from models.vae.outputs import Posterior
 
 
@@ -287,7 +283,7 @@ def test_losses_equal_their_equations():
     got = [float(v) for v in compute_object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
 
     from models.vae.config import nest_flat_options, override_options
-from models.vae.losses import OBJECT_WEIGHTS
+    from models.vae.losses import OBJECT_WEIGHTS
 
     want = np.zeros(3)
     for sample in range(b):

@@ -8,14 +8,14 @@ from models.pretrained import CHECKSUMS_NAME, WEIGHTS, compute_checksums, find_p
 
 
 def test_tracking_hides_password_of_uri():
-    from jobs.support.tracking import shown
+    from jobs.support.tracking import hide_credentials as shown
 
     assert shown("no answer from https://me:secret@host:5000/x") == "no answer from https://host:5000/x"
     assert shown("sqlite:////home/me/mlflow.db") == "sqlite:////home/me/mlflow.db"
 
 
 def test_pipeline_directory_default_is_only_trained_or_released(tmp_path, monkeypatch):
-    from jobs.support.options import pipeline_directory
+    from jobs.support.model_directories import pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
     assert pipeline_directory("") == find_pipeline_path("town")

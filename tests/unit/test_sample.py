@@ -8,7 +8,7 @@ from pipelines.schema.tables import read_scenes
 
 
 def test_sampler_repairs_sampled_scenes(tmp_path):
-    from jobs.support.options import pipeline_directory
+    from jobs.support.model_directories import pipeline_directory
     from pipelines.generation.sample import Sampler, SampleRequest
     from pipelines.metrics.validity import SLAB_OFFSET_M, find_faults
 

@@ -1,0 +1,287 @@
+"""Implementation of jobs/ablate_lvae.py."""
+
+from __future__ import annotations
+
+import io
+import os
+import platform
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from statistics import median
+
+import pyarrow as pa
+import torch
+from rich.progress import Progress
+from torch.utils.flop_counter import FlopCounterMode
+
+from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
+from jobs.implementation.train_lvae import prepare
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from jobs.support.terminal import print_table
+from jobs.support.tracking import Tracker
+from jobs.support.trainer import TrainingRun, fit
+from jobs.train_lvae import Config
+from models.batch import LayoutBatch
+from models.lvae import LayoutVAE
+from models.presets import LVAE_PRESETS, preset
+from models.studies.orientation_study import Settings
+from models.tensors import layout_batch
+from pipelines.evaluation import ablation
+from pipelines.evaluation.ablation import Variant
+from pipelines.evaluation.reconstruction import rebuild
+from pipelines.reporting.chart import Chart, standalone_svg
+from pipelines.reporting.report import Table
+from pipelines.runtime import storage
+from pipelines.schema.scene_subset import Selection
+from pipelines.training.latents import load_lvae
+
+TIMING_STEPS = 60
+NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output")  # may change between runs of a study
+RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in study.json
+
+
+# ---------------------------------------------------------------------------------------------------- encoding
+
+
+def compare_encodings(config: Encoding) -> str:
+    """Train missing trials, write the tables, figures and page, and return the directory."""
+    output = absolute(config.output) if config.output else home("ablations", "encoding")
+    settings = Settings(config.epochs, config.batch_size, config.learning_rate)
+    trials = plan_trials(config)
+    guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
+    start_ray()
+    tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join(output, "mlflow.json"))
+    with Progress() as bar:
+        shown = bar.add_task("train autoencoders", total=len(trials))
+        scores = ablation.rebuild_boxes(
+            trials,
+            storage.join(output, "trials"),
+            settings,
+            config.num_test_boxes,
+            config.max_concurrent_trials,
+            lambda: bar.advance(shown),
+        )
+        bar.add_task("disturb numbers", total=None)
+        losses = ablation.yaw_losses(config.num_noisy_boxes)
+    rows = ablation.by_size(scores)
+    for row in rows:
+        name = f"{row['boxes']}.{row['numbers']}.{row['encoding']}.iou3d"
+        tracker.metrics({name: row["iou3d_mean"]}, row["training_size"])
+    notes = [
+        f"{config.num_seeds} seeds, {config.epochs} epochs, batches of {config.batch_size}, learning rate "
+        f"{config.learning_rate:g}, {config.num_test_boxes} test boxes, at most "
+        f"{max(r['parameters'] for r in scores):,} parameters; the networks of all encodings differ only in "
+        "their first and last layer.",
+        describe_machine(),
+    ]
+    write_encoding_report(config, output, rows, losses, notes, tracker)
+    return output
+
+
+def plan_trials(config: Encoding) -> list:
+    """Return the trials of all three sets of boxes."""
+    trials = ablation.trials("vehicle", config.train_sizes, config.num_seeds)
+    if config.yaw_only_train_sizes:
+        trials += ablation.trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "moving")
+    if config.any_footprint_train_sizes:
+        trials += ablation.trials("any", config.any_footprint_train_sizes, config.num_seeds)
+    return trials
+
+
+def write_encoding_report(
+    config: Encoding, output: str, rows: list[dict], losses: list[dict], notes: list[str], tracker: Tracker
+) -> None:
+    """Write tables, figures and the page of the encoding study."""
+    table, footprints, angles = ablation.encoding_table(rows), ablation.share_table(rows), ablation.yaw_table(losses)
+    figure, cost = ablation.size_chart(rows, "vehicle"), ablation.yaw_chart(losses)
+    charts = [figure, cost]
+    if config.yaw_only_train_sizes:
+        charts.append(ablation.size_chart(rows, "vehicle", "moving"))
+    if config.any_footprint_train_sizes:
+        charts.append(ablation.share_chart(rows, "any", max(config.any_footprint_train_sizes)))
+    tables = [table, *([footprints] if footprints else []), angles]
+    write_tables(output, "encodings", rows, tables[:-1], figure)
+    write_tables(output, "yaw_loss", losses, [angles], cost)
+    html = ablation.page("Encodings of a box", "Cholesky, quaternion and octahedral, rebuilt", tables, charts, notes)
+    write_page(output, html, tables, tracker)
+
+
+# ---------------------------------------------------------------------------------------------------- variants
+
+
+def compare_variants(config: Branches) -> str:
+    """Train and score missing variants, write the table, curves and page, and return the directory."""
+    output = absolute(config.output) if config.output else home("ablations", config.name)
+    if config.minutes <= 0 or config.num_seeds < 1:
+        raise ValueError(f"--minutes is {config.minutes}, --num-seeds {config.num_seeds}: expected more than 0")
+    preset(LVAE_PRESETS, config.preset)
+    chosen = select_variants(config)
+    guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
+    start_ray()
+    tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join(output, "mlflow.json"))
+    scores = []
+    for seed in range(config.num_seeds):
+        for variant in chosen:
+            path = storage.join(output, "runs", f"{slug(variant)}-seed{seed}.json")
+            if not storage.exists(path):
+                storage.write_json(train_variant(config, variant, seed, output), path)
+            scores.append(storage.read_json(path))
+            kept = {f"{slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
+            tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
+    rows, curves = ablation.by_variant(scores), ablation.curve_chart(scores)
+    table = ablation.variant_table(rows)
+    write_tables(output, config.name, rows, [table], curves)
+    equal = "equal time" if at_equal_time(config) and not config.steps else "equally many steps"
+    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", describe_machine()]
+    html = ablation.page("Ablations of the layout VAE", config.name, [table], [curves], how)
+    write_page(output, html, [table], tracker)
+    return output
+
+
+def select_variants(config: Branches) -> dict[str, Variant]:
+    """Return the variants of --only-variants by name.
+
+    Raises:
+        ValueError: The study has no variant of that name.
+    """
+    studies = {
+        Branches: ablation.BRANCHES,
+        Decoders: ablation.DECODERS,
+        Ground: ablation.GROUND,
+        Augmentation: ablation.AUGMENTATIONS,
+    }
+    known = studies[type(config)]
+    if unknown := set(config.only_variants) - set(known):
+        raise ValueError(f"--only-variants {sorted(unknown)}: expected some of {list(known)}")
+    return {
+        name: variant for name, variant in known.items() if not config.only_variants or name in config.only_variants
+    }
+
+
+def at_equal_time(config: Branches) -> bool:
+    """Return whether the variants of a study train for equal time, not for equally many steps."""
+    return isinstance(config, Decoders | Ground)
+
+
+def slug(variant: str) -> str:
+    """Return a variant's name in a form that is valid in file names and MLflow metric names."""
+    return re.sub(r"\W+", "-", variant.replace("'", ""))
+
+
+def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps: int) -> TrainingRun:
+    """Return the training run of the preset with the architecture and options of a variant."""
+    switched = select_variants(config)[variant]
+    training = prepare(
+        Config(
+            preset=config.preset,
+            dataset=config.dataset,
+            name=name,
+            steps=steps,
+            batch_size=config.batch_size,
+            seed=seed,
+            checkpoint_every=max(1, steps // config.num_checkpoints),
+            **switched.options,
+        )
+    )
+    architecture, *rest = training.build.args
+    return replace(training, build=partial(training.build.func, architecture | switched.architecture, *rest))
+
+
+def train_variant(config: Branches, variant: str, seed: int, output: str) -> dict:
+    """Train one variant with one seed, reconstruct the held-out scenes, and return its scores."""
+    timed = variant if at_equal_time(config) else next(iter(select_variants(replace(config, only_variants=()))))
+    steps = config.steps or measure_steps(config, timed, output)
+    name = f"{config.name}-{slug(variant)}-seed{seed}"
+    training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
+    model = fit(training, config.num_workers, storage.join(output, "models", f"{slug(variant)}-seed{seed}"))
+    seconds = time.perf_counter() - started
+    root = training.identity["dataset"]
+    source = training.stream.shards[0].source
+    reconstruction = rebuild(Selection(root, source, "test", config.max_scenes), model).scores
+    described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
+    trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
+    described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
+    described |= {"gflops": count_gflops(trained, layout_batch(example, trained.spec))}
+    described |= {"curve": training.tracker.history("validation_ap3d"), "scenes": reconstruction["scenes"]}
+    return described | ablation.measured(select_variants(config)[variant], reconstruction)
+
+
+def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
+    """Return the floating-point operations, in 1e9, of encoding and decoding a batch."""
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model.decode(model.encode(batch).mean)
+    return counter.get_total_flops() / 1e9
+
+
+def measure_steps(config: Branches, variant: str, output: str) -> int:
+    """Return the steps of a variant in --minutes, measured once and then read from timing-<variant>.json."""
+    record = storage.join(output, f"timing-{slug(variant)}.json")
+    if not storage.exists(record):
+        name = f"timing-{slug(variant)}"
+        training = prepare_variant(config, variant, f"{config.name}-{name}", 0, TIMING_STEPS)
+        training = replace(training, validate=None, log_every=1)
+        fit(training, config.num_workers, storage.join(output, "models", name))
+        rates = [value for _, value in training.tracker.history("scenes_per_second")]
+        per_second = median(rates[len(rates) // 2 :]) / training.stream.batch_size  # the first steps are slow
+        storage.write_json(
+            {"steps_per_second": per_second, "steps": max(1, int(60 * config.minutes * per_second))}, record
+        )
+    return storage.read_json(record)["steps"]
+
+
+# ------------------------------------------------------------------------------------------------- both
+
+
+def guard_study(output: str, options: dict) -> None:
+    """Bind a directory to one set of options.
+
+    Raises:
+        ValueError: It holds trials of other options.
+    """
+    record = storage.join(output, "study.json")
+    kept = [path for path in storage.list_files(output, ".json") if not path.endswith(("/study.json", "/mlflow.json"))]
+    if kept and storage.exists(record) and (made := storage.read_json(record)) != options:
+        key = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
+        raise ValueError(
+            f"{output} holds a study with {key}={made.get(key)}, asked for {options.get(key)}; "
+            "use the same options to resume, or another --output for a new study"
+        )
+    storage.write_json(options, record)
+
+
+def write_tables(
+    output: str, name: str, rows: list[dict], tables: Sequence[Table], figure: Chart | None = None
+) -> None:
+    """Write NAME.json and NAME.parquet with all rows, NAME.txt with the tables, NAME.svg with the figure."""
+    storage.write_json({"machine": describe_machine(), "rows": rows}, storage.join(output, f"{name}.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, f"{name}.parquet"))
+    text = io.StringIO()
+    for table in tables:
+        print_table(table, text)
+    files = {"txt": text.getvalue()} | ({"svg": standalone_svg(figure)} if figure else {})
+    for kind, content in files.items():
+        path = storage.join(output, f"{name}.{kind}")
+        storage.write_text(content, path)
+
+
+def write_page(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -> None:
+    """Write the page, log it to MLflow, and print the tables."""
+    path = storage.join(output, "report.html")
+    storage.write_text(html, path)
+    tracker.client.log_text(tracker.run_id, html, "report.html")
+    tracker.finish("FINISHED")
+    for table in tables:
+        print_table(table)
+
+
+def describe_machine() -> str:
+    """Return machine and versions in one line."""
+    return f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, torch {torch.__version__}"
+
+
+def main(config: Encoding | Branches) -> None:
+    print(compare_encodings(config) if isinstance(config, Encoding) else compare_variants(config))

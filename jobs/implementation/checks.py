@@ -1,0 +1,113 @@
+"""Checks of options that need neither torch nor Ray: `run` reports mistakes before it imports a job's implementation.
+
+A function check_<job>(config) raises ValueError for a mistake. The implementations call it too.
+"""
+
+from __future__ import annotations
+
+import os
+
+from jobs.encode_latents import Config as EncodeConfig
+from jobs.evaluate_scenes import Config as EvaluateConfig
+from jobs.inpaint_scenes import Config as InpaintConfig
+from jobs.outpaint_scenes import Config as OutpaintConfig
+from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
+from jobs.publish_model import Config as PublishConfig
+from jobs.sample_scenes import Config as SampleConfig
+from jobs.support.cli import absolute, home, require_positive
+from jobs.support.model_directories import pipeline_directory, require_model_labels
+from jobs.train_dit import Config as DiTConfig
+from jobs.train_lvae import Config as LVAEConfig
+from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+
+
+def training_dataset_root(config: LVAEConfig | DiTConfig, source: str) -> str:
+    """Return --dataset, or the directory of the preset's dataset."""
+    if config.dataset:
+        return absolute(config.dataset)
+    return home("datasets", "smoke" if config.preset == "smoke" else source)
+
+
+def makes_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
+    """Return whether a training run generates its own missing inputs."""
+    return config.preset == "smoke" and not config.dataset
+
+
+def check_train_lvae(config: LVAEConfig) -> None:
+    row = preset(LVAE_PRESETS, config.preset)
+    require_positive(config, "gradient_accumulation_steps")
+    if not makes_smoke_inputs(config):
+        Dataset.open(training_dataset_root(config, row.source))
+
+
+def check_train_dit(config: DiTConfig) -> None:
+    row = preset(DIT_PRESETS, config.preset)
+    require_positive(config, "gradient_accumulation_steps")
+    if not makes_smoke_inputs(config):
+        root = Dataset.open(training_dataset_root(config, LVAE_PRESETS[row.lvae].source)).root
+        require_latents(absolute(config.latents) if config.latents else root, root)
+
+
+def require_latents(latents_root: str, dataset_root: str) -> None:
+    """Check that a directory has complete latents.
+
+    Raises:
+        ValueError: There are no latents, or encoding was interrupted.
+    """
+    path = storage.join(latents_root, "latents.json")
+    if not storage.exists(path):
+        raise ValueError(
+            f"{latents_root}: no latents.json here; run jobs/encode_latents.py --dataset {dataset_root} first"
+        )
+    if not storage.read_json(path)["complete"]:
+        raise ValueError(
+            f"{latents_root}: latents are incomplete; run jobs/encode_latents.py --dataset {dataset_root} again"
+        )
+
+
+def check_encode_latents(config: EncodeConfig) -> None:
+    Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
+
+
+def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
+    if not isinstance(config, Town) and "://" not in config.input and not os.path.isdir(absolute(config.input)):
+        raise ValueError(f"--input {config.input}: no such directory; give the dataset's root")
+
+
+def check_sample_scenes(config: SampleConfig) -> None:
+    require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size")
+    require_model_labels(pipeline_directory(config.model), config.labels)
+
+
+def check_publish_model(config: PublishConfig) -> None:
+    pipeline_directory(config.model)
+
+
+def check_inpaint_scenes(config: InpaintConfig) -> None:
+    if not (config.polygon_m or config.half_plane or config.primitives):
+        raise ValueError("no region: give --polygon-m, --half-plane or --primitives")
+    require_positive(config, "num_variants", "num_actors")
+    if config.num_examples < 0:
+        raise ValueError(f"--num-examples is {config.num_examples}, expected 0 or more")
+    if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
+        raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of at least three corners")
+    require_model_labels(pipeline_directory(config.model), [config.label] if config.label else [])
+
+
+def check_outpaint_scenes(config: OutpaintConfig) -> None:
+    require_positive(config, "num_actors", "batch_size")
+    require_model_labels(pipeline_directory(config.model), [config.label] if config.label else [])
+
+
+def check_evaluate_scenes(config: EvaluateConfig) -> None:
+    for name, least in (("num_examples", 0), ("max_scenes", 2), ("supersample", 1)):
+        if (value := getattr(config, name)) < least:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}, expected {least} or more")
+    if config.max_reconstructed_scenes is not None and not config.lvae:
+        raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
+    if config.inception and not storage.exists(absolute(config.inception)):
+        raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
+    if config.lvae and not storage.exists(storage.join(absolute(config.lvae), "config.json")):
+        raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")

@@ -1,0 +1,229 @@
+"""The demo's HTML page: real and generated scenes, training curves, and scores with their meaning."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import asdict
+from itertools import islice
+
+from jobs.run_demo import Config
+from jobs.support.cli import home
+from jobs.support.tracking import Tracker, client, tracking_uri
+from models.scene import Scene
+from pipelines.preprocess.sources.town.reference_statistics import measure
+from pipelines.rendering.render import bev_picture, picture_3d
+from pipelines.reporting.chart import Chart
+from pipelines.reporting.evaluation_report import score_table, validity_table
+from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, write_report
+from pipelines.schema.tables import read_scenes
+
+SHOWN = 4
+
+MEANINGS = {
+    "ground_iou": "IoU of the ground classes over all pixels; 1 is perfect (paper, on KITTI-360: 0.9996)",
+    "height_rmse_m": "root mean squared error of the ground height in metres, where there is ground",
+    "height_mse_normalised": "mean squared error of heights scaled to [0, 1] by the data's range (paper: 0.0075)",
+    "ap3d": "average precision of boxes over ten IoU thresholds, 0.05 to 0.50, without ellipsoids (paper: 0.621)",
+    "ap3d_50": "average precision at IoU 0.50 (paper: 0.470)",
+}
+
+
+def scene_picture_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, Picture]:
+    """Return a scene in 3D and from above."""
+    return (
+        Picture(caption, picture_3d(scene, 640, 480), tag),
+        Picture("", bev_picture(scene, 384, supersample=2), tag),
+    )
+
+
+def scene_pictures(title: str, note: str, scenes: list[Scene], tag: str) -> Pictures:
+    """Return two rows of pictures: scenes in 3D, and from above."""
+    pairs = [scene_picture_pair(s, f"{s.vegetation_density} vegetation · {len(s)} objects", tag) for s in scenes]
+    return Pictures(
+        title, [first for first, _ in pairs] + [second for _, second in pairs], columns=len(pairs), note=note
+    )
+
+
+def one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
+    """Return `count` scenes with low, medium and high vegetation in turn, as far as there are enough."""
+    groups = {name: iter([s for s in scenes if s.vegetation_density == name]) for name in ("low", "medium", "high")}
+    chosen: list[Scene] = []
+    while len(chosen) < count and groups:
+        for name in list(groups):
+            scene = next(groups[name], None)
+            if scene is None:
+                del groups[name]
+            else:
+                chosen.append(scene)
+    return chosen[:count] or scenes[:count]
+
+
+def curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float], list[float]]]:
+    """Return metric histories of an experiment's last run: label -> (steps, values)."""
+    api = client(tracking_uri())
+    found = api.get_experiment_by_name(experiment)
+    run_id = api.search_runs([found.experiment_id], max_results=1)[0].info.run_id
+    tracker = Tracker(tracking_uri(), run_id)
+    histories = {label: tracker.history(name) for name, label in names.items()}
+    return {label: tuple(map(list, zip(*h, strict=True))) for label, h in histories.items() if h}
+
+
+def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str, float]) -> None:
+    """Write one self-contained HTML page.
+
+    Args:
+        path: File to write.
+        config: Options of the demo.
+        scores: Nested scores of the evaluation.
+        seconds: Duration of each stage.
+    """
+    data = home("datasets", "town")
+    real = list(read_scenes(data, "town", "test"))
+    generated = list(read_scenes(home("generated"), "generated-samples"))
+    sections: list[Section] = [
+        *introduction_sections(config, scores["reconstruction"], len(real), len(generated), sum(seconds.values())),
+        *scene_sections(config, real, generated),
+        training_charts(),
+        *score_sections(scores, data),
+        *closing_sections(config, seconds),
+    ]
+    write_report(path, "PrITTI on Ray: the demo", sections, "Primitive-based generation of 3D semantic urban scenes")
+
+
+def introduction_sections(
+    config: Config, reconstruction: dict, num_real: int, num_generated: int, total_seconds: float
+) -> list[Section]:
+    """What the page shows, and its key figures."""
+    minutes = total_seconds / 60
+    return [
+        Text(
+            "What this is",
+            [
+                "A layout VAE and a diffusion transformer were trained from random weights on a procedural "
+                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. The "
+                "method is the paper's; the models are small and the training is short. Longer runs of the same command "
+                "give better scenes.",
+            ],
+        ),
+        KeyFigures(
+            "In short",
+            [
+                Figure(
+                    f"{minutes:.1f} min",
+                    "from raw drives to generated scenes",
+                    f"{os.cpu_count()} cores, {platform.machine()}",
+                ),
+                Figure(num_real + config.num_train, "town scenes"),
+                Figure(reconstruction["ground_iou"], "ground IoU", "reconstruction of held-out scenes"),
+                Figure(reconstruction["ap3d"], "AP3D", "reconstruction of held-out scenes"),
+                Figure(num_generated, "generated scenes", f"{config.num_inference_steps} denoising steps each"),
+            ],
+        ),
+    ]
+
+
+def scene_sections(config: Config, real: list[Scene], generated: list[Scene]) -> list[Section]:
+    """Pictures of released, real, generated and outpainted scenes."""
+    released = []
+    if config.num_released_scenes:
+        released = [
+            scene_pictures(
+                "Scenes of the released model",
+                "The weights come with the package and were trained for longer than a demo (models/weights/town).",
+                one_per_label(list(read_scenes(home("released"), "generated-samples")), SHOWN),
+                "generated",
+            )
+        ]
+    return [
+        *released,
+        scene_pictures(
+            "Real scenes",
+            "Held-out scenes of the town, 64 x 64 m, in 3D and from above. The car is at the bottom edge, facing up.",
+            one_per_label(real, SHOWN),
+            "real",
+        ),
+        scene_pictures(
+            "Generated scenes",
+            "Sampled by the diffusion transformer of this demo, for the vegetation label above each picture.",
+            one_per_label(generated, SHOWN),
+            "generated",
+        ),
+        outpainting_pictures(next(read_scenes(home("outpainted"), "generated-outpainted"))),
+    ]
+
+
+def outpainting_pictures(scene: Scene) -> Pictures:
+    """One outpainted scene from the side and from above."""
+    return Pictures(
+        "An outpainted scene",
+        [
+            Picture("128 x 128 m", picture_3d(scene, 960, 720), "generated"),
+            Picture(
+                "the middle quarter is the given scene; four sides and four corners were added",
+                bev_picture(scene, 720, supersample=2),
+                "generated",
+            ),
+        ],
+        columns=2,
+        note="One generated scene, extended in two passes: four sides, then four corners. Each block overlaps the "
+        "known region by half.",
+    )
+
+
+def training_charts() -> Charts:
+    """Loss and validation curves of both stages."""
+    losses = {"loss": "training", "validation_loss": "held out"}
+    return Charts(
+        "Training",
+        [
+            Chart("Layout VAE: total loss", curves("pritti-lvae", losses), "step", "loss", log_y=True),
+            Chart(
+                "Layout VAE: held-out ground IoU",
+                curves("pritti-lvae", {"validation_ground_iou": "held out"}),
+                "step",
+                "IoU",
+            ),
+            Chart(
+                "Diffusion transformer: noise error",
+                curves("pritti-dit", losses),
+                "step",
+                "mean squared error",
+                log_y=True,
+            ),
+        ],
+    )
+
+
+def score_sections(scores: dict, data: str) -> list[Section]:
+    """Tables of reconstruction, generation and validity scores, and of the town's statistics."""
+    reconstruction, generation = scores["reconstruction"], scores["generation"]
+    return [
+        Table(
+            "Reconstruction",
+            ("measure", "value"),
+            [(name.replace("_", " "), reconstruction[name]) for name in MEANINGS],
+            meanings=list(MEANINGS.values()),
+        ),
+        score_table(generation),
+        validity_table(generation["validity"]),
+        Table(
+            "The town against KITTI-360",
+            ("what", "vegetation", "target", "measured", "within tolerance"),
+            [tuple(row) for row in measure(islice(read_scenes(data, "town", "train"), 1000))],
+            note="The targets are published statistics of KITTI-360. A test checks them on 1,000 scenes; here they are "
+            "measured on the demo's scenes.",
+        ),
+    ]
+
+
+def closing_sections(config: Config, seconds: dict[str, float]) -> list[Section]:
+    """Duration of the stages, and the options of the run."""
+    return [
+        Table(
+            "Duration of the stages",
+            ("stage", "seconds"),
+            [(name, round(value, 1)) for name, value in seconds.items()],
+        ),
+        Text("How to repeat it", ["make demo", ", ".join(f"{name}={value}" for name, value in asdict(config).items())]),
+    ]

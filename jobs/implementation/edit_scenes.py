@@ -1,0 +1,91 @@
+"""Implementation of jobs/edit_scenes.py."""
+
+from __future__ import annotations
+
+from rich.progress import Progress
+
+from jobs.edit_scenes import (
+    Duplicate,
+    Relabel,
+    Remove,
+    Repair,
+    Replay,
+    Rotate,
+    Scale,
+    SelectOptions,
+    Snap,
+    Translate,
+)
+from jobs.support.cli import absolute
+from jobs.support.ray_session import start_ray
+from jobs.support.scene_requests import select_scenes
+from jobs.support.terminal import print_table
+from jobs.support.value_names import EDIT_FRAMES
+from pipelines.editing import edit
+from pipelines.generation import batch_edit
+from pipelines.runtime import storage
+
+
+def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
+    """Return the edits of the command line or of a file.
+
+    Raises:
+        ValueError: The file is missing or holds no list of edits.
+    """
+    if isinstance(config, Replay):
+        if not config.edits:
+            raise ValueError("replay needs a file: give the JSON file with the list of edits")
+        content = storage.read_json(absolute(config.edits))
+        content = content.get("edits") if isinstance(content, dict) else content
+        try:
+            return edit.edits_from_json(content)
+        except ValueError as error:
+            raise ValueError(f"{config.edits}: {error}") from error
+    names = ("category", "primitives", "instances", "polygon_m", "where")
+    select = edit.Select(**{name: getattr(config, name) for name in names})
+    match config:
+        case Remove():
+            return [edit.Remove(select)]
+        case Duplicate():
+            return [edit.Duplicate(select, config.offset_m)]
+        case Translate():
+            return [edit.Translate(select, config.offset_m, EDIT_FRAMES[config.frame])]
+        case Rotate():
+            return [edit.Rotate(select, config.angle_deg, config.pivot_m)]
+        case Scale():
+            return [edit.Scale(select, config.factors, config.anchor)]
+        case Relabel():
+            return [edit.Relabel(select, config.to, config.class_name)]
+        case Snap():
+            return [edit.Snap(select, config.slab_offset_m)]
+        case Repair():
+            limits = config.max_push_m, config.min_shrink
+            return [edit.Repair(select, config.slab_offset_m, config.ground, *limits, config.drop)]
+    raise ValueError(f"no edit: {config!r}")
+
+
+def edit_scenes(config: SelectOptions | Replay) -> batch_edit.Edited:
+    """Edit scenes, write them, and return the changes."""
+    if config.num_examples < 0 or not config.run or set(config.run) & set("/=\\"):
+        raise ValueError(
+            f"--num-examples is {config.num_examples}, --run {config.run!r}: expected 0 or more, and a word without "
+            "/ = and \\"
+        )
+    edits = read_edits(config)
+    for step in edits:
+        step.check()
+    selection = select_scenes(config)
+    total = sum(len(rows) for _, rows in selection.shards())
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("edit scenes", total=total)
+        request = batch_edit.EditRequest(tuple(edits), config.output_directory(), config.run)
+        return batch_edit.edit_scenes(request, selection, config.num_examples, lambda count: bar.advance(shown, count))
+
+
+def main(config: SelectOptions | Replay) -> None:
+    made = edit_scenes(config)
+    print_table(made.table)
+    rejected = f"; {made.rejects} scenes rejected, see the rejects table" if made.rejects else ""
+    print(f"{made.scenes} scenes, source edited-{config.run}, in {config.output_directory()}{rejected}")
+    print(f"before and after: {made.page}")

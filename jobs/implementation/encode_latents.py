@@ -1,0 +1,34 @@
+"""Implementation of jobs/encode_latents.py."""
+
+from __future__ import annotations
+
+from rich.progress import Progress
+
+from jobs.encode_latents import Config
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from pipelines.schema.dataset import Dataset
+from pipelines.training.latents import encode_latents
+
+
+def encode(config: Config) -> dict:
+    """Encode the scenes of a dataset and return the content of latents.json."""
+    dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
+    lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
+    output = absolute(config.output) if config.output else dataset.root
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))
+        return encode_latents(
+            dataset,
+            lvae,
+            output,
+            config.num_actors,
+            config.batch_size,
+            lambda row: bar.advance(shown, int(row["count"])),
+        )
+
+
+def main(config: Config) -> None:
+    content = encode(config)
+    print(f"latents of {sum(content['scenes'].values())} scenes, shape {content['shape']}")

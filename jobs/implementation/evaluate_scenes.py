@@ -1,0 +1,186 @@
+"""Implementation of jobs/evaluate_scenes.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from jobs.evaluate_scenes import Config
+from jobs.implementation.checks import check_evaluate_scenes
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from jobs.support.scores import publish_scores
+from jobs.support.value_names import REFERENCES
+from pipelines.evaluation.evaluate import compare, memorisation, plain
+from pipelines.evaluation.example_images import pictures_shown
+from pipelines.evaluation.features import Looks, PictureFile, Side, describe
+from pipelines.evaluation.reconstruction import draw, rebuild
+from pipelines.metrics.adm_npz import picture_shape, reference_moments
+from pipelines.metrics.inception import weights_line
+from pipelines.reporting.evaluation_report import evaluation_html, headlines, written
+from pipelines.reporting.reconstruction_report import reconstruction_html
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
+from pipelines.training.latents import load_lvae, weights_digest
+
+
+def evaluate(config: Config) -> dict:
+    """Evaluate, write all files, and return the nested metrics of metrics.json."""
+    check_evaluate_scenes(config)
+    dataset = None
+    if config.lvae or not config.real.endswith(".npz"):
+        dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
+    named = config.run or config.generated_source or not config.lvae
+    wanted = config.generated or (home("generated") if named else "")
+    output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
+    scores: dict = {}
+    sides = select_sides(config, dataset) if wanted else {}
+    start_ray()
+    with Progress() as bar:
+        if config.lvae:
+            scores["reconstruction"] = evaluate_reconstruction(config, dataset, output, bar)
+        if wanted:
+            scores["generation"] = evaluate_generation(config, dataset, sides, output, bar)
+    storage.write_json(describe_inputs(config, dataset, sides), storage.join(output, "evaluation.json"))
+    tags = {
+        "real": config.real or home("datasets", "town"),
+        "split": config.real_split,
+        "generated": wanted,
+        "lvae": config.lvae and absolute(config.lvae),
+    }
+    pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
+    return publish_scores(output, scores, tags, [pages[name] for name in scores])
+
+
+def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> dict:
+    """Return what was evaluated: sides, sampling options if one run generated all scenes, weights of the LVAE."""
+    about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
+    about["lvae_weights"] = weights_digest(load_lvae(absolute(config.lvae))) if config.lvae else None
+    made = sides.get("generated")
+    about["generated"] = made and made.root
+    sources = {shard.source for shard, _ in made.shards()} if isinstance(made, Selection) else ()
+    if len(sources) == 1:
+        about["source"] = sources.pop()
+        record = storage.join(made.root, f"{about['source']}.json")
+        about["sampling"] = storage.read_json(record) if storage.exists(record) else None
+    return about
+
+
+def evaluate_generation(
+    config: Config, dataset: Dataset | None, sides: dict[str, Side], output: str, bar: Progress
+) -> dict:
+    """Score generated scenes; write evaluation.html, and the features of each scene to described/."""
+    looks = Looks(config.supersample, config.inception and absolute(config.inception))
+    described = {}
+    for name, side in sides.items():
+        task, directory = bar.add_task(f"describe {name}", total=side.limit), storage.join(output, "described", name)
+        described[name] = describe(
+            side, dataset, looks, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
+        )
+    task = bar.add_task("compare", total=2)
+    reference = reference_moments(sides["real"].path) if isinstance(sides["real"], PictureFile) else None
+    classes = dataset.spec.ground_classes if dataset else ()
+    scores = compare(described["real"], described["generated"], classes, config.k, reference)
+    bar.advance(task)
+    features = "pool3" if "pool3" in described["real"] else "random"
+    found = memorisation(described["real"][features], described["generated"][features])
+    scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
+    bar.advance(task)
+    counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
+    shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
+    html = evaluation_html(plain(scores), counts, shown, describe_protocol(config, sides, looks))
+    storage.write_text(html, storage.join(output, "evaluation.html"))
+    return scores
+
+
+def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
+    """Return both sides with equally many scenes.
+
+    Raises:
+        ValueError: The pictures of the sides differ in size.
+    """
+    source = config.generated_source or (f"generated-{config.run}" if config.run else None)
+    generated = absolute(config.generated) if config.generated else home("generated")
+    labels = "balanced" if config.balance_labels else "spread"
+    sides, counts, sizes = {}, {}, {}
+    for name, path in (("real", absolute(config.real) if config.real else ""), ("generated", generated)):
+        if path.endswith(".npz"):
+            count, *sizes[name], _ = picture_shape(path)
+            counts[name], sides[name] = min(count, config.max_scenes), PictureFile(path, count)
+            continue
+        if name == "real":
+            side = Selection(
+                dataset.root,
+                dataset.source,
+                config.real_split,
+                config.max_scenes,
+                REFERENCES[config.reference],
+                config.min_distance_m,
+            )
+        else:
+            side = Selection(path, source, config.generated_split or None, config.max_scenes, labels)
+        sizes[name], sides[name] = [256, 256], side
+        counts[name] = sum(len(rows) for _, rows in side.shards())
+    if sizes["real"] != sizes["generated"]:
+        raise ValueError(
+            f"real pictures are {sizes['real']} pixels, generated ones {sizes['generated']}: expected equal sizes"
+        )
+    return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
+
+
+def describe_protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
+    """Return sentences about how the sides were chosen and drawn."""
+    how = {
+        "farthest-point": "farthest point sampling of poses",
+        "min-distance": f"poses at least {config.min_distance_m:g} m apart",
+        "uniform": "evenly spread",
+    }[config.reference]
+    chosen = {
+        "real": f"split {config.real_split}, {how}",
+        "generated": "labels in equal parts as far as they go" if config.balance_labels else "evenly spread",
+    }
+    words = [
+        f"{name.capitalize()}: {side.limit} of {side.root}, "
+        f"{'the first' if isinstance(side, PictureFile) else chosen[name]}."
+        for name, side in sides.items()
+    ]
+    drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
+    words.append(f"Pictures of scenes: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.")
+    return [*words, weights_line(looks.inception)] if looks.inception else words
+
+
+def evaluate_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
+    """Score reconstructions; write reconstruction.parquet and reconstruction.html with the best and worst scenes."""
+    real = Selection(dataset.root, dataset.source, config.lvae_split, config.max_reconstructed_scenes)
+    lvae = absolute(config.lvae)
+    shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
+    rebuilt = rebuild(
+        real,
+        lvae,
+        config.num_actors,
+        voxel_range_m=config.voxel_range_m,
+        dataset=dataset,
+        on_scene=lambda: bar.advance(shown),
+    )
+    storage.write_parquet(rebuilt.scenes, storage.join(output, "reconstruction.parquet"))
+    count = min(config.num_examples, len(rebuilt.places) // 2)
+    drawn = []
+    if count:
+        chosen = rebuilt.places[:count] + rebuilt.places[-count:]
+        drawing = bar.add_task("draw best and worst", total=len(chosen))
+        drawn = draw(chosen, lvae, config.num_actors, lambda: bar.advance(drawing))
+    subtitle = f"{lvae} on {rebuilt.scores['scenes']} scenes of {real.root}, split {real.split}"
+    html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
+    storage.write_text(html, storage.join(output, "reconstruction.html"))
+    return rebuilt.scores
+
+
+def main(config: Config) -> None:
+    lines = Table("metric", "value")
+    for name, value in headlines(evaluate(config)):
+        lines.add_row(name, written(value))
+    Console().print(lines)

@@ -1,0 +1,54 @@
+"""Implementation of jobs/evaluate_voxels.py."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from jobs.evaluate_voxels import Config
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from jobs.support.scores import publish_scores
+from pipelines.evaluation.voxel_reconstruction import files_by_scene, paired, score_voxels, true_scenes
+from pipelines.geometry.voxels import VoxelGrid
+from pipelines.io.voxel_import import VOXEL_AXES
+from pipelines.runtime import storage
+from pipelines.schema.axis_convention import scene_from_axes
+
+
+def evaluate(config: Config) -> dict:
+    """Evaluate, write all files, and return the nested metrics."""
+    axes, truth_axes = config.axes or VOXEL_AXES, config.ground_truth_axes or VOXEL_AXES
+    for words in (axes, truth_axes):
+        scene_from_axes(words)
+    grid = VoxelGrid(bottom_m=config.voxel_range_m[0], top_m=config.voxel_range_m[1])
+    truth = true_scenes(absolute(config.ground_truth), config.split)
+    rebuilt = files_by_scene(absolute(config.reconstructed), ".npz")
+    stored = files_by_scene(absolute(config.compressed)) if config.compressed else None
+    pairs = paired(truth, rebuilt, stored, config.allow_missing)
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("score voxels", total=len(pairs))
+        scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
+    scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
+    output = absolute(config.output) if config.output else home("evaluations", "voxels")
+    storage.write_parquet(scenes, storage.join(output, "voxels.parquet"))
+    tags = {"truth": absolute(config.ground_truth), "split": config.split, "rebuilt": absolute(config.reconstructed)}
+    return publish_scores(output, scores, tags)
+
+
+def main(config: Config) -> None:
+    scores = evaluate(config)
+    table = Table("score", "value")
+    for name, value in (("IoU", scores["voxels"]["iou"]), ("mIoU", scores["voxels"]["miou"])):
+        table.add_row(name, f"{100 * value:.2f} %")
+    for name, value in scores["voxels"]["class_iou"].items():
+        table.add_row(f"  {name}", f"{100 * value:.2f} %")
+    for kind, name in (("rebuilt", "reconstructed"), ("stored", "compressed")):
+        if sizes := scores.get(f"{kind}_bytes"):
+            table.add_row(f"{name}, per scene", f"{sizes['mean'] / 2**20:.3f} ± {sizes['std'] / 2**20:.3f} MiB")
+    left_out = scores["left_out"]
+    table.add_row("scenes", str(scores["scenes"]))
+    table.add_row("left out", f"{left_out['truths']} ground truths, {left_out['reconstructions']} reconstructions")
+    Console().print(table)

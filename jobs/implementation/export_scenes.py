@@ -1,0 +1,41 @@
+"""Implementation of jobs/export_scenes.py."""
+
+from __future__ import annotations
+
+from rich.progress import Progress
+
+from jobs.export_scenes import Config
+from jobs.support.cli import absolute
+from jobs.support.ray_session import start_ray
+from jobs.support.scene_requests import select_scenes
+from pipelines.io.export import export_scenes
+from pipelines.runtime import storage
+
+
+def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
+    """Write files.
+
+    Returns:
+        The output directory, the number of files per format, and the reason for each scene id that was not written.
+    """
+    if not config.formats:
+        raise ValueError("--formats is empty, expected some of glb, ply, npz, xodr")
+    selection = select_scenes(config)
+    output = absolute(config.output) if config.output else storage.join(selection.root, "export")
+    total = sum(len(rows) for _, rows in selection.shards())
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("export scenes", total=total)
+        made = export_scenes(
+            selection, config.formats, output, config.overwrite, lambda count: bar.advance(shown, count)
+        )
+    return output, *made
+
+
+def main(config: Config) -> None:
+    output, counts, refused = export(config)
+    print(f"{', '.join(f'{count} {kind}' for kind, count in counts.items())} files in {output}")
+    for scene_id, reason in list(refused.items())[:5]:
+        print(f"  not written: {scene_id}, {reason}")
+    if len(refused) > 5:
+        print(f"  and {len(refused) - 5} more, see {output}/rejects")

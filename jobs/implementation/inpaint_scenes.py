@@ -1,0 +1,42 @@
+"""Implementation of jobs/inpaint_scenes.py."""
+
+from __future__ import annotations
+
+from rich.progress import Progress
+
+from jobs.implementation.checks import check_inpaint_scenes
+from jobs.inpaint_scenes import Config
+from jobs.support.model_directories import pipeline_directory
+from jobs.support.ray_session import start_ray
+from jobs.support.scene_requests import repaint_settings, select_scenes
+from pipelines.generation.inpaint import InpaintRequest, Where, inpaint_scenes
+
+
+def inpaint(config: Config) -> dict[str, float | None]:
+    """Regenerate the region, write the scenes, and return how far raw decodes drift outside the region."""
+    check_inpaint_scenes(config)
+    selection = select_scenes(config)
+    total = sum(len(rows) for _, rows in selection.shards())
+    request = InpaintRequest(
+        model=pipeline_directory(config.model),
+        output=config.output_directory(),
+        run=config.run,
+        where=Where(config.polygon_m, config.half_plane, config.primitives, config.margin_m, config.invert_region),
+        contents=config.contents,
+        variants=config.num_variants,
+        label=config.label or None,
+        seed=config.seed,
+        resampling=repaint_settings(config),
+        guidance_scale=config.guidance_scale,
+    )
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("inpaint", total=total)
+        return inpaint_scenes(request, selection, config.num_actors, config.num_examples, lambda: bar.advance(shown))
+
+
+def main(config: Config) -> None:
+    scores = inpaint(config)
+    print(f"scenes, source generated-{config.run}, GLB files and {config.run}.html in {config.output_directory()}")
+    values = {name: "–" if value is None else f"{value:.4g}" for name, value in scores.items()}
+    print("drift outside the region:", ", ".join(f"{name} {value}" for name, value in values.items()))

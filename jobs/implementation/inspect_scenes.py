@@ -1,0 +1,117 @@
+"""Implementation of jobs/inspect_scenes.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.progress import Progress
+
+from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
+from jobs.support.cli import absolute, home, require_positive
+from jobs.support.ray_session import start_ray
+from jobs.support.value_names import SHEET_PICKS
+from pipelines.io.mesh_export import scene_glb
+from pipelines.rendering.render import png
+from pipelines.reporting.contact_sheet import Catalogue, View, captions, paint, scene_plate, scene_sheet, sheet_title
+from pipelines.reporting.dataset_report import dataset_html, read_facts
+from pipelines.reporting.gallery_page import gallery_html
+from pipelines.reporting.report import Picture
+from pipelines.runtime import storage
+
+
+def dataset_directory(config: DatasetOptions) -> str:
+    """Return --dataset or its default."""
+    return absolute(config.dataset) if config.dataset else home("datasets", "town")
+
+
+def output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> str:
+    """Return --output, or a path under $PRITTI_HOME named after the dataset."""
+    if config.output:
+        return absolute(config.output)
+    return home("inspect", dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")
+
+
+def draw_scenes(config: OneScene) -> list[str]:
+    """Write PNG and GLB files and return their paths."""
+    require_positive(config, "max_scenes")
+    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    chosen = catalogue.find(config.ids) if config.ids else catalogue.draw(config.max_scenes, config.seed)
+    written = []
+    with Progress() as bar:
+        shown = bar.add_task("draw scenes", total=len(chosen))
+        for shard, rows, _ in catalogue.chunks(chosen, 8):
+            for scene in shard.scenes(rows):
+                files = {"png": png(scene_plate(scene)[0])} | ({"glb": scene_glb(scene)} if config.glb else {})
+                for kind, content in files.items():
+                    written.append(storage.join(output_path(config, ""), f"{scene.scene_id}.{kind}"))
+                    storage.write_whole(written[-1], lambda stream, content=content: stream.write(content))
+                bar.advance(shown)
+    return written
+
+
+def draw_pictures(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> list[list[np.ndarray]]:
+    """Draw the chosen scenes with Ray and show a progress bar."""
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("draw pictures", total=len(chosen) * len(views))
+        return paint(catalogue, chosen, views, lambda: bar.advance(shown))
+
+
+def draw_sheet(config: Sheet) -> str:
+    """Write the sheet and return its path."""
+    require_positive(config, "max_scenes", "size_px")
+    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    chosen = catalogue.choose(config.max_scenes, config.sort, SHEET_PICKS[config.pick], config.seed)
+    pictures = [picture for (picture,) in draw_pictures(catalogue, chosen, (View(config.view, config.size_px),))]
+    title = sheet_title(catalogue, len(chosen), config.sort, SHEET_PICKS[config.pick])
+    sheet = scene_sheet(pictures, captions(catalogue, chosen, config.sort), title, config.num_columns or None)
+    path = output_path(config, "sheet.png")
+    storage.write_whole(path, lambda stream: stream.write(png(sheet)))
+    return path
+
+
+def write_dataset_report(config: Report) -> str:
+    """Write the page and return its path."""
+    with Progress() as bar:
+        shown = bar.add_task("read tables", total=None)
+        facts = read_facts(
+            dataset_directory(config),
+            config.source or None,
+            config.split or None,
+            lambda done, total: bar.update(shown, completed=done, total=total),
+        )
+    scenes = []
+    if config.num_examples > 0:
+        catalogue = facts.catalogue
+        chosen = catalogue.choose(config.num_examples, "vegetation")
+        named = captions(catalogue, chosen, "vegetation")
+        for (oblique, above), (name, remark) in zip(
+            draw_pictures(catalogue, chosen, (View("3d", 640), View("bev", 384))), named, strict=True
+        ):
+            scenes.append((Picture(name, oblique), Picture(remark, above)))
+    html = dataset_html(facts, scenes)
+    path = output_path(config, "report.html")
+    storage.write_text(html, path)
+    return path
+
+
+def write_gallery(config: Gallery) -> str:
+    """Write the page and return its path."""
+    require_positive(config, "max_scenes")
+    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    chosen = catalogue.choose(config.max_scenes, "drive")
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("pack scenes", total=len(chosen))
+        html = gallery_html(catalogue, chosen, config.title, lambda: bar.advance(shown))
+    path = output_path(config, "gallery.html")
+    storage.write_text(html, path)
+    return path
+
+
+def main(config: OneScene | Sheet | Report | Gallery) -> None:
+    if isinstance(config, OneScene):
+        print("\n".join(draw_scenes(config)))
+    elif isinstance(config, Gallery):
+        print(write_gallery(config))
+    else:
+        print(draw_sheet(config) if isinstance(config, Sheet) else write_dataset_report(config))

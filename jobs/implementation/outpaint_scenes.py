@@ -1,0 +1,79 @@
+"""Implementation of jobs/outpaint_scenes.py."""
+
+from __future__ import annotations
+
+from math import ceil
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import MofNCompleteColumn, Progress
+
+from jobs.implementation.checks import check_outpaint_scenes
+from jobs.outpaint_scenes import Config
+from jobs.support.model_directories import pipeline_directory
+from jobs.support.ray_session import start_ray
+from jobs.support.scene_requests import repaint_settings, select_scenes
+from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
+
+BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
+
+
+def count_blocks(config: Config) -> tuple[int, int, int, int]:
+    """Return the numbers of blocks ahead, behind, left and right of the scene.
+
+    Raises:
+        ValueError: A number is negative, or all are 0.
+    """
+    if config.extent_m is None:
+        counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
+    else:
+        step_m = BLOCK_M * (1 - config.overlap)
+        if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
+            raise ValueError(
+                f"--extent-m is {config.extent_m}, --overlap {config.overlap}: "
+                f"expected at least {BLOCK_M} m, and 0 to 1"
+            )
+        sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
+        counts = sides[0], sides[0], sides[1], sides[1]
+    if min(counts) < 0 or not any(counts):
+        raise ValueError(
+            f"blocks ahead, behind, left and right are {counts}: expected 0 or more, and at least one block"
+        )
+    return counts
+
+
+def outpaint(config: Config) -> pa.Table:
+    """Extend scenes, write them, and return the block table with the known share of each block."""
+    counts = count_blocks(config)
+    check_outpaint_scenes(config)
+    selection = select_scenes(config)
+    count = sum(len(rows) for _, rows in selection.shards())
+    request = OutpaintRequest(
+        model=pipeline_directory(config.model),
+        output=config.output_directory(),
+        run=config.run,
+        label=config.label or None,
+        seed=config.seed,
+        overlap=config.overlap,
+        mode=config.neighbour_latents,
+        resampling=repaint_settings(config),
+        guidance_scale=config.guidance_scale,
+        last=counts,
+        order=config.order,
+        batch_size=config.batch_size,
+    )
+    start_ray()
+    ahead, behind, left, right = counts
+    with Progress(*Progress.get_default_columns(), MofNCompleteColumn()) as bar:
+        shown = bar.add_task("outpaint, blocks", total=count * ((ahead + behind + 1) * (left + right + 1) - 1))
+        return outpaint_scenes(request, selection, config.num_actors, lambda blocks: bar.advance(shown, blocks))
+
+
+def main(config: Config) -> None:
+    blocks, output = outpaint(config), config.output_directory()
+    print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
+    if bare := pc.sum(pc.less(blocks["known_ground"], HARDLY_KNOWN)).as_py():
+        print(
+            f"{bare} of {len(blocks)} blocks had almost no known ground, where outpainting fails (as in the paper): "
+            f"known_ground below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
+        )

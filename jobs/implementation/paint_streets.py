@@ -1,0 +1,43 @@
+"""Implementation of jobs/paint_streets.py."""
+
+from __future__ import annotations
+
+from rich.progress import Progress
+
+from jobs.paint_streets import Config
+from jobs.support.cli import absolute, home, require_positive
+from jobs.support.ray_session import start_ray
+from pipelines.rendering.controlnet import PhotoRequest, drives, paint_streets
+from pipelines.runtime import storage
+
+
+def paint(config: Config) -> tuple[str, int]:
+    """Paint frames; return the directory of street views and the number of frames."""
+    for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
+        if not value:
+            raise ValueError(f"{name} is missing: give a local directory in diffusers' layout")
+    require_positive(config, "num_inference_steps", "num_actors")
+    for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
+        if not storage.list_files(absolute(value), ".json"):
+            raise ValueError(f"{name} {value}: no model here; give a local directory in diffusers' layout")
+    streets = absolute(config.streets) if config.streets else home("generated", "streets", "drive")
+    directories = drives(streets)
+    request = PhotoRequest(
+        diffusion=absolute(config.diffusion),
+        controlnet=absolute(config.controlnet),
+        prompt=config.prompt,
+        negative_prompt=config.negative_prompt,
+        steps=config.num_inference_steps,
+        guidance_scale=config.guidance_scale,
+        control_scale=config.controlnet_conditioning_scale,
+        seed=config.seed,
+    )
+    start_ray()
+    with Progress() as bar:
+        shown = bar.add_task("paint streets", total=len(directories))
+        return streets, paint_streets(request, directories, config.num_actors, lambda: bar.advance(shown))
+
+
+def main(config: Config) -> None:
+    streets, frames = paint(config)
+    print(f"{frames} frames painted in {streets}")

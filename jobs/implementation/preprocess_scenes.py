@@ -1,0 +1,69 @@
+"""Implementation of jobs/preprocess_scenes.py."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from jobs.implementation.checks import check_preprocess_scenes
+from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from models.layout import PAPER_SLOTS
+from pipelines.preprocess import sharding
+from pipelines.preprocess.ingest import ingest
+from pipelines.preprocess.sources.town.generator import TOWN_VERSION
+
+NOT_RECORDED = ("output", "skip_unreadable")
+RECORDED_AS = {"make_split": "split"}  # the key in dataset.json
+
+
+def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
+    """Return the shards to write."""
+    if isinstance(config, Town):
+        return sharding.plan_town(config.num_train, config.num_test, config.seed)
+    root = absolute(config.input)
+    if isinstance(config, Av2):
+        return sharding.plan_argoverse2(root)
+    plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_own
+    return plan_drives(root, config.make_split, config.skip_unreadable)
+
+
+def recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
+    """Return the options that dataset.json records: a run with other options does not resume."""
+    options = {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED}
+    options["source"] = type(config).__name__.lower()
+    if isinstance(config, Town):
+        return options | {"town_version": TOWN_VERSION}
+    return options | {"input": absolute(config.input)}
+
+
+def main(config: Town | Kitti360 | Av2 | Own) -> None:
+    check_preprocess_scenes(config)
+    options, shards = recorded_options(config), plan_shards(config)
+    source = options["source"]
+    output = absolute(config.output) if config.output else home("datasets", source)
+    skip = getattr(config, "skip_unreadable", False)
+    slots = PAPER_SLOTS if options.get("slots") == "paper" else None
+    start_ray()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("shards"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bar:
+        shown = bar.add_task(f"preprocess {source}", total=len(shards))
+        result = ingest(shards, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown))
+    if result.already_complete:
+        print(f"{output} is already complete: {dict(result.scenes)}, {sum(result.rejects.values())} rejected")
+        return
+    total = sum(result.scenes.values())
+    for reason, count in sorted(result.rejects.items(), key=lambda item: -item[1])[:10]:
+        print(f"  rejected {count}: {reason}")
+    print(
+        f"{output}: {total} scenes {dict(result.scenes)}, {sum(result.rejects.values())} rejected, "
+        f"{result.duplicates} duplicate objects dropped, {result.seconds:.1f} s ({total / result.seconds:.0f} scenes/s)"
+    )

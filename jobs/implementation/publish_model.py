@@ -1,0 +1,228 @@
+"""Implementation of jobs/publish_model.py."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from jobs.publish_model import Config
+from jobs.support.cli import absolute, home
+from jobs.support.model_directories import pipeline_directory
+from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
+from jobs.support.tracking import Tracker, client, hide_credentials, tracking_uri
+from jobs.support.trainer import publish_directory
+from models.labels import LABELS
+from models.pipeline import PrITTIPipeline
+from models.pretrained import CHECKSUMS, TRAINING, WEIGHTS, checksums
+from models.tensors import EXISTENCE_THRESHOLD
+from pipelines.generation.sample import load_pipeline
+from pipelines.metrics.validity import scene_validity, slab_offset_m
+from pipelines.rendering.render import bev_picture, contact_sheet, png
+from pipelines.reporting.chart import standalone_svg
+from pipelines.reporting.model_card import Card, Training
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.tables import read_scenes
+from pipelines.training.latents import weights_digest
+
+SHOWN = 32  # number of scenes on the card, from the first
+JUDGED = 256  # number of scenes among which those with most faults are shown
+FAILURES = 8
+CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
+
+
+def publish(config: Config) -> list[str]:
+    """Write the entry and register it.
+
+    Returns:
+        Values of --model for it: its directory and, if registered, models:/NAME/VERSION and the id of the run.
+    """
+    pipeline = load_pipeline(pipeline_directory(config.model))
+    weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
+    directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
+    about, scores = read_evaluation(directory, weights)
+    as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
+    if about["sampling"]["sampler"] != "ddpm":
+        as_judged["noise_scaling"] = about["sampling"].get("noise_scaling", 1.0)
+    pipeline.register_to_config(**as_judged)
+    facts = storage.read_json(storage.join(about["real"], "dataset.json"))
+    stages = [
+        history("pritti-lvae", "Layout VAE", pipeline.lvae),
+        history("pritti-dit", "Diffusion transformer", pipeline.dit),
+    ]
+    for *_, last in stages:
+        require_data(last, about["real"], facts, directory)
+    trainings = [training for stage in stages for training in stage]
+    output = absolute(config.output) if config.output else home("zoo", config.name)
+    entry = {"trainings": trainings, "facts": facts, "scores": scores, "about": about}
+    with tempfile.TemporaryDirectory() as staging:
+        version = write_entry(staging, config.name, pipeline, "-".join(weights), **entry)
+        publish_directory(staging, output)
+        if not config.register:
+            return [output]
+        tracker = Tracker.start(EXPERIMENT, config.name, {"weights": version})
+        tracker.artifacts(staging, PIPELINE)
+        tracker.finish("FINISHED")
+    return [output, register_version(config.name, tracker.run_id), tracker.run_id]
+
+
+def write_entry(
+    directory: str,
+    name: str,
+    pipeline: PrITTIPipeline,
+    version: str,
+    trainings: Sequence[Training],
+    facts: Mapping,
+    scores: Mapping,
+    about: Mapping,
+) -> str:
+    """Write weights, card, checksums, scores and pictures of an entry; return the card's version."""
+    pipeline.save_pretrained(directory)
+    remove_local_paths(directory)
+    sums, kind = checksums(directory), pipeline.dit.config.label
+    card = Card(
+        name, version, kind, LABELS[kind], trainings, facts, about["sampling"], about["real_split"], scores, sums
+    )
+    storage.write_text(card.markdown(), f"{directory}/README.md")
+    storage.write_json(sums, f"{directory}/{CHECKSUMS}")
+    storage.write_json(scores, f"{directory}/metrics.json")
+    storage.write_json([training.record(facts["options"]) for training in trainings], f"{directory}/{TRAINING}")
+    for training in trainings:
+        storage.write_text(standalone_svg(training.chart()), f"{directory}/{training.picture}")
+    for picture, image in draw_examples(about).items():
+        storage.write_whole(f"{directory}/{picture}.png", lambda stream, image=image: stream.write(image))
+    return card.version
+
+
+def remove_local_paths(directory: str) -> None:
+    """Remove the directory of this machine from which diffusers loaded a model."""
+    for path in storage.list_files(directory, ".json"):
+        content = storage.read_json(path)
+        storage.write_json({key: value for key, value in content.items() if key != "_name_or_path"}, path)
+
+
+def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
+    """Return the evaluated inputs and the scores.
+
+    Raises:
+        ValueError: There is no complete evaluation, or it belongs to other weights.
+    """
+    advice = "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and name its --output"
+    if not storage.exists(storage.join(directory, "evaluation.json")):
+        raise ValueError(f"--evaluation {directory}: no evaluation here; {advice}")
+    about, scores = (storage.read_json(storage.join(directory, f"{name}.json")) for name in ("evaluation", "metrics"))
+    for part in ("generation", "reconstruction"):
+        if part not in scores:
+            raise ValueError(f"--evaluation {directory} holds no scores of {part}; {advice}")
+    judged = (about["sampling"] or {}).get("weights"), about["lvae_weights"]
+    if judged != ("-".join(weights), weights[0]):
+        raise ValueError(f"--evaluation {directory} is of other weights ({judged[0]}); {advice}")
+    if "num_inference_steps" not in (about["sampling"] or {}):
+        raise ValueError(f"--evaluation {directory} is not of scenes that jobs/sample_scenes.py made; {advice}")
+    if about["sampling"].get("repair"):
+        raise ValueError(f"--evaluation {directory} is of repaired scenes; sample without --repair to judge a model")
+    return about, scores
+
+
+def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Training]:
+    """Return the runs that trained a model's weights, oldest first: a run may start from the weights of an earlier one.
+
+    Raises:
+        ValueError: Neither MLflow nor a published entry has a record of one of them.
+    """
+    parameters = sum(value.numel() for value in model.parameters())
+    runs = [find_training(experiment, stage, weights_digest(model), parameters)]
+    while start := runs[0].options.get("start_from"):
+        runs.insert(0, find_training(experiment, stage, start, None))  # its network may differ
+    name = experiment.removeprefix("pritti-")
+    later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
+    return [replace(runs[0], name=name), *later]
+
+
+def find_training(experiment: str, stage: str, digest: str, parameters: int | None) -> Training:
+    """Return the run that trained the weights with a digest.
+
+    Raises:
+        ValueError: Neither MLflow nor a published entry has a record of it.
+    """
+    uri = tracking_uri()
+    api = client(uri)
+    known = api.get_experiment_by_name(experiment)
+    runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
+    if not runs:
+        if record := read_published_training(digest):
+            return Training(**record | {"stage": stage})
+        raise ValueError(
+            f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); "
+            "set MLFLOW_TRACKING_URI"
+        )
+    found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
+    return Training(
+        experiment.removeprefix("pritti-"),
+        stage,
+        digest,
+        parameters,
+        int(found.data.tags["steps"]),
+        hours_of_steps(tracker, int(found.data.params["batch_size"])),
+        {name: value for name, value in found.data.params.items() if name != "architecture"},
+        {name: found.data.tags.get(name, "not recorded") for name in ("command", "commit", "machine", "versions")},
+        {words: axes(tracker.history(name)) for name, words in CURVES.items()},
+    )
+
+
+def read_published_training(digest: str) -> dict | None:
+    """Return the record of a training run from a published entry of the package or of this machine."""
+    for zoo in (str(WEIGHTS), home("zoo")):
+        for path in storage.list_files(zoo, TRAINING):
+            for record in storage.read_json(path):
+                if record["weights"] == digest:
+                    return record
+    return None
+
+
+def require_data(training: Training, real: str, facts: Mapping, evaluation: str) -> None:
+    """Check that an evaluation used the data of a training run.
+
+    Raises:
+        ValueError: It used other data.
+    """
+    same = training.data == facts["options"] if training.data else training.options["dataset"] == real
+    if not same:
+        raise ValueError(
+            f"--evaluation {evaluation} is against {real}, but the {training.stage} was trained on "
+            f"{training.data or training.options['dataset']}; run jobs/evaluate_scenes.py with that as --real"
+        )
+
+
+def axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float]]:
+    return [step for step, _ in points], [value for _, value in points]
+
+
+def hours_of_steps(tracker, batch_size: int) -> float:
+    """Return the training time in hours from the logged speeds, without start-up, validation and pauses."""
+    last, seconds = 0, 0.0
+    for step, speed in tracker.history("scenes_per_second"):
+        seconds += (step - last) * batch_size / speed
+        last = step
+    return seconds / 3600
+
+
+def draw_examples(about: Mapping) -> dict[str, bytes]:
+    """Return PNGs of the first evaluated scenes, and of those with most faults among the first JUDGED."""
+    offset_m = slab_offset_m(Dataset.open(about["real"]).spec.surface)
+    scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
+    faults = np.array([scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])
+    worst = [scenes[k] for k in np.argsort(-faults, kind="stable")[:FAILURES]]
+    sides = {"samples": (scenes[:SHOWN], 8), "failures": (worst, FAILURES)}
+    return {
+        name: png(contact_sheet([bev_picture(scene, 192, supersample=2) for scene in chosen], columns))
+        for name, (chosen, columns) in sides.items()
+    }
+
+
+def main(config: Config) -> None:
+    print("published:", ", ".join(publish(config)))

@@ -1,0 +1,148 @@
+"""Implementation of jobs/run_demo.py."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+from jobs.encode_latents import Config as EncodeConfig
+from jobs.evaluate_scenes import Config as EvaluateConfig
+from jobs.implementation import preprocess_scenes, train_dit, train_lvae
+from jobs.implementation.demo_report import write_demo_report
+from jobs.implementation.encode_latents import encode
+from jobs.implementation.evaluate_scenes import evaluate
+from jobs.implementation.outpaint_scenes import outpaint
+from jobs.implementation.sample_scenes import sample
+from jobs.outpaint_scenes import Config as OutpaintConfig
+from jobs.preprocess_scenes import Town
+from jobs.run_demo import Config
+from jobs.sample_scenes import Config as SampleConfig
+from jobs.support.cli import absolute, home
+from jobs.support.ray_session import start_ray
+from jobs.train_dit import Config as DiTConfig
+from jobs.train_lvae import Config as LVAEConfig
+from pipelines.rendering.render import contact_sheet, picture_3d, png
+from pipelines.runtime import storage
+from pipelines.schema.tables import read_scenes
+
+RELEASED = "town"
+CHECKPOINTS = 8  # per training run, each with a validation and pictures
+
+
+class Stages:
+    """Runs stages in sequence, prints their names, and records their durations across interruptions."""
+
+    def __init__(self, path: str, total: int) -> None:
+        self.path, self.total, self.started = path, total, time.perf_counter()
+        self.seconds: dict[str, float] = storage.read_json(path) if storage.exists(path) else {}
+        self.done = 0
+
+    def run(self, name: str, work: Callable[[], Any]) -> Any:
+        self.done += 1
+        print(f"\n[{self.done}/{self.total}] {name}", flush=True)
+        started = time.perf_counter()
+        result = work()
+        # A stage that is already complete returns at once: keep the duration of its actual work.
+        self.seconds[name] = max(self.seconds.get(name, 0.0), time.perf_counter() - started)
+        storage.write_json(self.seconds, self.path)
+        return result
+
+
+def show_released(config: Config) -> None:
+    """Generate scenes with the released weights, and a picture to look at during training."""
+    sample(
+        SampleConfig(
+            model=RELEASED,
+            output=home("released"),
+            num_scenes=config.num_released_scenes,
+            seed=config.seed,
+            sampler="dpm++",
+            num_inference_steps=20,
+            num_glb=1,
+        )
+    )
+    scenes = read_scenes(home("released"), "generated-samples")
+    sheet = contact_sheet([picture_3d(scene, 480, 360) for scene in scenes], columns=4)
+    path = home("released.png")
+    storage.write_whole(path, lambda stream: stream.write(png(sheet)))
+    print(f"pictures: {os.path.relpath(path)}; the next stages train such a model")
+
+
+def main(config: Config) -> None:
+    os.environ["PRITTI_HOME"] = absolute(config.output)
+    os.environ.pop("MLFLOW_TRACKING_URI", None)  # all files are kept under the output directory
+    stages = Stages(home("stages.json"), total=9 if config.num_released_scenes else 8)
+    start_ray(training=True)
+    if config.num_released_scenes:
+        stages.run("sample scenes of the released model", lambda: show_released(config))
+    run_training_stages(config, stages)
+    scores = run_generation_stages(config, stages)
+    report = home("report.html")
+    stages.run("write the report", lambda: write_demo_report(report, config, scores, stages.seconds))
+    print(f"\nreport: {os.path.relpath(report)}")
+
+
+def run_training_stages(config: Config, stages: Stages) -> None:
+    """Preprocess the town, train the layout VAE, encode latents, train the diffusion transformer."""
+    data = home("datasets", "town")
+    town = Town(output=data, num_train=config.num_train, num_test=config.num_test, seed=config.seed)
+    stages.run("preprocess the town", lambda: preprocess_scenes.main(town))
+    lvae = LVAEConfig(
+        config.preset,
+        data,
+        steps=config.lvae_steps,
+        batch_size=config.lvae_batch_size,
+        checkpoint_every=-(-config.lvae_steps // CHECKPOINTS),
+        seed=config.seed,
+    )
+    stages.run("train the layout VAE", lambda: train_lvae.train(lvae))
+    latents = EncodeConfig(dataset=data, lvae=lvae_directory(config), num_actors=config.num_actors)
+    stages.run("encode latents", lambda: encode(latents))
+    dit = DiTConfig(
+        config.preset,
+        data,
+        steps=config.dit_steps,
+        batch_size=config.dit_batch_size,
+        checkpoint_every=-(-config.dit_steps // CHECKPOINTS),
+        seed=config.seed,
+    )
+    stages.run("train the diffusion transformer", lambda: train_dit.train(dit))
+
+
+def run_generation_stages(config: Config, stages: Stages) -> dict:
+    """Sample scenes, outpaint one, evaluate; return the scores."""
+    model = home("models", f"pritti-{config.preset}")
+    sampling = SampleConfig(
+        model=model,
+        num_scenes=config.num_scenes,
+        seed=config.seed,
+        num_inference_steps=config.num_inference_steps,
+        num_actors=config.num_actors,
+        num_glb=1,
+    )
+    stages.run("sample scenes", lambda: sample(sampling))
+    outpainting = OutpaintConfig(
+        model=model,
+        source="generated-samples",
+        max_scenes=1,
+        seed=config.seed,
+        num_inference_steps=config.outpaint_inference_steps,
+        guided=True,
+    )
+    stages.run("outpaint a scene", lambda: outpaint(outpainting))
+    evaluation = EvaluateConfig(
+        real=home("datasets", "town"),
+        generated=home("generated"),
+        run="samples",
+        lvae=lvae_directory(config),
+        max_reconstructed_scenes=config.num_test,
+        num_actors=config.num_actors,
+    )
+    return stages.run("evaluate", lambda: evaluate(evaluation))
+
+
+def lvae_directory(config: Config) -> str:
+    """Return the directory of the trained layout VAE."""
+    return home("models", f"lvae-{config.preset}")

@@ -1,0 +1,51 @@
+"""Implementation of jobs/sample_scenes.py."""
+
+from __future__ import annotations
+
+from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
+
+from jobs.implementation.checks import check_sample_scenes
+from jobs.sample_scenes import Config
+from jobs.support.cli import absolute, home
+from jobs.support.model_directories import model_label_kind, pipeline_directory
+from jobs.support.ray_session import start_ray
+from models.labels import LABELS
+from pipelines.generation.sample import SampleRequest, sample_scenes
+from pipelines.io.mesh_export import scene_glb
+from pipelines.runtime import storage
+from pipelines.schema.tables import read_scenes
+
+
+def sample(config: Config) -> str:
+    """Generate scenes and return the dataset directory."""
+    check_sample_scenes(config)
+    model = pipeline_directory(config.model)
+    output = absolute(config.output) if config.output else home("generated")
+    request = SampleRequest(
+        model=model,
+        output=output,
+        run=config.run,
+        num_scenes=config.num_scenes,
+        labels=config.labels or LABELS[model_label_kind(model)],
+        seed=config.seed,
+        num_inference_steps=config.num_inference_steps,
+        guidance_scale=config.guidance_scale,
+        sampler=config.sampler,
+        noise_scaling=config.noise_scaling,
+        existence_threshold=config.existence_threshold,
+        repair=config.repair,
+        shard_scenes=min(64, max(1, -(-config.num_scenes // 8))),
+    )
+    start_ray()
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TaskProgressColumn(show_speed=True))
+    with Progress(*columns) as bar:
+        shown = bar.add_task("sample scenes", total=config.num_scenes)
+        sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
+    for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
+        path = storage.join(output, "glb", config.run, f"{scene.scene_id}.glb")
+        storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
+    return output
+
+
+def main(config: Config) -> None:
+    print(f"{config.num_scenes} scenes of source generated-{config.run} in {sample(config)}")

@@ -1,0 +1,18 @@
+"""The dataset of the smoke presets: a small town, generated when it is missing."""
+
+from __future__ import annotations
+
+from jobs.implementation.preprocess_scenes import main
+from jobs.preprocess_scenes import Town
+from jobs.support.ray_session import start_ray
+from pipelines.runtime import storage
+
+NUM_TRAIN, NUM_TEST = 32, 16
+
+
+def make_smoke_dataset(root: str) -> None:
+    """Generate a town of 32 + 16 scenes, unless it exists."""
+    if storage.exists(storage.join(root, "dataset.json")):
+        return
+    start_ray(training=True)  # before preprocessing starts Ray without the dashboard that training needs
+    main(Town(output=root, num_train=NUM_TRAIN, num_test=NUM_TEST))

@@ -1,0 +1,125 @@
+"""Implementation of jobs/sweep_samplers.py."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from jobs.support.cli import absolute, home, require_positive
+from jobs.support.model_directories import model_label_kind, pipeline_directory
+from jobs.support.ray_session import start_ray
+from jobs.support.terminal import print_table
+from jobs.sweep_samplers import Config
+from models.labels import LABELS
+from models.pipeline import SAMPLERS, require_scaling
+from models.sampling.diffusion import Diffusion
+from pipelines.evaluation.evaluate import compare
+from pipelines.evaluation.features import Looks, describe
+from pipelines.evaluation.sampler_sweep import CHARTED, sampler_charts, sampler_html, sampler_row, sampler_table
+from pipelines.generation.sample import SampleRequest, sample_scenes
+from pipelines.rendering.render import bev_picture
+from pipelines.reporting.chart import standalone_svg
+from pipelines.reporting.report import Picture
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.scene_subset import Selection
+from pipelines.schema.tables import read_scenes
+
+
+def sweep_samplers(config: Config) -> list[dict]:
+    """Generate and score every setting, write all files, and return a row per setting."""
+    model = pipeline_directory(config.model)
+    require_positive(config, "num_actors", "batch_size")
+    if config.num_scenes < 5 or config.num_examples < 0:
+        raise ValueError(
+            f"--num-scenes is {config.num_scenes}, --num-examples {config.num_examples}: expected 5 and 0 or more"
+        )
+    if not config.samplers or not config.num_inference_steps:
+        raise ValueError("--samplers or --num-inference-steps is empty: expected at least one value of each")
+
+    if unknown := set(config.samplers) - set(SAMPLERS):
+        raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
+    for steps in config.num_inference_steps:  # raises for an invalid number before hours of valid ones
+        Diffusion().visited(steps)
+    for scaling in config.noise_scalings:
+        require_scaling(scaling)
+    dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
+    output = absolute(config.output) if config.output else home("evaluations", "samplers")
+    real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
+    count = sum(len(rows) for _, rows in real.shards())
+    labels = LABELS[model_label_kind(model)]
+    rows, pictures = [], []
+    start_ray()
+    with Progress() as bar:
+
+        def described(side: Selection, name: str) -> dict:
+            task = bar.add_task(f"describe {name}", total=count)
+            directory = storage.join(output, "described", name)
+            return describe(side, dataset, Looks(), directory, config.num_actors, lambda n: bar.advance(task, n))
+
+        truth = described(real, "real")
+        for sampler, steps, scaling in product(
+            config.samplers, config.num_inference_steps, config.noise_scalings or (None,)
+        ):
+            request = SampleRequest(
+                model=model,
+                output=output,
+                run=f"{sampler}-{steps}" + (f"-{scaling:g}" if scaling else ""),
+                num_scenes=config.num_scenes,
+                labels=labels,
+                seed=config.seed,
+                num_inference_steps=steps,
+                guidance_scale=config.guidance_scale,
+                sampler=sampler,
+                noise_scaling=scaling,
+                shard_scenes=max(
+                    1, config.num_scenes // 8
+                ),  # regardless of the number of actors, so that a run resumes with another number
+            )
+            seconds_per_scene = sample_and_time(config, request, bar)
+            made = described(Selection(output, request.source, None, count, "spread"), request.run)
+            scores = compare(truth, made, dataset.spec.ground_classes)
+            used = storage.read_json(storage.join(output, f"{request.source}.json"))["noise_scaling"]
+            rows.append(sampler_row(sampler, steps, used, seconds_per_scene, scores))
+            scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
+            pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
+    how = [
+        f"Real: {count} scenes of {dataset.root}, split {config.real_split}, evenly spread. Model: {model}.",
+        f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
+    ]
+    write_report(output, rows, pictures, max(1, config.num_examples), how)
+    return rows
+
+
+def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
+    """Generate missing scenes; return seconds per scene and actor over the timed shards, or None without any."""
+    record = storage.join(request.output, "times", f"{request.run}.json")
+    times = storage.read_json(record) if storage.exists(record) else {}
+    shown = bar.add_task(request.run, total=request.num_scenes)
+
+    def advance(row: dict) -> None:
+        bar.advance(shown, row["scenes"])
+        if row["seconds"]:  # 0 for a shard that an interrupted run wrote
+            times[str(row["id"])] = [row["seconds"], row["scenes"]]
+            storage.write_json(times, record)
+
+    sample_scenes(request, config.num_actors, config.batch_size, advance)
+    if not times:
+        return None
+    seconds, scenes = map(sum, zip(*times.values(), strict=True))
+    return seconds / scenes
+
+
+def write_report(output: str, rows: list[dict], pictures: list[Picture], columns: int, how: list[str]) -> None:
+    """Write the rows, the figures and the page."""
+    storage.write_json(rows, storage.join(output, "samplers.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
+    storage.write_text(sampler_html(rows, pictures, columns, how), storage.join(output, "samplers.html"))
+    for name, chart in zip(CHARTED, sampler_charts(rows), strict=True):
+        storage.write_text(standalone_svg(chart), storage.join(output, f"samplers-{name}.svg"))
+
+
+def main(config: Config) -> None:
+    print_table(sampler_table(sweep_samplers(config)))

@@ -1,0 +1,245 @@
+"""Implementation of jobs/train_dit.py."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from jobs.encode_latents import Config as EncodeConfig
+from jobs.implementation.checks import makes_smoke_inputs, require_latents, training_dataset_root
+from jobs.implementation.encode_latents import encode
+from jobs.implementation.smoke_inputs import make_smoke_dataset
+from jobs.implementation.train_lvae import train as train_lvae
+from jobs.support import trainer
+from jobs.support.callbacks import SamplingCheck
+from jobs.support.cli import absolute, home
+from jobs.support.model_directories import pipeline_directory
+from jobs.support.ray_session import start_ray
+from jobs.support.tracking import Tracker
+from jobs.support.trainer import TrainingRun, publish_directory
+from jobs.support.value_names import PREDICTION_TYPES, TIMESTEP_SAMPLINGS
+from jobs.train_dit import Config
+from jobs.train_lvae import Config as LVAEConfig
+from models.dit import DiT
+from models.labels import LABELS
+from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline, scheduler
+from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, preset
+from models.training import Execution, Optimisation, dit_trainer
+from pipelines.generation.sample import load_pipeline
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.tables import find_shards
+from pipelines.training.data_loader import LatentReader, Stream
+from pipelines.training.latents import load_lvae, weights_digest
+
+
+def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
+    """Prepare training; make the smoke preset's inputs if they are missing.
+
+    Returns:
+        The training run, and a function that completes its output directory to a pipeline.
+    """
+    row = resolve_preset(config)
+    root = training_dataset_root(config, LVAE_PRESETS[row.lvae].source)
+    if makes_smoke_inputs(config):
+        make_smoke_dataset(root)
+        make_smoke_latents(root)
+    dataset = Dataset.open(root)
+    latents_root = absolute(config.latents) if config.latents else root
+    require_latents(latents_root, root)
+    latents = storage.read_json(storage.join(latents_root, "latents.json"))
+    architecture = dit_architecture(config, row, latents, load_encoder(latents, latents_root))
+    start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
+    architecture |= start.normalisation if start else {}
+    settings = optimizer_settings(config, row)
+    identity = run_identity(config, row, settings, latents, root, start)
+    name = config.name or f"dit-{config.preset}"
+    record = trainer.guard_run_name(name, home("runs"), identity)
+    tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
+    execution = Execution(config.gradient_accumulation_steps, config.precision, config.compile)
+    timesteps = TIMESTEP_SAMPLINGS[config.timestep_sampling]
+    shards = find_shards(root, source=dataset.source, split="train")
+    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    training = TrainingRun(
+        name=name,
+        storage_path=home("runs"),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start, timesteps),
+        stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
+        reader=LatentReader(latents_root, config.label_kind),
+        settings=settings,
+        identity=identity,
+        tracker=tracker,
+        checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
+        log_every=max(1, min(50, settings.steps // 50)),
+        validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label_kind),
+    )
+    return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
+
+
+def make_smoke_latents(root: str) -> None:
+    """Encode the smoke dataset with the smoke layout VAE, which is trained if it is missing."""
+    start_ray(training=True)
+    lvae = home("models", "lvae-smoke")
+    if not storage.exists(storage.join(lvae, "config.json")):
+        train_lvae(LVAEConfig(preset="smoke"))
+    encode(EncodeConfig(dataset=root, lvae=lvae))
+
+
+def resolve_preset(config: Config) -> DiTPreset:
+    """Return the preset with the options that override it."""
+    row = preset(DIT_PRESETS, config.preset)
+    if config.batch_size is not None:
+        row = replace(row, batch_size=config.batch_size)
+    if config.prediction_type is not None:
+        row = replace(row, prediction=PREDICTION_TYPES[config.prediction_type])
+    if config.normalise_latents is not None:
+        row = replace(row, normalise_latents=config.normalise_latents)
+    return row
+
+
+def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
+    """Return the layout VAE that encoded the latents.
+
+    Raises:
+        ValueError: Its weights have changed since.
+    """
+    lvae = load_lvae(latents["lvae"])
+    if weights_digest(lvae) != latents["lvae_digest"]:
+        raise ValueError(
+            f"{latents['lvae']} has changed since {latents_root} was encoded with it; encode again to another --output"
+        )
+    return lvae
+
+
+def optimizer_settings(config: Config, row: DiTPreset) -> Optimisation:
+    """Return the optimizer settings of the preset with the options that override them."""
+    return trainer.override_settings(
+        Optimisation(
+            steps=row.steps,
+            learning_rate=row.learning_rate,
+            weight_decay=row.weight_decay,
+            betas=(0.95, 0.999),  # as in SLEDGE
+            grad_clip=row.grad_clip,
+            ema_decay=row.ema_decay,
+            seed=config.seed,
+        ),
+        steps=config.steps,
+        learning_rate=config.learning_rate,
+        final_learning_rate=config.final_learning_rate,
+        warmup_steps=config.warmup_steps,
+    )
+
+
+def dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: LayoutVAE) -> dict:
+    """Return the keyword arguments of DiT: the preset's, and those that follow from latents and labels."""
+    channels, size, _ = latents["shape"]
+    return row.architecture() | {
+        "channels": channels,
+        "size": size,
+        "label": config.label_kind,
+        "num_labels": len(LABELS[config.label_kind]),
+        "layout": dict(lvae.config.layout),
+        "shift": latents["channel_mean"] if row.normalise_latents else None,
+        "scale": latents["channel_std"] if row.normalise_latents else None,
+    }
+
+
+def run_identity(
+    config: Config, row: DiTPreset, settings: Optimisation, latents: dict, root: str, start: Start | None
+) -> dict:
+    """Return the options that a resumed run must share with the run that it continues."""
+    identity = trainer.run_identity(
+        settings,
+        stage="dit",
+        preset=config.preset,
+        batch_size=row.batch_size,
+        label=config.label_kind,
+        prediction=row.prediction,
+        normalise_latents=row.normalise_latents,
+        lvae=latents["lvae_digest"],
+        dataset=root,
+    )
+    if start:
+        identity |= {"start_from": start.digest}
+    if config.timestep_sampling != "uniform":  # absent for uniform, so that runs from before this option resume
+        identity |= {"timesteps": TIMESTEP_SAMPLINGS[config.timestep_sampling]}
+    return identity
+
+
+def train(config: Config) -> str:
+    """Train and return the pipeline's directory."""
+    training, complete = prepare(config)
+    output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
+    trainer.fit(training, config.num_workers, storage.join(output, "dit"))
+    return complete(output)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Trained weights from which a run starts."""
+
+    digest: str
+    normalisation: dict  # shift and scale of the latents for these weights
+    sampling: dict  # noise scaling and existence threshold of their pipeline
+    state: dict[str, Tensor]
+
+
+def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
+    """Return the transformer of a trained pipeline.
+
+    Raises:
+        ValueError: It was trained on latents of another layout VAE, or its architecture differs.
+    """
+    directory = pipeline_directory(model)
+    pipeline = load_pipeline(directory)
+    if weights_digest(pipeline.lvae) != lvae_digest:
+        raise ValueError(
+            f"--start-from {model}: its transformer was trained on latents of another layout VAE; "
+            f"encode with that one first: jobs/encode_latents.py --lvae {directory}/lvae"
+        )
+    built = pipeline.dit.config
+    for key in ("patch", "depth", "width", "heads", "prediction", "label"):
+        if built[key] != architecture[key]:
+            raise ValueError(
+                f"--start-from {model}: its {key} is {built[key]}, this run's {architecture[key]}; choose the same"
+            )
+    normalisation = {"shift": built["shift"], "scale": built["scale"]}
+    sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold")}
+    return Start(weights_digest(pipeline.dit), normalisation, sampling, pipeline.dit.state_dict())
+
+
+def build(
+    architecture: dict, settings, execution, label_dropout: float, start: Start | None, timesteps: str, device, wrap
+):
+    """Return the Trainer of stage 2, with the same initial weights on every worker."""
+    torch.manual_seed(settings.seed)
+    model = DiT(**architecture)
+    if start:
+        model.load_state_dict(start.state)
+    return dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
+
+
+def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
+    """Write layout VAE and scheduler next to a trained DiT, so that `output` is a PrITTIPipeline directory.
+
+    Args:
+        lvae: Directory of the layout VAE.
+        sampling: `noise_scaling` and `existence_threshold`, where they differ from the paper's.
+        output: Directory that contains dit/; returned.
+    """
+    dit = DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False)
+    pipeline = PrITTIPipeline(load_lvae(lvae), dit, scheduler(), **sampling)
+    with tempfile.TemporaryDirectory() as directory:
+        pipeline.save_pretrained(directory)
+        publish_directory(directory, output)
+    return output
+
+
+def main(config: Config) -> None:
+    print(f"trained: {train(config)}")

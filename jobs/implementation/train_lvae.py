@@ -1,0 +1,247 @@
+"""Implementation of jobs/train_lvae.py."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from jobs.implementation.checks import makes_smoke_inputs, training_dataset_root
+from jobs.implementation.smoke_inputs import make_smoke_dataset
+from jobs.support import trainer
+from jobs.support.callbacks import ReconstructionCheck
+from jobs.support.cli import absolute, home
+from jobs.support.model_directories import pipeline_directory
+from jobs.support.tracking import Tracker
+from jobs.support.trainer import TrainingRun, as_tensors, publish_directory
+from jobs.train_lvae import Config
+from models.augment import Augmentation
+from models.batch import LayoutBatch
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.presets import LVAE_PRESETS, LVAEPreset, preset
+from models.training import Execution, Optimisation, lvae_trainer
+from pipelines.generation.sample import load_pipeline
+from pipelines.runtime import storage
+from pipelines.schema.dataset import Dataset
+from pipelines.schema.tables import find_shards
+from pipelines.training.data_loader import LayoutReader, Stream
+from pipelines.training.latents import load_lvae, weights_digest
+
+OF_OBJECT_DECODER = ("decoder", "head_hidden", "least_per_cell")  # keys of an architecture
+START_SCENES, START_SHARDS = 96, 16  # training scenes from which the model is initialised
+
+
+def prepare(config: Config) -> TrainingRun:
+    """Return the training run of the options; generate the smoke preset's dataset if it is missing."""
+    row = resolve_preset(config)
+    root = training_dataset_root(config, row.source)
+    if makes_smoke_inputs(config):
+        make_smoke_dataset(root)
+    dataset = Dataset.open(root)
+    spec = dataset.spec.with_resolution(row.raster_px)
+    settings = optimizer_settings(config, row)
+    shards = find_shards(root, source=dataset.source, split="train")
+    counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
+    identity = run_identity(config, row, settings, spec, root, augment)
+    name = config.name or f"lvae-{config.preset}"
+    kept = None
+    if config.train_object_decoder_of:
+        kept = load_kept_weights(config.train_object_decoder_of, row.architecture(), spec)
+        identity |= {"start_from": kept.digest}
+        require_replaceable(name, kept)
+    record = trainer.guard_run_name(name, home("runs"), identity)
+    tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()}, record)
+    execution = Execution(config.gradient_accumulation_steps, config.precision, config.compile)
+    sample = sample_layouts(shards, counts, spec)
+    return TrainingRun(
+        name=name,
+        storage_path=home("runs"),
+        build=partial(
+            build,
+            row.architecture(),
+            spec.to_dict(),
+            settings,
+            row.kl_weight,
+            row.latent_noise,
+            execution,
+            sample,
+            kept,
+        ),
+        stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
+        reader=LayoutReader(spec, augment if config.flip or config.jitter else None),
+        settings=settings,
+        identity=identity,
+        tracker=tracker,
+        checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
+        log_every=max(1, min(50, settings.steps // 50)),
+        validate=ReconstructionCheck(root, dataset.source, row.kl_weight),
+    )
+
+
+def resolve_preset(config: Config) -> LVAEPreset:
+    """Return the preset with the options that override it."""
+    row = preset(LVAE_PRESETS, config.preset)
+    names = ("batch_size", "kl_weight", "latent_noise")
+    row = replace(row, **{name: value for name in names if (value := getattr(config, name)) is not None})
+    if row.kl_weight < 0:
+        raise ValueError(f"--kl-weight is {row.kl_weight}, expected 0 or more")
+    if row.latent_noise < 0:
+        raise ValueError(f"--latent-noise is {row.latent_noise}, expected 0 or more")
+    return row
+
+
+def optimizer_settings(config: Config, row: LVAEPreset) -> Optimisation:
+    """Return the optimizer settings of the preset with the options that override them."""
+    return trainer.override_settings(
+        Optimisation(
+            steps=row.steps,
+            learning_rate=row.learning_rate,
+            final_learning_rate=row.final_learning_rate,
+            weight_decay=row.weight_decay,
+            warmup_steps=row.warmup_steps,
+            cycle_momentum=(0.85, 0.95),  # OneCycleLR's defaults, as in SLEDGE
+            grad_clip=row.grad_clip,
+            ema_decay=row.ema_decay,
+            seed=config.seed,
+        ),
+        steps=config.steps,
+        learning_rate=config.learning_rate,
+    )
+
+
+def run_identity(
+    config: Config, row: LVAEPreset, settings: Optimisation, spec: LayoutSpec, root: str, augment: Augmentation
+) -> dict:
+    """Return the options that a resumed run must share with the run that it continues."""
+    identity = trainer.run_identity(
+        settings,
+        stage="lvae",
+        preset=config.preset,
+        batch_size=row.batch_size,
+        kl_weight=row.kl_weight,
+        latent_noise=row.latent_noise,
+        layout=spec.fingerprint(),
+        dataset=root,
+    )
+    if config.flip or config.jitter:
+        identity |= {"augmentation": asdict(augment)}
+    if row.least_per_cell != 1:  # absent at 1, so that runs from before this option resume
+        identity |= {"least_per_cell": row.least_per_cell}
+    return identity
+
+
+def train(config: Config) -> str:
+    """Train; return the directory of the model, or of the pipeline with --train-object-decoder-of."""
+    training = prepare(config)
+    output = absolute(config.output) if config.output else home("models", training.name)
+    trainer.fit(training, config.num_workers, output)
+    if config.train_object_decoder_of:
+        return write_updated_pipeline(config.train_object_decoder_of, output, training)
+    return output
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Weights of a trained layout VAE whose latents are kept, and the digest of the transformer trained on them."""
+
+    digest: str
+    transformer: str
+    state: dict[str, Tensor]
+
+
+def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
+    """Return the layout VAE of a trained pipeline.
+
+    Raises:
+        ValueError: Its encoders or its layout differ from this run's.
+    """
+    pipeline = load_pipeline(pipeline_directory(model))
+    lvae = pipeline.lvae
+    for key, wanted in architecture.items():
+        built = lvae.config[key]
+        if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
+            raise ValueError(
+                f"--train-object-decoder-of {model}: its {key} is {built}, this preset's {wanted}; "
+                "choose its own preset"
+            )
+    if lvae.spec.fingerprint() != spec.fingerprint():
+        raise ValueError(
+            f"--train-object-decoder-of {model}: its layout differs from this dataset's; choose its own dataset"
+        )
+    return Kept(weights_digest(lvae), weights_digest(pipeline.dit), lvae.state_dict())
+
+
+def require_replaceable(name: str, kept: Kept) -> None:
+    """Check that writing the updated pipeline replaces neither another pipeline nor the one it starts from.
+
+    Raises:
+        ValueError: It would.
+    """
+    place = home("models", f"pritti-{name}")
+    if not storage.exists(storage.join(place, "model_index.json")):
+        return
+    there = load_pipeline(place)
+    if weights_digest(there.lvae) == kept.digest or weights_digest(there.dit) != kept.transformer:
+        raise ValueError(f"--name {name}: {place} holds a pipeline that would be replaced; choose another name")
+
+
+def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
+    """Write a trained pipeline with another layout VAE of the same latents; return its directory.
+
+    Raises:
+        ValueError: The pipeline has changed since the training started.
+    """
+
+    pipeline = load_pipeline(pipeline_directory(model))
+    if weights_digest(pipeline.lvae) != training.identity["start_from"]:
+        raise ValueError(
+            f"--train-object-decoder-of {model} was replaced during training; the trained layout VAE is in {lvae}"
+        )
+    pipeline.register_modules(lvae=load_lvae(lvae))
+    output = home("models", f"pritti-{training.name}")
+    with tempfile.TemporaryDirectory() as directory:
+        pipeline.save_pretrained(directory)
+        publish_directory(directory, output)
+    return output
+
+
+def sample_layouts(shards: list, counts: list[int], spec) -> dict:
+    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset (LayoutVAE.start_at)."""
+
+    read, parts = LayoutReader(spec), []
+    for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):
+        take = min(counts[k], START_SCENES // START_SHARDS)
+        parts.append(read(shards[k], np.linspace(0, counts[k] - 1, take).round().astype(int)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def build(
+    architecture: dict,
+    layout: dict,
+    settings,
+    kl_weight: float,
+    latent_noise: float,
+    execution,
+    sample: dict,
+    kept: Kept | None,
+    device,
+    wrap,
+):
+    """Return the Trainer of stage 1, with the same initial weights on every worker."""
+
+    torch.manual_seed(settings.seed)
+    model = LayoutVAE(layout=layout, **architecture)
+    model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
+    if kept:
+        model.keep_latents_of(kept.state)
+    return lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)
+
+
+def main(config: Config) -> None:
+    print(f"trained: {train(config)}")

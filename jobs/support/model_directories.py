@@ -1,0 +1,52 @@
+"""Find the pipeline that --model names. Importing this module imports neither torch nor MLflow."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from jobs.support.cli import absolute, home
+from models.labels import require_labels
+from models.pretrained import INDEX, pipeline_path
+from pipelines.runtime import storage
+
+
+def require_model_labels(model: str, labels: Iterable[str]) -> None:
+    """Check labels against the pipeline in a directory.
+
+    Raises:
+        ValueError: The pipeline does not know a label.
+    """
+    require_labels(model_label_kind(model), labels)
+
+
+def model_label_kind(model: str) -> str:
+    """Return the kind of label that the pipeline in a directory is conditioned on."""
+    return storage.read_json(storage.join(model, "dit/config.json"))["label"]
+
+
+def pipeline_directory(model: str) -> str:
+    """Return the directory that --model names; pipelines in MLflow are downloaded first.
+
+    Without a name: $PRITTI_HOME/models/pritti-town, or the only pipeline trained there, or the released weights.
+
+    Raises:
+        ValueError: There is no such pipeline, or no name and several trained pipelines.
+    """
+    if not model:
+        found = [path.removesuffix(f"/{INDEX}") for path in storage.list_files(home("models"), INDEX)]
+        if (town := home("models", "pritti-town")) in found:
+            return town
+        if len(found) > 1:
+            raise ValueError(
+                f"--model is missing and several were trained here; name one of: {', '.join(sorted(found))}"
+            )
+        return found[0] if found else pipeline_path("town")
+    for directory in (absolute(model), home("zoo", model)):
+        if storage.exists(storage.join(directory, INDEX)):
+            return directory
+    if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):
+        from jobs.support.registry import download_pipeline  # imports MLflow, which no other --model needs
+
+        return download_pipeline(model)
+    return pipeline_path(model)

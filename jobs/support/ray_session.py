@@ -1,0 +1,40 @@
+"""Start Ray or join a cluster."""
+
+from __future__ import annotations
+
+import logging
+
+import ray
+import ray.data
+from ray import cloudpickle
+
+from jobs.support.cli import set_ray_environment
+
+
+def start_ray(training: bool = False) -> None:
+    """Join the cluster that RAY_ADDRESS names, or start Ray on this machine; do nothing if Ray runs already.
+
+    Args:
+        training: Also start the dashboard. Ray Train asks it once per second which workers are alive and logs a warning
+            if there is none; other jobs do without, because a local Ray ends with the command.
+    """
+    set_ray_environment()
+    if ray.is_initialized():
+        return
+    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training)
+    context = ray.data.DataContext.get_current()
+    context.enable_progress_bars = False
+    context.print_on_execution_start = False
+    context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `root_cause`
+    logging.getLogger("ray.data").setLevel(logging.WARNING)
+    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # Ray's bars are off, the jobs' are on
+    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # these errors are raised here as well
+        logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
+
+
+def run_packed(config: dict[str, bytes]) -> None:
+    """Unpickle and call a function in a Ray Train worker.
+
+    Ray Train's controller unpickles this function too; packing keeps it from importing the models.
+    """
+    cloudpickle.loads(config["packed"])()

@@ -1,0 +1,29 @@
+"""From shared options to what pipelines/ takes: the scenes to read and the RePaint settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from jobs.support.cli import absolute, home
+from jobs.support.options import RePaintOptions, SceneOptions
+from models.pipeline import Resampling
+from pipelines.schema.scene_subset import Selection
+
+
+def select_scenes(options: SceneOptions) -> Selection:
+    """Return the first scenes that the options name."""
+    directory = absolute(options.input) if options.input else home("generated")
+    return Selection(directory, options.source or None, options.split or None, options.max_scenes, "first")
+
+
+def repaint_settings(options: RePaintOptions) -> Resampling:
+    """Return the paper's or the guided settings, with every setting that an option overrides."""
+    given = {
+        "num_steps": options.num_inference_steps,
+        "jump_length": options.jump_length,
+        "resamplings": options.num_resamplings,
+        "known_guidance": options.pseudoinverse_guidance,
+        "eta": options.eta,
+    }
+    start = Resampling.guided() if options.guided else Resampling()
+    return replace(start, **{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,55 @@
+"""Write the scores of an evaluation to files and to MLflow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+
+import pyarrow as pa
+
+from jobs.support.tracking import Tracker
+from pipelines.evaluation.evaluate import flattened, plain
+from pipelines.metrics.intervals import Estimate
+from pipelines.runtime import storage
+
+METRICS_PER_CALL = 1000  # MLflow's limit
+
+
+def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files: Sequence[str] = ()) -> dict:
+    """Write scores to metrics.json and metrics.parquet, and log them with tags and files to MLflow.
+
+    There is one MLflow run per output directory, which is updated. metrics.parquet has a row per score, with the ends
+    of its 95 % interval if there is one; in MLflow the ends are separate metrics, NAME.low and NAME.high.
+
+    Args:
+        output: Directory or URI of the files.
+        scores: Nested scores.
+        tags: Tags of the MLflow run.
+        files: Names of files in `output` to log.
+
+    Returns:
+        The content of metrics.json.
+    """
+    rows, known = [], {}
+    for name, value in flattened(scores).items():
+        score = value if isinstance(value, Estimate) else Estimate(value, None, None)
+        rows.append({"metric": name} | score._asdict())
+        named = {"": score.value, ".low": score.low, ".high": score.high}
+        known |= {name + end: number for end, number in named.items() if number is not None}
+    nested = plain(scores)
+    storage.write_json(nested, storage.join(output, "metrics.json"))
+    schema = pa.schema({"metric": pa.string(), "value": pa.float64(), "low": pa.float64(), "high": pa.float64()})
+    storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join(output, "metrics.parquet"))
+
+    run_name = output.rstrip("/").rsplit("/", 1)[-1]
+    tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join(output, "mlflow.json"))
+    for key, value in tags.items():
+        tracker.tag(key, value)
+    finite = [(name, number) for name, number in known.items() if isfinite(number)]
+    for start in range(0, len(finite), METRICS_PER_CALL):
+        tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
+    if "://" not in output:  # MLflow takes local files only
+        for file in ("metrics.json", *files):
+            tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
+    tracker.finish("FINISHED")
+    return nested

@@ -1,0 +1,71 @@
+"""The console script: `pritti <job>` runs an executable of jobs/, `pritti --help` lists them.
+
+The list comes from the docstrings in the files: importing the job modules would take longer.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from pritti import __version__
+
+
+def job_files() -> dict[str, Path]:
+    """Return the executables of the installed jobs package by command name, such as sample-scenes."""
+    (directory,) = find_spec("jobs").submodule_search_locations
+    files = sorted(path for path in Path(directory).glob("*.py") if path.stem != "__init__")
+    return {path.stem.replace("_", "-"): path for path in files}
+
+
+def summarize(path: Path) -> str:
+    """Return the first line of a file's docstring."""
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n", 1)[0]
+
+
+def describe_usage() -> str:
+    """Return the help text with one line per job."""
+    files = job_files()
+    width = max(map(len, files))
+    lines = [f"  {name:{width}}  {summarize(path)}" for name, path in files.items()]
+    return "\n".join(
+        [
+            "usage: pritti JOB [OPTIONS]",
+            "       pritti JOB --help",
+            "",
+            "Generate, edit and evaluate 3D semantic urban scenes. Data and models are kept in $PRITTI_HOME (default:",
+            "~/pritti).",
+            "",
+            "jobs:",
+            *lines,
+        ]
+    )
+
+
+def main() -> None:
+    """Run the job that the first word names with the other words as its command line."""
+    name, *args = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help"):
+        print(describe_usage())
+        return
+    if name == "--version":
+        print(f"pritti {__version__}")
+        return
+    files = job_files()
+    path = files.get(name.replace("_", "-"))
+    if path is None:
+        near = difflib.get_close_matches(name.replace("_", "-"), files, n=3)
+        hint = f"did you mean {' or '.join(near)}?" if near else "pritti --help lists the jobs"
+        print(f"error: unknown job {name!r}; {hint}", file=sys.stderr)
+        sys.exit(2)
+    from jobs.support.cli import run  # imports tyro, which the list of jobs does not need
+
+    sys.argv[0] = "pritti"  # the recorded command of a run should not contain a directory of this machine
+    run(path.stem, args, prog=f"pritti {name}")
+
+
+if __name__ == "__main__":
+    main()
