@@ -168,7 +168,7 @@ def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatc
         {"_drive_or_reason": 1, "Map(write)": 3, "training_statistics": 1, "Map(move)": 2},
     )
     for name, seconds in (
-        ("read_drive", 0.6),
+        ("_drive_or_reason", 0.6),
         ("write_shard", 0.2),
         ("training_statistics", 0.6),
         ("label_scenes", 0.2),
