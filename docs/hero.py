@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from models import PrITTIPipeline
-from models.pipeline import Resampling
+from models.sampling.repaint import RePaintConfig
 from models.scene import Scene
-from pipelines.geometry.centerlines import drive, road_network
-from pipelines.rendering.pinhole import Lens, StreetRenderer, shaded
-from pipelines.rendering.render import picture_3d, png
-from pipelines.rendering.street_views import StreetRequest, cameras_along
+from pipelines.geometry.centerlines import extract_road_network, plan_drive
+from pipelines.rendering.pinhole import Lens, StreetRenderer, shade_view
+from pipelines.rendering.render import encode_png, render_3d
+from pipelines.rendering.street_views import StreetRequest, place_cameras
 
 GAP, WIDTH, HEIGHT, FRAME = 12, 480, 360, 154  # pixels: between pictures, of a scene, height of a street view
 SEED = 0
@@ -26,9 +26,9 @@ def street_views(scene: Scene) -> list[np.ndarray]:
     """Views along the road through a scene, evenly spread."""
     lens = Lens().resized(WIDTH, FRAME)
     request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
-    cameras = cameras_along(drive(road_network(scene)), request)
+    cameras = place_cameras(plan_drive(extract_road_network(scene)), request)
     renderer = StreetRenderer(scene)
-    return [shaded(renderer.view(cameras[k])) for k in np.linspace(0, 0.6 * len(cameras), FRAMES).astype(int)]
+    return [shade_view(renderer.view(cameras[k])) for k in np.linspace(0, 0.6 * len(cameras), FRAMES).astype(int)]
 
 
 def stacked(pictures: list[np.ndarray], axis: int) -> np.ndarray:
@@ -46,11 +46,11 @@ def main() -> None:
     for label in ("low", "medium", "high"):
         pipeline.use_sampler("dpm++")
         made[label] = pipeline.generate([label], seed=SEED, num_inference_steps=20)[0]
-    larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, resampling=Resampling.guided())
-    above = stacked([picture_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
+    larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, resampling=RePaintConfig.guided())
+    above = stacked([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stacked(street_views(larger), 0)
-    below = stacked([picture_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
-    Path(__file__).with_name("hero.png").write_bytes(png(stacked([above, below], 0)))
+    below = stacked([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
+    Path(__file__).with_name("hero.png").write_bytes(encode_png(stacked([above, below], 0)))
 
 
 if __name__ == "__main__":

@@ -111,8 +111,8 @@ def home(tmp_path_factory, cluster) -> Path:
     """A separate $PRITTI_HOME in which the smoke presets have run once: data, models, latents."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
-    from jobs.train_dit import Config
     from jobs.implementation.train_dit import train
+    from jobs.train_dit import Config
 
     train(Config(preset="smoke"))
     return path
@@ -126,9 +126,9 @@ def smoke(tmp_path_factory, cluster) -> Path:
     import torch
 
     import jobs.support.trainer
+    from jobs.implementation.train_dit import train
     from jobs.support.trainer import as_tensors
     from jobs.train_dit import Config
-    from jobs.implementation.train_dit import train
     from pipelines.training.data_loader import iterate_batches
 
     def fit_here(run, num_workers: int, output: str) -> str:
@@ -306,8 +306,8 @@ def studio_url(studio_files, cluster) -> Iterator[str]:
     """URL of a studio that Ray Serve serves."""
     from ray import serve as ray_serve
 
-    from jobs.serve_studio import Config
     from jobs.implementation.serve_studio import serve
+    from jobs.serve_studio import Config
 
     yield serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), threads=1))
     ray_serve.shutdown()
@@ -320,8 +320,8 @@ def gallery_scenes(town_drive_3) -> list[Scene]:
 
 @pytest.fixture(scope="session")
 def gallery_page(gallery_scenes, tmp_path_factory, cluster) -> Path:
-    from jobs.inspect_scenes import Gallery
     from jobs.implementation.inspect_scenes import write_gallery
+    from jobs.inspect_scenes import Gallery
 
     root = tmp_path_factory.mktemp("gallery")
     Shard(str(root), "town", "test", 0).write(gallery_scenes)

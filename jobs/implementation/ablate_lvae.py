@@ -27,16 +27,16 @@ from jobs.support.trainer import TrainingRun, fit
 from jobs.train_lvae import Config
 from models.batch import LayoutBatch
 from models.lvae import LayoutVAE
-from models.presets import LVAE_PRESETS, preset
-from models.studies.orientation_study import Settings
-from models.tensors import layout_batch
+from models.presets import LVAE_PRESETS, find_preset
+from models.studies.orientation_study import StudyConfig
+from models.tensors import make_layout_batch
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
-from pipelines.evaluation.reconstruction import rebuild
-from pipelines.reporting.chart import Chart, standalone_svg
+from pipelines.evaluation.reconstruction import evaluate_reconstruction
+from pipelines.reporting.chart import Chart, make_standalone_svg
 from pipelines.reporting.report import Table
 from pipelines.runtime import storage
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
 
 TIMING_STEPS = 60
@@ -50,24 +50,24 @@ RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in st
 def compare_encodings(config: Encoding) -> str:
     """Train missing trials, write the tables, figures and page, and return the directory."""
     output = absolute(config.output) if config.output else home("ablations", "encoding")
-    settings = Settings(config.epochs, config.batch_size, config.learning_rate)
+    settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
     start_ray()
-    tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join(output, "mlflow.json"))
+    tracker = Tracker.start("pritti-ablation", "encoding", asdict(config), storage.join_uri(output, "mlflow.json"))
     with Progress() as bar:
         shown = bar.add_task("train autoencoders", total=len(trials))
-        scores = ablation.rebuild_boxes(
+        scores = ablation.reconstruct_boxes(
             trials,
-            storage.join(output, "trials"),
+            storage.join_uri(output, "trials"),
             settings,
             config.num_test_boxes,
             config.max_concurrent_trials,
             lambda: bar.advance(shown),
         )
         bar.add_task("disturb numbers", total=None)
-        losses = ablation.yaw_losses(config.num_noisy_boxes)
-    rows = ablation.by_size(scores)
+        losses = ablation.compute_yaw_losses(config.num_noisy_boxes)
+    rows = ablation.average_by_size(scores)
     for row in rows:
         name = f"{row['boxes']}.{row['numbers']}.{row['encoding']}.iou3d"
         tracker.metrics({name: row["iou3d_mean"]}, row["training_size"])
@@ -84,11 +84,11 @@ def compare_encodings(config: Encoding) -> str:
 
 def plan_trials(config: Encoding) -> list:
     """Return the trials of all three sets of boxes."""
-    trials = ablation.trials("vehicle", config.train_sizes, config.num_seeds)
+    trials = ablation.list_trials("vehicle", config.train_sizes, config.num_seeds)
     if config.yaw_only_train_sizes:
-        trials += ablation.trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "moving")
+        trials += ablation.list_trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "moving")
     if config.any_footprint_train_sizes:
-        trials += ablation.trials("any", config.any_footprint_train_sizes, config.num_seeds)
+        trials += ablation.list_trials("any", config.any_footprint_train_sizes, config.num_seeds)
     return trials
 
 
@@ -96,17 +96,23 @@ def write_encoding_report(
     config: Encoding, output: str, rows: list[dict], losses: list[dict], notes: list[str], tracker: Tracker
 ) -> None:
     """Write tables, figures and the page of the encoding study."""
-    table, footprints, angles = ablation.encoding_table(rows), ablation.share_table(rows), ablation.yaw_table(losses)
-    figure, cost = ablation.size_chart(rows, "vehicle"), ablation.yaw_chart(losses)
+    table, footprints, angles = (
+        ablation.build_encoding_table(rows),
+        ablation.build_share_table(rows),
+        ablation.build_yaw_table(losses),
+    )
+    figure, cost = ablation.draw_size_chart(rows, "vehicle"), ablation.draw_yaw_chart(losses)
     charts = [figure, cost]
     if config.yaw_only_train_sizes:
-        charts.append(ablation.size_chart(rows, "vehicle", "moving"))
+        charts.append(ablation.draw_size_chart(rows, "vehicle", "moving"))
     if config.any_footprint_train_sizes:
-        charts.append(ablation.share_chart(rows, "any", max(config.any_footprint_train_sizes)))
+        charts.append(ablation.draw_share_chart(rows, "any", max(config.any_footprint_train_sizes)))
     tables = [table, *([footprints] if footprints else []), angles]
     write_tables(output, "encodings", rows, tables[:-1], figure)
     write_tables(output, "yaw_loss", losses, [angles], cost)
-    html = ablation.page("Encodings of a box", "Cholesky, quaternion and octahedral, rebuilt", tables, charts, notes)
+    html = ablation.render_page(
+        "Encodings of a box", "Cholesky, quaternion and octahedral, rebuilt", tables, charts, notes
+    )
     write_page(output, html, tables, tracker)
 
 
@@ -118,26 +124,26 @@ def compare_variants(config: Branches) -> str:
     output = absolute(config.output) if config.output else home("ablations", config.name)
     if config.minutes <= 0 or config.num_seeds < 1:
         raise ValueError(f"--minutes is {config.minutes}, --num-seeds {config.num_seeds}: expected more than 0")
-    preset(LVAE_PRESETS, config.preset)
+    find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
     start_ray()
-    tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join(output, "mlflow.json"))
+    tracker = Tracker.start("pritti-ablation", config.name, asdict(config), storage.join_uri(output, "mlflow.json"))
     scores = []
     for seed in range(config.num_seeds):
         for variant in chosen:
-            path = storage.join(output, "runs", f"{slug(variant)}-seed{seed}.json")
+            path = storage.join_uri(output, "runs", f"{slug(variant)}-seed{seed}.json")
             if not storage.exists(path):
                 storage.write_json(train_variant(config, variant, seed, output), path)
             scores.append(storage.read_json(path))
             kept = {f"{slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
             tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
-    rows, curves = ablation.by_variant(scores), ablation.curve_chart(scores)
-    table = ablation.variant_table(rows)
+    rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
+    table = ablation.build_variant_table(rows)
     write_tables(output, config.name, rows, [table], curves)
     equal = "equal time" if at_equal_time(config) and not config.steps else "equally many steps"
     how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", describe_machine()]
-    html = ablation.page("Ablations of the layout VAE", config.name, [table], [curves], how)
+    html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
     write_page(output, html, [table], tracker)
     return output
 
@@ -197,17 +203,17 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
     steps = config.steps or measure_steps(config, timed, output)
     name = f"{config.name}-{slug(variant)}-seed{seed}"
     training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
-    model = fit(training, config.num_workers, storage.join(output, "models", f"{slug(variant)}-seed{seed}"))
+    model = fit(training, config.num_workers, storage.join_uri(output, "models", f"{slug(variant)}-seed{seed}"))
     seconds = time.perf_counter() - started
     root = training.identity["dataset"]
     source = training.stream.shards[0].source
-    reconstruction = rebuild(Selection(root, source, "test", config.max_scenes), model).scores
+    reconstruction = evaluate_reconstruction(SceneSubset(root, source, "test", config.max_scenes), model).scores
     described = {"variant": variant, "seed": seed, "steps": steps, "dataset": root}
     trained, example = load_lvae(model), training.stream.shards[0].scenes([0])
     described |= {"parameters": trained.num_parameters(), "training_seconds": seconds}
-    described |= {"gflops": count_gflops(trained, layout_batch(example, trained.spec))}
+    described |= {"gflops": count_gflops(trained, make_layout_batch(example, trained.spec))}
     described |= {"curve": training.tracker.history("validation_ap3d"), "scenes": reconstruction["scenes"]}
-    return described | ablation.measured(select_variants(config)[variant], reconstruction)
+    return described | ablation.average_measurements(select_variants(config)[variant], reconstruction)
 
 
 def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
@@ -219,12 +225,12 @@ def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
 
 def measure_steps(config: Branches, variant: str, output: str) -> int:
     """Return the steps of a variant in --minutes, measured once and then read from timing-<variant>.json."""
-    record = storage.join(output, f"timing-{slug(variant)}.json")
+    record = storage.join_uri(output, f"timing-{slug(variant)}.json")
     if not storage.exists(record):
         name = f"timing-{slug(variant)}"
         training = prepare_variant(config, variant, f"{config.name}-{name}", 0, TIMING_STEPS)
         training = replace(training, validate=None, log_every=1)
-        fit(training, config.num_workers, storage.join(output, "models", name))
+        fit(training, config.num_workers, storage.join_uri(output, "models", name))
         rates = [value for _, value in training.tracker.history("scenes_per_second")]
         per_second = median(rates[len(rates) // 2 :]) / training.stream.batch_size  # the first steps are slow
         storage.write_json(
@@ -242,7 +248,7 @@ def guard_study(output: str, options: dict) -> None:
     Raises:
         ValueError: It holds trials of other options.
     """
-    record = storage.join(output, "study.json")
+    record = storage.join_uri(output, "study.json")
     kept = [path for path in storage.list_files(output, ".json") if not path.endswith(("/study.json", "/mlflow.json"))]
     if kept and storage.exists(record) and (made := storage.read_json(record)) != options:
         key = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
@@ -257,20 +263,20 @@ def write_tables(
     output: str, name: str, rows: list[dict], tables: Sequence[Table], figure: Chart | None = None
 ) -> None:
     """Write NAME.json and NAME.parquet with all rows, NAME.txt with the tables, NAME.svg with the figure."""
-    storage.write_json({"machine": describe_machine(), "rows": rows}, storage.join(output, f"{name}.json"))
-    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, f"{name}.parquet"))
+    storage.write_json({"machine": describe_machine(), "rows": rows}, storage.join_uri(output, f"{name}.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, f"{name}.parquet"))
     text = io.StringIO()
     for table in tables:
         print_table(table, text)
-    files = {"txt": text.getvalue()} | ({"svg": standalone_svg(figure)} if figure else {})
+    files = {"txt": text.getvalue()} | ({"svg": make_standalone_svg(figure)} if figure else {})
     for kind, content in files.items():
-        path = storage.join(output, f"{name}.{kind}")
+        path = storage.join_uri(output, f"{name}.{kind}")
         storage.write_text(content, path)
 
 
 def write_page(output: str, html: str, tables: Sequence[Table], tracker: Tracker) -> None:
     """Write the page, log it to MLflow, and print the tables."""
-    path = storage.join(output, "report.html")
+    path = storage.join_uri(output, "report.html")
     storage.write_text(html, path)
     tracker.client.log_text(tracker.run_id, html, "report.html")
     tracker.finish("FINISHED")

@@ -18,7 +18,7 @@ from jobs.support.cli import absolute, home, require_positive
 from jobs.support.model_directories import pipeline_directory, require_model_labels
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
-from models.presets import DIT_PRESETS, LVAE_PRESETS, preset
+from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 
@@ -36,14 +36,14 @@ def makes_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
 
 
 def check_train_lvae(config: LVAEConfig) -> None:
-    row = preset(LVAE_PRESETS, config.preset)
+    row = find_preset(LVAE_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
     if not makes_smoke_inputs(config):
         Dataset.open(training_dataset_root(config, row.source))
 
 
 def check_train_dit(config: DiTConfig) -> None:
-    row = preset(DIT_PRESETS, config.preset)
+    row = find_preset(DIT_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
     if not makes_smoke_inputs(config):
         root = Dataset.open(training_dataset_root(config, LVAE_PRESETS[row.lvae].source)).root
@@ -56,7 +56,7 @@ def require_latents(latents_root: str, dataset_root: str) -> None:
     Raises:
         ValueError: There are no latents, or encoding was interrupted.
     """
-    path = storage.join(latents_root, "latents.json")
+    path = storage.join_uri(latents_root, "latents.json")
     if not storage.exists(path):
         raise ValueError(
             f"{latents_root}: no latents.json here; run jobs/encode_latents.py --dataset {dataset_root} first"
@@ -109,5 +109,5 @@ def check_evaluate_scenes(config: EvaluateConfig) -> None:
         raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
     if config.inception and not storage.exists(absolute(config.inception)):
         raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
-    if config.lvae and not storage.exists(storage.join(absolute(config.lvae), "config.json")):
+    if config.lvae and not storage.exists(storage.join_uri(absolute(config.lvae), "config.json")):
         raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")

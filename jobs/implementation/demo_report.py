@@ -11,10 +11,10 @@ from jobs.run_demo import Config
 from jobs.support.cli import home
 from jobs.support.tracking import Tracker, client, tracking_uri
 from models.scene import Scene
-from pipelines.preprocess.sources.town.reference_statistics import measure
-from pipelines.rendering.render import bev_picture, picture_3d
+from pipelines.preprocess.sources.town.reference_statistics import measure_town
+from pipelines.rendering.render import render_3d, render_bev
 from pipelines.reporting.chart import Chart
-from pipelines.reporting.evaluation_report import score_table, validity_table
+from pipelines.reporting.evaluation_report import build_score_table, build_validity_table
 from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Section, Table, Text, write_report
 from pipelines.schema.tables import read_scenes
 
@@ -32,8 +32,8 @@ MEANINGS = {
 def scene_picture_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, Picture]:
     """Return a scene in 3D and from above."""
     return (
-        Picture(caption, picture_3d(scene, 640, 480), tag),
-        Picture("", bev_picture(scene, 384, supersample=2), tag),
+        Picture(caption, render_3d(scene, 640, 480), tag),
+        Picture("", render_bev(scene, 384, supersample=2), tag),
     )
 
 
@@ -158,10 +158,10 @@ def outpainting_pictures(scene: Scene) -> Pictures:
     return Pictures(
         "An outpainted scene",
         [
-            Picture("128 x 128 m", picture_3d(scene, 960, 720), "generated"),
+            Picture("128 x 128 m", render_3d(scene, 960, 720), "generated"),
             Picture(
                 "the middle quarter is the given scene; four sides and four corners were added",
-                bev_picture(scene, 720, supersample=2),
+                render_bev(scene, 720, supersample=2),
                 "generated",
             ),
         ],
@@ -205,12 +205,12 @@ def score_sections(scores: dict, data: str) -> list[Section]:
             [(name.replace("_", " "), reconstruction[name]) for name in MEANINGS],
             meanings=list(MEANINGS.values()),
         ),
-        score_table(generation),
-        validity_table(generation["validity"]),
+        build_score_table(generation),
+        build_validity_table(generation["validity"]),
         Table(
             "The town against KITTI-360",
             ("what", "vegetation", "target", "measured", "within tolerance"),
-            [tuple(row) for row in measure(islice(read_scenes(data, "town", "train"), 1000))],
+            [tuple(row) for row in measure_town(islice(read_scenes(data, "town", "train"), 1000))],
             note="The targets are published statistics of KITTI-360. A test checks them on 1,000 scenes; here they are "
             "measured on the demo's scenes.",
         ),

@@ -38,7 +38,7 @@ def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
         content = storage.read_json(absolute(config.edits))
         content = content.get("edits") if isinstance(content, dict) else content
         try:
-            return edit.edits_from_json(content)
+            return edit.parse_edits(content)
         except ValueError as error:
             raise ValueError(f"{config.edits}: {error}") from error
     names = ("category", "primitives", "instances", "polygon_m", "where")
@@ -64,7 +64,7 @@ def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
     raise ValueError(f"no edit: {config!r}")
 
 
-def edit_scenes(config: SelectOptions | Replay) -> batch_edit.Edited:
+def edit_scenes(config: SelectOptions | Replay) -> batch_edit.EditResult:
     """Edit scenes, write them, and return the changes."""
     if config.num_examples < 0 or not config.run or set(config.run) & set("/=\\"):
         raise ValueError(

@@ -14,18 +14,18 @@ from jobs.support.cli import absolute, home
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
-from pipelines.evaluation.evaluate import compare, memorisation, plain
-from pipelines.evaluation.example_images import pictures_shown
-from pipelines.evaluation.features import Looks, PictureFile, Side, describe
-from pipelines.evaluation.reconstruction import draw, rebuild
-from pipelines.metrics.adm_npz import picture_shape, reference_moments
-from pipelines.metrics.inception import weights_line
-from pipelines.reporting.evaluation_report import evaluation_html, headlines, written
-from pipelines.reporting.reconstruction_report import reconstruction_html
+from pipelines.evaluation.evaluate import compare_datasets, compute_memorisation, convert_estimates
+from pipelines.evaluation.example_images import select_shown_images
+from pipelines.evaluation.features import FeatureConfig, ImageFile, SceneSet, compute_scene_features
+from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
+from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
+from pipelines.metrics.inception import describe_weights
+from pipelines.reporting.evaluation_report import format_value, list_headlines, render_evaluation_html
+from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
-from pipelines.training.latents import load_lvae, weights_digest
+from pipelines.schema.scene_subset import SceneSubset
+from pipelines.training.latents import digest_weights, load_lvae
 
 
 def evaluate(config: Config) -> dict:
@@ -42,10 +42,10 @@ def evaluate(config: Config) -> dict:
     start_ray()
     with Progress() as bar:
         if config.lvae:
-            scores["reconstruction"] = evaluate_reconstruction(config, dataset, output, bar)
+            scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
         if wanted:
             scores["generation"] = evaluate_generation(config, dataset, sides, output, bar)
-    storage.write_json(describe_inputs(config, dataset, sides), storage.join(output, "evaluation.json"))
+    storage.write_json(describe_inputs(config, dataset, sides), storage.join_uri(output, "evaluation.json"))
     tags = {
         "real": config.real or home("datasets", "town"),
         "split": config.real_split,
@@ -56,48 +56,51 @@ def evaluate(config: Config) -> dict:
     return publish_scores(output, scores, tags, [pages[name] for name in scores])
 
 
-def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Side]) -> dict:
+def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, SceneSet]) -> dict:
     """Return what was evaluated: sides, sampling options if one run generated all scenes, weights of the LVAE."""
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
-    about["lvae_weights"] = weights_digest(load_lvae(absolute(config.lvae))) if config.lvae else None
+    about["lvae_weights"] = digest_weights(load_lvae(absolute(config.lvae))) if config.lvae else None
     made = sides.get("generated")
     about["generated"] = made and made.root
-    sources = {shard.source for shard, _ in made.shards()} if isinstance(made, Selection) else ()
+    sources = {shard.source for shard, _ in made.shards()} if isinstance(made, SceneSubset) else ()
     if len(sources) == 1:
         about["source"] = sources.pop()
-        record = storage.join(made.root, f"{about['source']}.json")
+        record = storage.join_uri(made.root, f"{about['source']}.json")
         about["sampling"] = storage.read_json(record) if storage.exists(record) else None
     return about
 
 
 def evaluate_generation(
-    config: Config, dataset: Dataset | None, sides: dict[str, Side], output: str, bar: Progress
+    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
 ) -> dict:
     """Score generated scenes; write evaluation.html, and the features of each scene to described/."""
-    looks = Looks(config.supersample, config.inception and absolute(config.inception))
+    looks = FeatureConfig(config.supersample, config.inception and absolute(config.inception))
     described = {}
     for name, side in sides.items():
-        task, directory = bar.add_task(f"describe {name}", total=side.limit), storage.join(output, "described", name)
-        described[name] = describe(
+        task, directory = (
+            bar.add_task(f"describe {name}", total=side.limit),
+            storage.join_uri(output, "described", name),
+        )
+        described[name] = compute_scene_features(
             side, dataset, looks, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
         )
     task = bar.add_task("compare", total=2)
-    reference = reference_moments(sides["real"].path) if isinstance(sides["real"], PictureFile) else None
+    reference = read_reference_moments(sides["real"].path) if isinstance(sides["real"], ImageFile) else None
     classes = dataset.spec.ground_classes if dataset else ()
-    scores = compare(described["real"], described["generated"], classes, config.k, reference)
+    scores = compare_datasets(described["real"], described["generated"], classes, config.k, reference)
     bar.advance(task)
     features = "pool3" if "pool3" in described["real"] else "random"
-    found = memorisation(described["real"][features], described["generated"][features])
+    found = compute_memorisation(described["real"][features], described["generated"][features])
     scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
     bar.advance(task)
     counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
-    shown = pictures_shown(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
-    html = evaluation_html(plain(scores), counts, shown, describe_protocol(config, sides, looks))
-    storage.write_text(html, storage.join(output, "evaluation.html"))
+    shown = select_shown_images(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
+    html = render_evaluation_html(convert_estimates(scores), counts, shown, describe_protocol(config, sides, looks))
+    storage.write_text(html, storage.join_uri(output, "evaluation.html"))
     return scores
 
 
-def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
+def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
     """Return both sides with equally many scenes.
 
     Raises:
@@ -109,11 +112,11 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     sides, counts, sizes = {}, {}, {}
     for name, path in (("real", absolute(config.real) if config.real else ""), ("generated", generated)):
         if path.endswith(".npz"):
-            count, *sizes[name], _ = picture_shape(path)
-            counts[name], sides[name] = min(count, config.max_scenes), PictureFile(path, count)
+            count, *sizes[name], _ = read_picture_shape(path)
+            counts[name], sides[name] = min(count, config.max_scenes), ImageFile(path, count)
             continue
         if name == "real":
-            side = Selection(
+            side = SceneSubset(
                 dataset.root,
                 dataset.source,
                 config.real_split,
@@ -122,7 +125,7 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
                 config.min_distance_m,
             )
         else:
-            side = Selection(path, source, config.generated_split or None, config.max_scenes, labels)
+            side = SceneSubset(path, source, config.generated_split or None, config.max_scenes, labels)
         sizes[name], sides[name] = [256, 256], side
         counts[name] = sum(len(rows) for _, rows in side.shards())
     if sizes["real"] != sizes["generated"]:
@@ -132,7 +135,7 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, Side]:
     return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
 
 
-def describe_protocol(config: Config, sides: dict[str, Side], looks: Looks) -> list[str]:
+def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: FeatureConfig) -> list[str]:
     """Return sentences about how the sides were chosen and drawn."""
     how = {
         "farthest-point": "farthest point sampling of poses",
@@ -145,20 +148,20 @@ def describe_protocol(config: Config, sides: dict[str, Side], looks: Looks) -> l
     }
     words = [
         f"{name.capitalize()}: {side.limit} of {side.root}, "
-        f"{'the first' if isinstance(side, PictureFile) else chosen[name]}."
+        f"{'the first' if isinstance(side, ImageFile) else chosen[name]}."
         for name, side in sides.items()
     ]
     drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
     words.append(f"Pictures of scenes: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.")
-    return [*words, weights_line(looks.inception)] if looks.inception else words
+    return [*words, describe_weights(looks.inception)] if looks.inception else words
 
 
-def evaluate_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
+def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Score reconstructions; write reconstruction.parquet and reconstruction.html with the best and worst scenes."""
-    real = Selection(dataset.root, dataset.source, config.lvae_split, config.max_reconstructed_scenes)
+    real = SceneSubset(dataset.root, dataset.source, config.lvae_split, config.max_reconstructed_scenes)
     lvae = absolute(config.lvae)
     shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
-    rebuilt = rebuild(
+    rebuilt = evaluate_reconstruction(
         real,
         lvae,
         config.num_actors,
@@ -166,21 +169,21 @@ def evaluate_reconstruction(config: Config, dataset: Dataset, output: str, bar: 
         dataset=dataset,
         on_scene=lambda: bar.advance(shown),
     )
-    storage.write_parquet(rebuilt.scenes, storage.join(output, "reconstruction.parquet"))
+    storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))
     count = min(config.num_examples, len(rebuilt.places) // 2)
     drawn = []
     if count:
         chosen = rebuilt.places[:count] + rebuilt.places[-count:]
         drawing = bar.add_task("draw best and worst", total=len(chosen))
-        drawn = draw(chosen, lvae, config.num_actors, lambda: bar.advance(drawing))
+        drawn = draw_scenes(chosen, lvae, config.num_actors, lambda: bar.advance(drawing))
     subtitle = f"{lvae} on {rebuilt.scores['scenes']} scenes of {real.root}, split {real.split}"
-    html = reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
-    storage.write_text(html, storage.join(output, "reconstruction.html"))
+    html = render_reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:count], drawn[count:][::-1], subtitle)
+    storage.write_text(html, storage.join_uri(output, "reconstruction.html"))
     return rebuilt.scores
 
 
 def main(config: Config) -> None:
     lines = Table("metric", "value")
-    for name, value in headlines(evaluate(config)):
-        lines.add_row(name, written(value))
+    for name, value in list_headlines(evaluate(config)):
+        lines.add_row(name, format_value(value))
     Console().print(lines)

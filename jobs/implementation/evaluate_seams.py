@@ -10,10 +10,17 @@ from jobs.evaluate_seams import Config
 from jobs.support.cli import absolute, home
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
-from pipelines.evaluation.evaluate import plain
-from pipelines.evaluation.seams import Lines, join_sides, measure, seams_html, seams_table, shown_rows
+from pipelines.evaluation.evaluate import convert_estimates
+from pipelines.evaluation.seams import (
+    SeamLines,
+    build_seams_table,
+    join_scene_sets,
+    measure_seams,
+    render_seams_html,
+    select_shown_rows,
+)
 from pipelines.runtime import storage
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 
 ENOUGH_SEAMS = 200
 SHOWN = 6
@@ -25,19 +32,19 @@ def evaluate_seams(config: Config) -> dict:
     source = f"generated-{config.run}" if config.run else None
     sides = {
         "generated": (
-            Selection(
+            SceneSubset(
                 absolute(config.generated) if config.generated else home("outpainted"), source, None, config.max_scenes
             ),
-            Lines(config.rows_m, config.cols_m),
+            SeamLines(config.rows_m, config.cols_m),
         ),
         "real": (
-            Selection(
+            SceneSubset(
                 absolute(config.real) if config.real else home("datasets", "town"),
                 None,
                 config.real_split,
                 config.max_scenes,
             ),
-            Lines(config.real_rows_m, ()),
+            SeamLines(config.real_rows_m, ()),
         ),
     }
     for selection, _ in sides.values():
@@ -47,11 +54,11 @@ def evaluate_seams(config: Config) -> dict:
         measured = {}
         for name, (selection, lines) in sides.items():
             task = bar.add_task(f"measure {name}", total=sum(len(rows) for _, rows in selection.shards()))
-            measured[name] = measure(selection, lines, config.num_actors, lambda task=task: bar.advance(task))
-    scores = join_sides(measured)
-    storage.write_parquet(seams_table(measured), storage.join(output, "seams.parquet"))
-    html = seams_html(plain(scores), *sides["generated"], SHOWN)
-    storage.write_text(html, storage.join(output, "seams.html"))
+            measured[name] = measure_seams(selection, lines, config.num_actors, lambda task=task: bar.advance(task))
+    scores = join_scene_sets(measured)
+    storage.write_parquet(build_seams_table(measured), storage.join_uri(output, "seams.parquet"))
+    html = render_seams_html(convert_estimates(scores), *sides["generated"], SHOWN)
+    storage.write_text(html, storage.join_uri(output, "seams.html"))
     tags = {name: selection.root for name, (selection, _) in sides.items()}
     return publish_scores(output, scores, tags, ["seams.html"])
 
@@ -59,7 +66,7 @@ def evaluate_seams(config: Config) -> dict:
 def main(config: Config) -> None:
     scores = evaluate_seams(config)
     lines = Table("seams / nearby lines", "generated", "real")
-    for row in shown_rows(scores):
+    for row in select_shown_rows(scores):
         lines.add_row(*row)
     Console().print(lines)
     if (count := scores["seams"]["generated"]) < ENOUGH_SEAMS:

@@ -10,30 +10,30 @@ from jobs.evaluate_voxels import Config
 from jobs.support.cli import absolute, home
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
-from pipelines.evaluation.voxel_reconstruction import files_by_scene, paired, score_voxels, true_scenes
+from pipelines.evaluation.voxel_reconstruction import group_files_by_scene, list_true_scenes, pair_files, score_voxels
 from pipelines.geometry.voxels import VoxelGrid
 from pipelines.io.voxel_import import VOXEL_AXES
 from pipelines.runtime import storage
-from pipelines.schema.axis_convention import scene_from_axes
+from pipelines.schema.axis_convention import compute_scene_from_axes
 
 
 def evaluate(config: Config) -> dict:
     """Evaluate, write all files, and return the nested metrics."""
     axes, truth_axes = config.axes or VOXEL_AXES, config.ground_truth_axes or VOXEL_AXES
     for words in (axes, truth_axes):
-        scene_from_axes(words)
+        compute_scene_from_axes(words)
     grid = VoxelGrid(bottom_m=config.voxel_range_m[0], top_m=config.voxel_range_m[1])
-    truth = true_scenes(absolute(config.ground_truth), config.split)
-    rebuilt = files_by_scene(absolute(config.reconstructed), ".npz")
-    stored = files_by_scene(absolute(config.compressed)) if config.compressed else None
-    pairs = paired(truth, rebuilt, stored, config.allow_missing)
+    truth = list_true_scenes(absolute(config.ground_truth), config.split)
+    rebuilt = group_files_by_scene(absolute(config.reconstructed), ".npz")
+    stored = group_files_by_scene(absolute(config.compressed)) if config.compressed else None
+    pairs = pair_files(truth, rebuilt, stored, config.allow_missing)
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("score voxels", total=len(pairs))
         scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
     scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
     output = absolute(config.output) if config.output else home("evaluations", "voxels")
-    storage.write_parquet(scenes, storage.join(output, "voxels.parquet"))
+    storage.write_parquet(scenes, storage.join_uri(output, "voxels.parquet"))
     tags = {"truth": absolute(config.ground_truth), "split": config.split, "rebuilt": absolute(config.reconstructed)}
     return publish_scores(output, scores, tags)
 

@@ -21,7 +21,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     if not config.formats:
         raise ValueError("--formats is empty, expected some of glb, ply, npz, xodr")
     selection = select_scenes(config)
-    output = absolute(config.output) if config.output else storage.join(selection.root, "export")
+    output = absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())
     start_ray()
     with Progress() as bar:

@@ -10,7 +10,7 @@ from jobs.support.ray_session import start_ray
 from pipelines.io.mesh_import import AUTHORS_AXES
 from pipelines.io.voxel_import import VOXEL_AXES
 from pipelines.preprocess.import_external import ImportRequest, find_files, import_files
-from pipelines.schema.axis_convention import scene_from_axes
+from pipelines.schema.axis_convention import compute_scene_from_axes
 
 
 def import_scenes(config: Config) -> tuple[str, dict]:
@@ -22,7 +22,7 @@ def import_scenes(config: Config) -> tuple[str, dict]:
     if not config.name or set(config.name) & set("/=\\"):
         raise ValueError(f"--name is {config.name!r}, expected a word without slashes")
     axes = config.axes or {"glb": AUTHORS_AXES, "npz": VOXEL_AXES}[config.format]
-    scene_from_axes(axes)
+    compute_scene_from_axes(axes)
     base, files = find_files(absolute(config.files), f".{config.format}")
     output = absolute(config.output) if config.output else home("imported", config.name)
     request = ImportRequest(base, files, config.format, axes, output, config.name)

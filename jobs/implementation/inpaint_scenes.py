@@ -9,7 +9,7 @@ from jobs.inpaint_scenes import Config
 from jobs.support.model_directories import pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import repaint_settings, select_scenes
-from pipelines.generation.inpaint import InpaintRequest, Where, inpaint_scenes
+from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
 
 def inpaint(config: Config) -> dict[str, float | None]:
@@ -21,7 +21,9 @@ def inpaint(config: Config) -> dict[str, float | None]:
         model=pipeline_directory(config.model),
         output=config.output_directory(),
         run=config.run,
-        where=Where(config.polygon_m, config.half_plane, config.primitives, config.margin_m, config.invert_region),
+        where=RegionConfig(
+            config.polygon_m, config.half_plane, config.primitives, config.margin_m, config.invert_region
+        ),
         contents=config.contents,
         variants=config.num_variants,
         label=config.label or None,

@@ -9,12 +9,20 @@ from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
 from jobs.support.cli import absolute, home, require_positive
 from jobs.support.ray_session import start_ray
 from jobs.support.value_names import SHEET_PICKS
-from pipelines.io.mesh_export import scene_glb
-from pipelines.rendering.render import png
-from pipelines.reporting.contact_sheet import Catalogue, View, captions, paint, scene_plate, scene_sheet, sheet_title
-from pipelines.reporting.dataset_report import dataset_html, read_facts
-from pipelines.reporting.gallery_page import gallery_html
+from pipelines.io.mesh_export import export_glb
+from pipelines.rendering.render import encode_png
+from pipelines.reporting.contact_sheet import (
+    View,
+    draw_scene_plate,
+    draw_scene_sheet,
+    make_captions,
+    make_sheet_title,
+    paint_scene,
+)
+from pipelines.reporting.dataset_report import read_facts, render_dataset_html
+from pipelines.reporting.gallery_page import render_gallery_html
 from pipelines.reporting.report import Picture
+from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
 
 
@@ -40,9 +48,11 @@ def draw_scenes(config: OneScene) -> list[str]:
         shown = bar.add_task("draw scenes", total=len(chosen))
         for shard, rows, _ in catalogue.chunks(chosen, 8):
             for scene in shard.scenes(rows):
-                files = {"png": png(scene_plate(scene)[0])} | ({"glb": scene_glb(scene)} if config.glb else {})
+                files = {"png": encode_png(draw_scene_plate(scene)[0])} | (
+                    {"glb": export_glb(scene)} if config.glb else {}
+                )
                 for kind, content in files.items():
-                    written.append(storage.join(output_path(config, ""), f"{scene.scene_id}.{kind}"))
+                    written.append(storage.join_uri(output_path(config, ""), f"{scene.scene_id}.{kind}"))
                     storage.write_whole(written[-1], lambda stream, content=content: stream.write(content))
                 bar.advance(shown)
     return written
@@ -53,7 +63,7 @@ def draw_pictures(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> lis
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("draw pictures", total=len(chosen) * len(views))
-        return paint(catalogue, chosen, views, lambda: bar.advance(shown))
+        return paint_scene(catalogue, chosen, views, lambda: bar.advance(shown))
 
 
 def draw_sheet(config: Sheet) -> str:
@@ -62,10 +72,10 @@ def draw_sheet(config: Sheet) -> str:
     catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
     chosen = catalogue.choose(config.max_scenes, config.sort, SHEET_PICKS[config.pick], config.seed)
     pictures = [picture for (picture,) in draw_pictures(catalogue, chosen, (View(config.view, config.size_px),))]
-    title = sheet_title(catalogue, len(chosen), config.sort, SHEET_PICKS[config.pick])
-    sheet = scene_sheet(pictures, captions(catalogue, chosen, config.sort), title, config.num_columns or None)
+    title = make_sheet_title(catalogue, len(chosen), config.sort, SHEET_PICKS[config.pick])
+    sheet = draw_scene_sheet(pictures, make_captions(catalogue, chosen, config.sort), title, config.num_columns or None)
     path = output_path(config, "sheet.png")
-    storage.write_whole(path, lambda stream: stream.write(png(sheet)))
+    storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
     return path
 
 
@@ -83,12 +93,12 @@ def write_dataset_report(config: Report) -> str:
     if config.num_examples > 0:
         catalogue = facts.catalogue
         chosen = catalogue.choose(config.num_examples, "vegetation")
-        named = captions(catalogue, chosen, "vegetation")
+        named = make_captions(catalogue, chosen, "vegetation")
         for (oblique, above), (name, remark) in zip(
             draw_pictures(catalogue, chosen, (View("3d", 640), View("bev", 384))), named, strict=True
         ):
             scenes.append((Picture(name, oblique), Picture(remark, above)))
-    html = dataset_html(facts, scenes)
+    html = render_dataset_html(facts, scenes)
     path = output_path(config, "report.html")
     storage.write_text(html, path)
     return path
@@ -102,7 +112,7 @@ def write_gallery(config: Gallery) -> str:
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("pack scenes", total=len(chosen))
-        html = gallery_html(catalogue, chosen, config.title, lambda: bar.advance(shown))
+        html = render_gallery_html(catalogue, chosen, config.title, lambda: bar.advance(shown))
     path = output_path(config, "gallery.html")
     storage.write_text(html, path)
     return path

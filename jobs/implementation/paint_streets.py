@@ -7,7 +7,7 @@ from rich.progress import Progress
 from jobs.paint_streets import Config
 from jobs.support.cli import absolute, home, require_positive
 from jobs.support.ray_session import start_ray
-from pipelines.rendering.controlnet import PhotoRequest, drives, paint_streets
+from pipelines.rendering.controlnet import PhotoRequest, list_drives, paint_streets
 from pipelines.runtime import storage
 
 
@@ -21,7 +21,7 @@ def paint(config: Config) -> tuple[str, int]:
         if not storage.list_files(absolute(value), ".json"):
             raise ValueError(f"{name} {value}: no model here; give a local directory in diffusers' layout")
     streets = absolute(config.streets) if config.streets else home("generated", "streets", "drive")
-    directories = drives(streets)
+    directories = list_drives(streets)
     request = PhotoRequest(
         diffusion=absolute(config.diffusion),
         controlnet=absolute(config.controlnet),

@@ -12,7 +12,7 @@ from jobs.support.cli import absolute, home
 from jobs.support.ray_session import start_ray
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
-from pipelines.preprocess.ingest import ingest
+from pipelines.preprocess.ingest import ingest_drives
 from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
 NOT_RECORDED = ("output", "skip_unreadable")
@@ -26,7 +26,7 @@ def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
     root = absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
-    plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_own
+    plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_custom
     return plan_drives(root, config.make_split, config.skip_unreadable)
 
 
@@ -56,7 +56,9 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     )
     with Progress(*columns) as bar:
         shown = bar.add_task(f"preprocess {source}", total=len(shards))
-        result = ingest(shards, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown))
+        result = ingest_drives(
+            shards, output, options, slots, skip_unreadable=skip, on_shard=lambda _: bar.advance(shown)
+        )
     if result.already_complete:
         print(f"{output} is already complete: {dict(result.scenes)}, {sum(result.rejects.values())} rejected")
         return

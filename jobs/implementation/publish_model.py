@@ -17,17 +17,17 @@ from jobs.support.tracking import Tracker, client, hide_credentials, tracking_ur
 from jobs.support.trainer import publish_directory
 from models.labels import LABELS
 from models.pipeline import PrITTIPipeline
-from models.pretrained import CHECKSUMS, TRAINING, WEIGHTS, checksums
+from models.pretrained import CHECKSUMS_NAME, TRAINING_NAME, WEIGHTS, compute_checksums
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.generation.sample import load_pipeline
-from pipelines.metrics.validity import scene_validity, slab_offset_m
-from pipelines.rendering.render import bev_picture, contact_sheet, png
-from pipelines.reporting.chart import standalone_svg
-from pipelines.reporting.model_card import Card, Training
+from pipelines.metrics.validity import compute_scene_validity, find_slab_offset_m
+from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_bev
+from pipelines.reporting.chart import make_standalone_svg
+from pipelines.reporting.model_card import ModelCard, TrainingRecord
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import read_scenes
-from pipelines.training.latents import weights_digest
+from pipelines.training.latents import digest_weights
 
 SHOWN = 32  # number of scenes on the card, from the first
 JUDGED = 256  # number of scenes among which those with most faults are shown
@@ -42,14 +42,14 @@ def publish(config: Config) -> list[str]:
         Values of --model for it: its directory and, if registered, models:/NAME/VERSION and the id of the run.
     """
     pipeline = load_pipeline(pipeline_directory(config.model))
-    weights = [weights_digest(pipeline.lvae), weights_digest(pipeline.dit)]
+    weights = [digest_weights(pipeline.lvae), digest_weights(pipeline.dit)]
     directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
     about, scores = read_evaluation(directory, weights)
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
     if about["sampling"]["sampler"] != "ddpm":
         as_judged["noise_scaling"] = about["sampling"].get("noise_scaling", 1.0)
     pipeline.register_to_config(**as_judged)
-    facts = storage.read_json(storage.join(about["real"], "dataset.json"))
+    facts = storage.read_json(storage.join_uri(about["real"], "dataset.json"))
     stages = [
         history("pritti-lvae", "Layout VAE", pipeline.lvae),
         history("pritti-dit", "Diffusion transformer", pipeline.dit),
@@ -75,7 +75,7 @@ def write_entry(
     name: str,
     pipeline: PrITTIPipeline,
     version: str,
-    trainings: Sequence[Training],
+    trainings: Sequence[TrainingRecord],
     facts: Mapping,
     scores: Mapping,
     about: Mapping,
@@ -83,16 +83,16 @@ def write_entry(
     """Write weights, card, checksums, scores and pictures of an entry; return the card's version."""
     pipeline.save_pretrained(directory)
     remove_local_paths(directory)
-    sums, kind = checksums(directory), pipeline.dit.config.label
-    card = Card(
+    sums, kind = compute_checksums(directory), pipeline.dit.config.label
+    card = ModelCard(
         name, version, kind, LABELS[kind], trainings, facts, about["sampling"], about["real_split"], scores, sums
     )
     storage.write_text(card.markdown(), f"{directory}/README.md")
-    storage.write_json(sums, f"{directory}/{CHECKSUMS}")
+    storage.write_json(sums, f"{directory}/{CHECKSUMS_NAME}")
     storage.write_json(scores, f"{directory}/metrics.json")
-    storage.write_json([training.record(facts["options"]) for training in trainings], f"{directory}/{TRAINING}")
+    storage.write_json([training.record(facts["options"]) for training in trainings], f"{directory}/{TRAINING_NAME}")
     for training in trainings:
-        storage.write_text(standalone_svg(training.chart()), f"{directory}/{training.picture}")
+        storage.write_text(make_standalone_svg(training.chart()), f"{directory}/{training.picture}")
     for picture, image in draw_examples(about).items():
         storage.write_whole(f"{directory}/{picture}.png", lambda stream, image=image: stream.write(image))
     return card.version
@@ -112,9 +112,11 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
         ValueError: There is no complete evaluation, or it belongs to other weights.
     """
     advice = "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and name its --output"
-    if not storage.exists(storage.join(directory, "evaluation.json")):
+    if not storage.exists(storage.join_uri(directory, "evaluation.json")):
         raise ValueError(f"--evaluation {directory}: no evaluation here; {advice}")
-    about, scores = (storage.read_json(storage.join(directory, f"{name}.json")) for name in ("evaluation", "metrics"))
+    about, scores = (
+        storage.read_json(storage.join_uri(directory, f"{name}.json")) for name in ("evaluation", "metrics")
+    )
     for part in ("generation", "reconstruction"):
         if part not in scores:
             raise ValueError(f"--evaluation {directory} holds no scores of {part}; {advice}")
@@ -128,14 +130,14 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
     return about, scores
 
 
-def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Training]:
+def history(experiment: str, stage: str, model: torch.nn.Module) -> list[TrainingRecord]:
     """Return the runs that trained a model's weights, oldest first: a run may start from the weights of an earlier one.
 
     Raises:
         ValueError: Neither MLflow nor a published entry has a record of one of them.
     """
     parameters = sum(value.numel() for value in model.parameters())
-    runs = [find_training(experiment, stage, weights_digest(model), parameters)]
+    runs = [find_training(experiment, stage, digest_weights(model), parameters)]
     while start := runs[0].options.get("start_from"):
         runs.insert(0, find_training(experiment, stage, start, None))  # its network may differ
     name = experiment.removeprefix("pritti-")
@@ -143,7 +145,7 @@ def history(experiment: str, stage: str, model: torch.nn.Module) -> list[Trainin
     return [replace(runs[0], name=name), *later]
 
 
-def find_training(experiment: str, stage: str, digest: str, parameters: int | None) -> Training:
+def find_training(experiment: str, stage: str, digest: str, parameters: int | None) -> TrainingRecord:
     """Return the run that trained the weights with a digest.
 
     Raises:
@@ -155,13 +157,13 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
     runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
     if not runs:
         if record := read_published_training(digest):
-            return Training(**record | {"stage": stage})
+            return TrainingRecord(**record | {"stage": stage})
         raise ValueError(
             f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); "
             "set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
-    return Training(
+    return TrainingRecord(
         experiment.removeprefix("pritti-"),
         stage,
         digest,
@@ -177,14 +179,14 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
 def read_published_training(digest: str) -> dict | None:
     """Return the record of a training run from a published entry of the package or of this machine."""
     for zoo in (str(WEIGHTS), home("zoo")):
-        for path in storage.list_files(zoo, TRAINING):
+        for path in storage.list_files(zoo, TRAINING_NAME):
             for record in storage.read_json(path):
                 if record["weights"] == digest:
                     return record
     return None
 
 
-def require_data(training: Training, real: str, facts: Mapping, evaluation: str) -> None:
+def require_data(training: TrainingRecord, real: str, facts: Mapping, evaluation: str) -> None:
     """Check that an evaluation used the data of a training run.
 
     Raises:
@@ -213,13 +215,13 @@ def hours_of_steps(tracker, batch_size: int) -> float:
 
 def draw_examples(about: Mapping) -> dict[str, bytes]:
     """Return PNGs of the first evaluated scenes, and of those with most faults among the first JUDGED."""
-    offset_m = slab_offset_m(Dataset.open(about["real"]).spec.surface)
+    offset_m = find_slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
-    faults = np.array([scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])
+    faults = np.array([compute_scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])
     worst = [scenes[k] for k in np.argsort(-faults, kind="stable")[:FAILURES]]
     sides = {"samples": (scenes[:SHOWN], 8), "failures": (worst, FAILURES)}
     return {
-        name: png(contact_sheet([bev_picture(scene, 192, supersample=2) for scene in chosen], columns))
+        name: encode_png(arrange_contact_sheet([render_bev(scene, 192, supersample=2) for scene in chosen], columns))
         for name, (chosen, columns) in sides.items()
     }
 

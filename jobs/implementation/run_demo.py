@@ -23,7 +23,7 @@ from jobs.support.cli import absolute, home
 from jobs.support.ray_session import start_ray
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
-from pipelines.rendering.render import contact_sheet, picture_3d, png
+from pipelines.rendering.render import arrange_contact_sheet, encode_png, render_3d
 from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
 
@@ -64,9 +64,9 @@ def show_released(config: Config) -> None:
         )
     )
     scenes = read_scenes(home("released"), "generated-samples")
-    sheet = contact_sheet([picture_3d(scene, 480, 360) for scene in scenes], columns=4)
+    sheet = arrange_contact_sheet([render_3d(scene, 480, 360) for scene in scenes], columns=4)
     path = home("released.png")
-    storage.write_whole(path, lambda stream: stream.write(png(sheet)))
+    storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
     print(f"pictures: {os.path.relpath(path)}; the next stages train such a model")
 
 

@@ -11,7 +11,7 @@ from jobs.support.model_directories import model_label_kind, pipeline_directory
 from jobs.support.ray_session import start_ray
 from models.labels import LABELS
 from pipelines.generation.sample import SampleRequest, sample_scenes
-from pipelines.io.mesh_export import scene_glb
+from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
 
@@ -42,8 +42,8 @@ def sample(config: Config) -> str:
         shown = bar.add_task("sample scenes", total=config.num_scenes)
         sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
     for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
-        path = storage.join(output, "glb", config.run, f"{scene.scene_id}.glb")
-        storage.write_whole(path, lambda stream, scene=scene: stream.write(scene_glb(scene)))
+        path = storage.join_uri(output, "glb", config.run, f"{scene.scene_id}.glb")
+        storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
     return output
 
 

@@ -14,7 +14,7 @@ from jobs.support.model_directories import pipeline_directory
 from jobs.support.ray_session import start_ray
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards
-from pipelines.studio.serve import deployment
+from pipelines.studio.serve import make_deployment
 from pipelines.studio.session import LOOPBACK
 
 
@@ -39,7 +39,7 @@ def serve(config: Config) -> str:
     start_ray()
     quiet = {"log_level": "WARNING", "enable_access_log": False}
     ray_serve.start(http_options={"host": config.host, "port": config.port}, logging_config=quiet)
-    ray_serve.run(deployment(model, tables, token, hosts, config.num_threads), name="studio", route_prefix="/")
+    ray_serve.run(make_deployment(model, tables, token, hosts, config.num_threads), name="studio", route_prefix="/")
     shown = f"[{config.host}]" if ":" in config.host else config.host
     return f"http://{shown}:{config.port}/" + (f"?token={token}" if token else "")
 

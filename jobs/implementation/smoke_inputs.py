@@ -12,7 +12,7 @@ NUM_TRAIN, NUM_TEST = 32, 16
 
 def make_smoke_dataset(root: str) -> None:
     """Generate a town of 32 + 16 scenes, unless it exists."""
-    if storage.exists(storage.join(root, "dataset.json")):
+    if storage.exists(storage.join_uri(root, "dataset.json")):
         return
     start_ray(training=True)  # before preprocessing starts Ray without the dashboard that training needs
     main(Town(output=root, num_train=NUM_TRAIN, num_test=NUM_TEST))

@@ -13,18 +13,25 @@ from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
 from models.labels import LABELS
-from models.pipeline import SAMPLERS, require_scaling
+from models.pipeline import check_noise_scaling
 from models.sampling.diffusion import Diffusion
-from pipelines.evaluation.evaluate import compare
-from pipelines.evaluation.features import Looks, describe
-from pipelines.evaluation.sampler_sweep import CHARTED, sampler_charts, sampler_html, sampler_row, sampler_table
+from models.sampling.schedulers import SAMPLERS
+from pipelines.evaluation.evaluate import compare_datasets
+from pipelines.evaluation.features import FeatureConfig, compute_scene_features
+from pipelines.evaluation.sampler_sweep import (
+    CHARTED,
+    build_sampler_table,
+    draw_sampler_charts,
+    make_sampler_row,
+    render_sampler_html,
+)
 from pipelines.generation.sample import SampleRequest, sample_scenes
-from pipelines.rendering.render import bev_picture
-from pipelines.reporting.chart import standalone_svg
+from pipelines.rendering.render import render_bev
+from pipelines.reporting.chart import make_standalone_svg
 from pipelines.reporting.report import Picture
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import read_scenes
 
 
@@ -44,20 +51,22 @@ def sweep_samplers(config: Config) -> list[dict]:
     for steps in config.num_inference_steps:  # raises for an invalid number before hours of valid ones
         Diffusion().visited(steps)
     for scaling in config.noise_scalings:
-        require_scaling(scaling)
+        check_noise_scaling(scaling)
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     output = absolute(config.output) if config.output else home("evaluations", "samplers")
-    real = Selection(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
+    real = SceneSubset(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
     count = sum(len(rows) for _, rows in real.shards())
     labels = LABELS[model_label_kind(model)]
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:
 
-        def described(side: Selection, name: str) -> dict:
+        def described(side: SceneSubset, name: str) -> dict:
             task = bar.add_task(f"describe {name}", total=count)
-            directory = storage.join(output, "described", name)
-            return describe(side, dataset, Looks(), directory, config.num_actors, lambda n: bar.advance(task, n))
+            directory = storage.join_uri(output, "described", name)
+            return compute_scene_features(
+                side, dataset, FeatureConfig(), directory, config.num_actors, lambda n: bar.advance(task, n)
+            )
 
         truth = described(real, "real")
         for sampler, steps, scaling in product(
@@ -79,12 +88,12 @@ def sweep_samplers(config: Config) -> list[dict]:
                 ),  # regardless of the number of actors, so that a run resumes with another number
             )
             seconds_per_scene = sample_and_time(config, request, bar)
-            made = described(Selection(output, request.source, None, count, "spread"), request.run)
-            scores = compare(truth, made, dataset.spec.ground_classes)
-            used = storage.read_json(storage.join(output, f"{request.source}.json"))["noise_scaling"]
-            rows.append(sampler_row(sampler, steps, used, seconds_per_scene, scores))
+            made = described(SceneSubset(output, request.source, None, count, "spread"), request.run)
+            scores = compare_datasets(truth, made, dataset.spec.ground_classes)
+            used = storage.read_json(storage.join_uri(output, f"{request.source}.json"))["noise_scaling"]
+            rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores))
             scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
-            pictures += [Picture(f"{request.run}, {s.frame}", bev_picture(s, supersample=2)) for s in scenes]
+            pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
     how = [
         f"Real: {count} scenes of {dataset.root}, split {config.real_split}, evenly spread. Model: {model}.",
         f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
@@ -95,7 +104,7 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
     """Generate missing scenes; return seconds per scene and actor over the timed shards, or None without any."""
-    record = storage.join(request.output, "times", f"{request.run}.json")
+    record = storage.join_uri(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}
     shown = bar.add_task(request.run, total=request.num_scenes)
 
@@ -114,12 +123,12 @@ def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> fl
 
 def write_report(output: str, rows: list[dict], pictures: list[Picture], columns: int, how: list[str]) -> None:
     """Write the rows, the figures and the page."""
-    storage.write_json(rows, storage.join(output, "samplers.json"))
-    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "samplers.parquet"))
-    storage.write_text(sampler_html(rows, pictures, columns, how), storage.join(output, "samplers.html"))
-    for name, chart in zip(CHARTED, sampler_charts(rows), strict=True):
-        storage.write_text(standalone_svg(chart), storage.join(output, f"samplers-{name}.svg"))
+    storage.write_json(rows, storage.join_uri(output, "samplers.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "samplers.parquet"))
+    storage.write_text(render_sampler_html(rows, pictures, columns, how), storage.join_uri(output, "samplers.html"))
+    for name, chart in zip(CHARTED, draw_sampler_charts(rows), strict=True):
+        storage.write_text(make_standalone_svg(chart), storage.join_uri(output, f"samplers-{name}.svg"))
 
 
 def main(config: Config) -> None:
-    print_table(sampler_table(sweep_samplers(config)))
+    print_table(build_sampler_table(sweep_samplers(config)))

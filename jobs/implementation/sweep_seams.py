@@ -11,15 +11,20 @@ from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
 from jobs.sweep_seams import Config
-from models.pipeline import Resampling
 from models.sampling.diffusion import Diffusion
-from pipelines.evaluation.seam_sweep import objects_per_ha, seam_row, seam_sweep_html, seam_table
-from pipelines.evaluation.seams import Lines, measure, with_lines
+from models.sampling.repaint import RePaintConfig
+from pipelines.evaluation.seam_sweep import (
+    build_seam_table,
+    count_objects_per_ha,
+    make_seam_row,
+    render_seam_sweep_html,
+)
+from pipelines.evaluation.seams import SeamLines, draw_lines, measure_seams
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
-from pipelines.metrics.seams import seam_ratios
+from pipelines.metrics.seams import estimate_seam_ratios
 from pipelines.reporting.report import Picture
 from pipelines.runtime import storage
-from pipelines.schema.scene_subset import Selection
+from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import read_scenes
 
 
@@ -31,7 +36,7 @@ def sweep_seams(config: Config) -> list[dict]:
         raise ValueError("--settings is empty: expected five numbers per setting")
 
     for setting in config.settings:
-        Resampling(*setting).transitions()  # raises for an invalid setting before hours of valid ones
+        RePaintConfig(*setting).transitions()  # raises for an invalid setting before hours of valid ones
         Diffusion().visited(setting[0])
     output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
     selection = select_scenes(config)
@@ -49,27 +54,27 @@ def sweep_seams(config: Config) -> list[dict]:
                 seed=config.seed,
                 overlap=config.overlap,
                 mode=config.neighbour_latents,
-                resampling=Resampling(*setting),
+                resampling=RePaintConfig(*setting),
                 guidance_scale=config.guidance_scale,
                 batch_size=config.batch_size,
             )
             done = bar.add_task(f"{name}, blocks", total=8 * count)
             outpaint_scenes(request, selection, config.num_actors, lambda blocks, task=done: bar.advance(task, blocks))
-            measured = measure(Selection(output, request.source), Lines(), config.num_actors)
-            objects = objects_per_ha(read_scenes(output, request.source))
+            measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
+            objects = count_objects_per_ha(read_scenes(output, request.source))
             seams = int(measured.seams.sum())
-            rows.append(seam_row(request.resampling, seams, objects, seam_ratios(measured.records)))
+            rows.append(make_seam_row(request.resampling, seams, objects, estimate_seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
-            pictures.append(Picture(first.scene_id, with_lines(first, Lines()), name))
-    storage.write_json(rows, storage.join(output, "sweep.json"))
-    storage.write_parquet(pa.Table.from_pylist(rows), storage.join(output, "sweep.parquet"))
+            pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
+    storage.write_json(rows, storage.join_uri(output, "sweep.json"))
+    storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
     how = [
         f"{count} scenes of {selection.root}, overlap {config.overlap:g}, {config.neighbour_latents}. Model: {model}."
     ]
-    html = seam_sweep_html(rows, pictures, how)
-    storage.write_text(html, storage.join(output, "sweep.html"))
+    html = render_seam_sweep_html(rows, pictures, how)
+    storage.write_text(html, storage.join_uri(output, "sweep.html"))
     return rows
 
 
 def main(config: Config) -> None:
-    print_table(seam_table(sweep_seams(config)))
+    print_table(build_seam_table(sweep_seams(config)))

@@ -29,14 +29,14 @@ from models.dit import DiT
 from models.labels import LABELS
 from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline, scheduler
-from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, preset
-from models.training import Execution, Optimisation, dit_trainer
+from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
+from models.training import ExecutionConfig, OptimizerConfig, make_dit_trainer
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 from pipelines.training.data_loader import LatentReader, Stream
-from pipelines.training.latents import load_lvae, weights_digest
+from pipelines.training.latents import digest_weights, load_lvae
 
 
 def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
@@ -53,7 +53,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     dataset = Dataset.open(root)
     latents_root = absolute(config.latents) if config.latents else root
     require_latents(latents_root, root)
-    latents = storage.read_json(storage.join(latents_root, "latents.json"))
+    latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
     architecture = dit_architecture(config, row, latents, load_encoder(latents, latents_root))
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.normalisation if start else {}
@@ -62,7 +62,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     name = config.name or f"dit-{config.preset}"
     record = trainer.guard_run_name(name, home("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
-    execution = Execution(config.gradient_accumulation_steps, config.precision, config.compile)
+    execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     timesteps = TIMESTEP_SAMPLINGS[config.timestep_sampling]
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
@@ -86,14 +86,14 @@ def make_smoke_latents(root: str) -> None:
     """Encode the smoke dataset with the smoke layout VAE, which is trained if it is missing."""
     start_ray(training=True)
     lvae = home("models", "lvae-smoke")
-    if not storage.exists(storage.join(lvae, "config.json")):
+    if not storage.exists(storage.join_uri(lvae, "config.json")):
         train_lvae(LVAEConfig(preset="smoke"))
     encode(EncodeConfig(dataset=root, lvae=lvae))
 
 
 def resolve_preset(config: Config) -> DiTPreset:
     """Return the preset with the options that override it."""
-    row = preset(DIT_PRESETS, config.preset)
+    row = find_preset(DIT_PRESETS, config.preset)
     if config.batch_size is not None:
         row = replace(row, batch_size=config.batch_size)
     if config.prediction_type is not None:
@@ -110,17 +110,17 @@ def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
         ValueError: Its weights have changed since.
     """
     lvae = load_lvae(latents["lvae"])
-    if weights_digest(lvae) != latents["lvae_digest"]:
+    if digest_weights(lvae) != latents["lvae_digest"]:
         raise ValueError(
             f"{latents['lvae']} has changed since {latents_root} was encoded with it; encode again to another --output"
         )
     return lvae
 
 
-def optimizer_settings(config: Config, row: DiTPreset) -> Optimisation:
+def optimizer_settings(config: Config, row: DiTPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
-        Optimisation(
+        OptimizerConfig(
             steps=row.steps,
             learning_rate=row.learning_rate,
             weight_decay=row.weight_decay,
@@ -151,7 +151,7 @@ def dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: Layout
 
 
 def run_identity(
-    config: Config, row: DiTPreset, settings: Optimisation, latents: dict, root: str, start: Start | None
+    config: Config, row: DiTPreset, settings: OptimizerConfig, latents: dict, root: str, start: Start | None
 ) -> dict:
     """Return the options that a resumed run must share with the run that it continues."""
     identity = trainer.run_identity(
@@ -176,7 +176,7 @@ def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
     training, complete = prepare(config)
     output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
-    trainer.fit(training, config.num_workers, storage.join(output, "dit"))
+    trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
     return complete(output)
 
 
@@ -198,7 +198,7 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
     """
     directory = pipeline_directory(model)
     pipeline = load_pipeline(directory)
-    if weights_digest(pipeline.lvae) != lvae_digest:
+    if digest_weights(pipeline.lvae) != lvae_digest:
         raise ValueError(
             f"--start-from {model}: its transformer was trained on latents of another layout VAE; "
             f"encode with that one first: jobs/encode_latents.py --lvae {directory}/lvae"
@@ -211,7 +211,7 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
             )
     normalisation = {"shift": built["shift"], "scale": built["scale"]}
     sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold")}
-    return Start(weights_digest(pipeline.dit), normalisation, sampling, pipeline.dit.state_dict())
+    return Start(digest_weights(pipeline.dit), normalisation, sampling, pipeline.dit.state_dict())
 
 
 def build(
@@ -222,7 +222,7 @@ def build(
     model = DiT(**architecture)
     if start:
         model.load_state_dict(start.state)
-    return dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
+    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
@@ -233,7 +233,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
         sampling: `noise_scaling` and `existence_threshold`, where they differ from the paper's.
         output: Directory that contains dit/; returned.
     """
-    dit = DiT.from_pretrained(storage.join(output, "dit"), low_cpu_mem_usage=False)
+    dit = DiT.from_pretrained(storage.join_uri(output, "dit"), low_cpu_mem_usage=False)
     pipeline = PrITTIPipeline(load_lvae(lvae), dit, scheduler(), **sampling)
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)

@@ -23,14 +23,14 @@ from models.augment import Augmentation
 from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.presets import LVAE_PRESETS, LVAEPreset, preset
-from models.training import Execution, Optimisation, lvae_trainer
+from models.presets import LVAE_PRESETS, LVAEPreset, find_preset
+from models.training import ExecutionConfig, OptimizerConfig, make_lvae_trainer
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 from pipelines.training.data_loader import LayoutReader, Stream
-from pipelines.training.latents import load_lvae, weights_digest
+from pipelines.training.latents import digest_weights, load_lvae
 
 OF_OBJECT_DECODER = ("decoder", "head_hidden", "least_per_cell")  # keys of an architecture
 START_SCENES, START_SHARDS = 96, 16  # training scenes from which the model is initialised
@@ -57,7 +57,7 @@ def prepare(config: Config) -> TrainingRun:
         require_replaceable(name, kept)
     record = trainer.guard_run_name(name, home("runs"), identity)
     tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()}, record)
-    execution = Execution(config.gradient_accumulation_steps, config.precision, config.compile)
+    execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     sample = sample_layouts(shards, counts, spec)
     return TrainingRun(
         name=name,
@@ -86,7 +86,7 @@ def prepare(config: Config) -> TrainingRun:
 
 def resolve_preset(config: Config) -> LVAEPreset:
     """Return the preset with the options that override it."""
-    row = preset(LVAE_PRESETS, config.preset)
+    row = find_preset(LVAE_PRESETS, config.preset)
     names = ("batch_size", "kl_weight", "latent_noise")
     row = replace(row, **{name: value for name in names if (value := getattr(config, name)) is not None})
     if row.kl_weight < 0:
@@ -96,10 +96,10 @@ def resolve_preset(config: Config) -> LVAEPreset:
     return row
 
 
-def optimizer_settings(config: Config, row: LVAEPreset) -> Optimisation:
+def optimizer_settings(config: Config, row: LVAEPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
-        Optimisation(
+        OptimizerConfig(
             steps=row.steps,
             learning_rate=row.learning_rate,
             final_learning_rate=row.final_learning_rate,
@@ -116,7 +116,7 @@ def optimizer_settings(config: Config, row: LVAEPreset) -> Optimisation:
 
 
 def run_identity(
-    config: Config, row: LVAEPreset, settings: Optimisation, spec: LayoutSpec, root: str, augment: Augmentation
+    config: Config, row: LVAEPreset, settings: OptimizerConfig, spec: LayoutSpec, root: str, augment: Augmentation
 ) -> dict:
     """Return the options that a resumed run must share with the run that it continues."""
     identity = trainer.run_identity(
@@ -131,8 +131,8 @@ def run_identity(
     )
     if config.flip or config.jitter:
         identity |= {"augmentation": asdict(augment)}
-    if row.least_per_cell != 1:  # absent at 1, so that runs from before this option resume
-        identity |= {"least_per_cell": row.least_per_cell}
+    if row.min_proposals_per_cell != 1:  # absent at 1, so that runs from before this option resume
+        identity |= {"least_per_cell": row.min_proposals_per_cell}
     return identity
 
 
@@ -174,7 +174,7 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
         raise ValueError(
             f"--train-object-decoder-of {model}: its layout differs from this dataset's; choose its own dataset"
         )
-    return Kept(weights_digest(lvae), weights_digest(pipeline.dit), lvae.state_dict())
+    return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict())
 
 
 def require_replaceable(name: str, kept: Kept) -> None:
@@ -184,10 +184,10 @@ def require_replaceable(name: str, kept: Kept) -> None:
         ValueError: It would.
     """
     place = home("models", f"pritti-{name}")
-    if not storage.exists(storage.join(place, "model_index.json")):
+    if not storage.exists(storage.join_uri(place, "model_index.json")):
         return
     there = load_pipeline(place)
-    if weights_digest(there.lvae) == kept.digest or weights_digest(there.dit) != kept.transformer:
+    if digest_weights(there.lvae) == kept.digest or digest_weights(there.dit) != kept.transformer:
         raise ValueError(f"--name {name}: {place} holds a pipeline that would be replaced; choose another name")
 
 
@@ -199,7 +199,7 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
     """
 
     pipeline = load_pipeline(pipeline_directory(model))
-    if weights_digest(pipeline.lvae) != training.identity["start_from"]:
+    if digest_weights(pipeline.lvae) != training.identity["start_from"]:
         raise ValueError(
             f"--train-object-decoder-of {model} was replaced during training; the trained layout VAE is in {lvae}"
         )
@@ -237,10 +237,10 @@ def build(
 
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
-    model.start_at(LayoutBatch.from_compact(as_tensors(sample)))
+    model.init_from_data(LayoutBatch.from_compact(as_tensors(sample)))
     if kept:
-        model.keep_latents_of(kept.state)
-    return lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)
+        model.freeze_all_but_object_decoder(kept.state)
+    return make_lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)
 
 
 def main(config: Config) -> None:

@@ -9,13 +9,19 @@ import numpy as np
 import torch
 
 from models.lvae import LayoutVAE
-from models.sampling.diffusion import Diffusion, SceneNoise, Walk, keyed_generator, sample
+from models.sampling.diffusion import Diffusion, SamplingSchedule, SceneNoise, make_keyed_generator, sample
 from models.scene import Scene
-from models.tensors import layout_batch, scene_from_layout
-from models.training import Trainer, stacked_noise
-from models.vae.losses import lvae_loss
-from pipelines.metrics.reconstruction import detection_scores, ground_scores, ground_sums, join_matches, match_scene
-from pipelines.rendering.render import bev_picture, contact_sheet
+from models.tensors import decode_layout, make_layout_batch
+from models.training import Trainer, sample_noise
+from models.vae.losses import compute_lvae_loss
+from pipelines.metrics.reconstruction import (
+    compute_detection_scores,
+    compute_ground_scores,
+    join_matches,
+    match_scene,
+    sum_ground,
+)
+from pipelines.rendering.render import arrange_contact_sheet, render_bev
 from pipelines.schema.tables import find_shards, read_scenes
 from pipelines.training.data_loader import LatentReader
 from pipelines.training.latents import load_lvae
@@ -49,34 +55,34 @@ class ReconstructionCheck:
         Losses are those of a sampled latent, as in training. Ground IoU, height error and AP3D are those of the mean
         latent, as in the evaluation. The pictures show ground truth above reconstruction.
         """
-        model, scenes = trainer.averaged().eval(), list(held_out_scenes(self.root, self.source, self.count))
+        model, scenes = trainer.ema_model().eval(), list(held_out_scenes(self.root, self.source, self.count))
         spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
-            batch = layout_batch(chosen, spec).to(trainer.device)
-            noise = stacked_noise(
-                [keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
+            batch = make_layout_batch(chosen, spec).to(trainer.device)
+            noise = sample_noise(
+                [make_keyed_generator(0, start + k) for k in range(len(chosen))], model.latent_shape, trainer.device
             )
             output, posterior = model(batch, noise)
-            parts = lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
+            parts = compute_lvae_loss(output, posterior, batch, spec, self.kl_weight).items()
             losses.append({name: float(value) * len(chosen) for name, value in parts.items()})
             layouts = model.decode(posterior.mean).layouts()
             for scene, layout, *truth in zip(chosen, layouts, batch.occupied, batch.height, strict=True):
-                rebuilt.append(scene_from_layout(layout, spec, scene))
-                matches.append(match_scene(scene, scene_from_layout(layout, spec, scene, threshold=-1.0)))
+                rebuilt.append(decode_layout(layout, spec, scene))
+                matches.append(match_scene(scene, decode_layout(layout, spec, scene, threshold=-1.0)))
                 occupied, height = (v.cpu().numpy() for v in truth)
                 height_m = [spec.height_bounds_m.restore(h[..., None])[..., 0] for h in (height, layout.height)]
-                part = ground_sums(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
+                part = sum_ground(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
                 sums = part if sums is None else sums + part
         model.train()
-        scores = ground_scores(
+        scores = compute_ground_scores(
             sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high])
         )
         metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
         metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
-        metrics |= {"validation_ap3d": detection_scores(join_matches(matches)).ap3d}
-        pictures = [bev_picture(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
-        return metrics, {"reconstruction": contact_sheet(pictures, columns=min(SHOWN, len(scenes)))}
+        metrics |= {"validation_ap3d": compute_detection_scores(join_matches(matches)).ap3d}
+        pictures = [render_bev(s) for s in (*scenes[:SHOWN], *rebuilt[:SHOWN])]
+        return metrics, {"reconstruction": arrange_contact_sheet(pictures, columns=min(SHOWN, len(scenes)))}
 
 
 @dataclass(frozen=True)
@@ -94,16 +100,19 @@ class SamplingCheck:
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the validation loss, with the same noise each time, and pictures of SHOWN generated scenes."""
-        dit, device = trainer.averaged().eval(), trainer.device
+        dit, device = trainer.ema_model().eval(), trainer.device
         arrays = held_out_latents(self.root, self.source, self.latents, self.label, self.count)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
-        generators = [keyed_generator(1, k) for k in range(len(arrays["label"]))]
+        generators = [make_keyed_generator(1, k) for k in range(len(arrays["label"]))]
         loss = float(trainer.loss(dit, arrays, generators)["loss"])
 
         shape = (dit.config.channels, dit.config.size, dit.config.size)
         labels = torch.arange(SHOWN, device=device) % dit.config.num_labels
         latents = sample(
-            dit, Walk(Diffusion(), self.num_inference_steps), SceneNoise(0, range(SHOWN), shape, device), labels
+            dit,
+            SamplingSchedule(Diffusion(), self.num_inference_steps),
+            SceneNoise(0, range(SHOWN), shape, device),
+            labels,
         )
         shift, scale = (
             torch.tensor(v or [d] * shape[0], device=device)[:, None, None]
@@ -112,8 +121,10 @@ class SamplingCheck:
         dit.train()
         lvae = cached_lvae(self.lvae).to(device)
         identity = held_out_scenes(self.root, self.source, 1)[0]
-        scenes = [scene_from_layout(x, lvae.spec, identity) for x in lvae.decode(latents * scale + shift).layouts()]
-        return {"validation_loss": loss}, {"samples": contact_sheet([bev_picture(s) for s in scenes], columns=SHOWN)}
+        scenes = [decode_layout(x, lvae.spec, identity) for x in lvae.decode(latents * scale + shift).layouts()]
+        return {"validation_loss": loss}, {
+            "samples": arrange_contact_sheet([render_bev(s) for s in scenes], columns=SHOWN)
+        }
 
 
 @lru_cache(maxsize=1)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from jobs.support.cli import absolute, home
 from models.labels import require_labels
-from models.pretrained import INDEX, pipeline_path
+from models.pretrained import INDEX_NAME, find_pipeline_path
 from pipelines.runtime import storage
 
 
@@ -22,7 +22,7 @@ def require_model_labels(model: str, labels: Iterable[str]) -> None:
 
 def model_label_kind(model: str) -> str:
     """Return the kind of label that the pipeline in a directory is conditioned on."""
-    return storage.read_json(storage.join(model, "dit/config.json"))["label"]
+    return storage.read_json(storage.join_uri(model, "dit/config.json"))["label"]
 
 
 def pipeline_directory(model: str) -> str:
@@ -34,19 +34,19 @@ def pipeline_directory(model: str) -> str:
         ValueError: There is no such pipeline, or no name and several trained pipelines.
     """
     if not model:
-        found = [path.removesuffix(f"/{INDEX}") for path in storage.list_files(home("models"), INDEX)]
+        found = [path.removesuffix(f"/{INDEX_NAME}") for path in storage.list_files(home("models"), INDEX_NAME)]
         if (town := home("models", "pritti-town")) in found:
             return town
         if len(found) > 1:
             raise ValueError(
                 f"--model is missing and several were trained here; name one of: {', '.join(sorted(found))}"
             )
-        return found[0] if found else pipeline_path("town")
+        return found[0] if found else find_pipeline_path("town")
     for directory in (absolute(model), home("zoo", model)):
-        if storage.exists(storage.join(directory, INDEX)):
+        if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
     if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):
         from jobs.support.registry import download_pipeline  # imports MLflow, which no other --model needs
 
         return download_pipeline(model)
-    return pipeline_path(model)
+    return find_pipeline_path(model)

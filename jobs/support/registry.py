@@ -11,7 +11,7 @@ from mlflow.exceptions import MlflowException
 
 from jobs.support.cli import home
 from jobs.support.tracking import client, hide_credentials, tracking_uri
-from models.pretrained import CHECKSUMS, INDEX, checksums
+from models.pretrained import CHECKSUMS_NAME, INDEX_NAME, compute_checksums
 
 EXPERIMENT = "pritti-zoo"
 PIPELINE = "pipeline"  # artifact directory of a publishing run
@@ -45,13 +45,13 @@ def download_pipeline(reference: str) -> str:
             name, _, version = reference.removeprefix("models:/").rpartition("/")
             run_id = api.get_model_version(name, version).run_id
         directory = os.path.join(home("registry"), run_id)
-        if os.path.exists(os.path.join(directory, INDEX)):
+        if os.path.exists(os.path.join(directory, INDEX_NAME)):
             return directory
         os.makedirs(home("registry"), exist_ok=True)
         with tempfile.TemporaryDirectory(dir=home("registry")) as staging:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
-            if checksums(whole) != json.loads(Path(whole, CHECKSUMS).read_text()):
-                raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS}; publish it again")
+            if compute_checksums(whole) != json.loads(Path(whole, CHECKSUMS_NAME).read_text()):
+                raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS_NAME}; publish it again")
             if not os.path.exists(directory):  # another process may have finished first
                 os.rename(whole, directory)
     except (MlflowException, OSError) as error:

@@ -6,17 +6,17 @@ from dataclasses import replace
 
 from jobs.support.cli import absolute, home
 from jobs.support.options import RePaintOptions, SceneOptions
-from models.pipeline import Resampling
-from pipelines.schema.scene_subset import Selection
+from models.sampling.repaint import RePaintConfig
+from pipelines.schema.scene_subset import SceneSubset
 
 
-def select_scenes(options: SceneOptions) -> Selection:
+def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the first scenes that the options name."""
     directory = absolute(options.input) if options.input else home("generated")
-    return Selection(directory, options.source or None, options.split or None, options.max_scenes, "first")
+    return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
 
 
-def repaint_settings(options: RePaintOptions) -> Resampling:
+def repaint_settings(options: RePaintOptions) -> RePaintConfig:
     """Return the paper's or the guided settings, with every setting that an option overrides."""
     given = {
         "num_steps": options.num_inference_steps,
@@ -25,5 +25,5 @@ def repaint_settings(options: RePaintOptions) -> Resampling:
         "known_guidance": options.pseudoinverse_guidance,
         "eta": options.eta,
     }
-    start = Resampling.guided() if options.guided else Resampling()
+    start = RePaintConfig.guided() if options.guided else RePaintConfig()
     return replace(start, **{name: value for name, value in given.items() if value is not None})

@@ -8,7 +8,7 @@ from math import isfinite
 import pyarrow as pa
 
 from jobs.support.tracking import Tracker
-from pipelines.evaluation.evaluate import flattened, plain
+from pipelines.evaluation.evaluate import convert_estimates, flatten_scores
 from pipelines.metrics.intervals import Estimate
 from pipelines.runtime import storage
 
@@ -31,18 +31,18 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
         The content of metrics.json.
     """
     rows, known = [], {}
-    for name, value in flattened(scores).items():
+    for name, value in flatten_scores(scores).items():
         score = value if isinstance(value, Estimate) else Estimate(value, None, None)
         rows.append({"metric": name} | score._asdict())
         named = {"": score.value, ".low": score.low, ".high": score.high}
         known |= {name + end: number for end, number in named.items() if number is not None}
-    nested = plain(scores)
-    storage.write_json(nested, storage.join(output, "metrics.json"))
+    nested = convert_estimates(scores)
+    storage.write_json(nested, storage.join_uri(output, "metrics.json"))
     schema = pa.schema({"metric": pa.string(), "value": pa.float64(), "low": pa.float64(), "high": pa.float64()})
-    storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join(output, "metrics.parquet"))
+    storage.write_parquet(pa.Table.from_pylist(rows, schema), storage.join_uri(output, "metrics.parquet"))
 
     run_name = output.rstrip("/").rsplit("/", 1)[-1]
-    tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join(output, "mlflow.json"))
+    tracker = Tracker.start("pritti-evaluation", run_name, {}, storage.join_uri(output, "mlflow.json"))
     for key, value in tags.items():
         tracker.tag(key, value)
     finite = [(name, number) for name, number in known.items() if isfinite(number)]
@@ -50,6 +50,6 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
         tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
     if "://" not in output:  # MLflow takes local files only
         for file in ("metrics.json", *files):
-            tracker.client.log_artifact(tracker.run_id, storage.join(output, file))
+            tracker.client.log_artifact(tracker.run_id, storage.join_uri(output, file))
     tracker.finish("FINISHED")
     return nested

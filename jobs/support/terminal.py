@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from pipelines.reporting.report import Table, written
+from pipelines.reporting.report import Table, format_cell
 
 
 def print_table(table: Table, file: IO[str] | None = None) -> None:
@@ -18,5 +18,5 @@ def print_table(table: Table, file: IO[str] | None = None) -> None:
     for name in table.columns:
         lines.add_column(name, overflow="fold")  # long names differ at their ends
     for row in table.rows:
-        lines.add_row(*map(written, row))
+        lines.add_row(*map(format_cell, row))
     Console(file=file, width=None if file is None and sys.stdout.isatty() else 200).print(lines)

@@ -24,10 +24,10 @@ from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, Sc
 from jobs.support.cli import root_cause
 from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
-from models.training import NotFinite, Optimisation, Trainer
+from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
-from pipelines.training.data_loader import READER_CPUS, Reader, Stream, batches
-from pipelines.training.latents import weights_digest
+from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches
+from pipelines.training.latents import digest_weights
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
 RETRIES = 2  # restarts from the last checkpoint after a worker failure
@@ -46,7 +46,7 @@ class TrainingRun:
     build: Callable[[torch.device, Wrap], Trainer]
     stream: Stream
     reader: Reader
-    settings: Optimisation
+    settings: OptimizerConfig
     identity: dict
     tracker: Tracker
     checkpoint_every: int
@@ -77,12 +77,12 @@ def train_worker(run: TrainingRun, threads: int) -> None:
     local = run.stream.batch_size // world
     positions = range(rank * local, (rank + 1) * local)
     started, logged, waited = time.perf_counter(), trainer.steps_done, 0.0
-    feed = measure_waiting(batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
+    feed = measure_waiting(iterate_batches(run.stream, run.reader, trainer.steps_done, run.settings.steps, rank, world))
     for batch, seconds in feed:
         waited += seconds
         try:
             losses = trainer.step(as_tensors(batch), positions)
-        except NotFinite as error:
+        except NonFiniteLossError as error:
             raise ValueError(with_scene_ids(error, run.stream)) from error
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
         if rank == 0 and (step % run.log_every == 0 or last):
@@ -105,7 +105,7 @@ def train_worker(run: TrainingRun, threads: int) -> None:
             started, logged, waited = time.perf_counter(), step, 0.0
 
 
-def with_scene_ids(error: NotFinite, stream: Stream) -> str:
+def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
     """Return the message of a non-finite loss, with the ids of the scenes that caused it."""
     shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
     ids = [
@@ -139,7 +139,7 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
             run.tracker.metrics(values, trainer.steps_done)
         for name, image in pictures.items():
             run.tracker.picture(image, f"{name}/step-{trainer.steps_done:07d}.png")
-    model = trainer.averaged()
+    model = trainer.ema_model()
     tag_weights(run.tracker, model, trainer.steps_done)
     with tempfile.TemporaryDirectory() as directory:
         trainer.save(directory)
@@ -149,7 +149,7 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
 
 def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
     """Tag an MLflow run with its current weights, by which jobs/publish_model.py finds it."""
-    tracker.tag("weights", weights_digest(model))
+    tracker.tag("weights", digest_weights(model))
     tracker.tag("steps", str(steps))
 
 
@@ -213,8 +213,8 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
     Raises:
         ValueError: The name belongs to a run with other options, which has checkpoints.
     """
-    directory = storage.join(storage_path, name)
-    record = storage.join(directory, "identity.json")
+    directory = storage.join_uri(storage_path, name)
+    record = storage.join_uri(directory, "identity.json")
     if storage.exists(record) and (made := storage.read_json(record)) != identity:
         if any("/checkpoint_" in path for path in storage.list_files(directory, ".json")):
             key = next(key for key in sorted(made | identity) if made.get(key) != identity.get(key))
@@ -224,7 +224,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
             )
         storage.delete_directory(directory)  # it has no checkpoint
     storage.write_json(identity, record)
-    return storage.join(directory, "mlflow.json")
+    return storage.join_uri(directory, "mlflow.json")
 
 
 def publish_directory(directory: str, output: str) -> None:
@@ -235,11 +235,11 @@ def publish_directory(directory: str, output: str) -> None:
     for path in sorted(paths, key=lambda path: (path == "model_index.json", path.endswith("config.json"), path)):
         with open(os.path.join(directory, path), "rb") as source:
             storage.write_whole(
-                storage.join(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
+                storage.join_uri(output, path), lambda stream, source=source: shutil.copyfileobj(source, stream)
             )
 
 
-def override_settings(settings: Optimisation, **changes: Any) -> Optimisation:
+def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerConfig:
     """Return the settings with every change that is not None.
 
     Raises:
@@ -252,6 +252,6 @@ def override_settings(settings: Optimisation, **changes: Any) -> Optimisation:
     return replace(settings, **changes)
 
 
-def run_identity(settings: Optimisation, **more: Any) -> dict:
+def run_identity(settings: OptimizerConfig, **more: Any) -> dict:
     """Return the options that determine a run's weights: its optimizer settings and `more`."""
     return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more

@@ -33,7 +33,15 @@ def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
     from jobs.ablate_lvae import Encoding
     from jobs.implementation.ablate_lvae import compare_encodings
 
-    config = Encoding((64, 128), any_footprint_train_sizes=(64,), yaw_only_train_sizes=(32,), num_seeds=1, epochs=1, num_test_boxes=300, num_noisy_boxes=20)
+    config = Encoding(
+        (64, 128),
+        any_footprint_train_sizes=(64,),
+        yaw_only_train_sizes=(32,),
+        num_seeds=1,
+        epochs=1,
+        num_test_boxes=300,
+        num_noisy_boxes=20,
+    )
     output = empty_home / "ablations/encoding"
     assert compare_encodings(config) == str(output)
     assert "mean IoU3D" in capsys.readouterr().out and "octahedral" in (output / "encodings.txt").read_text()

@@ -6,8 +6,8 @@ from PIL import Image
 
 
 def test_paint_job_paints_drive_and_resumes(controlnet_weights, tmp_path, cluster):
-    from jobs.paint_streets import Config
     from jobs.implementation.paint_streets import paint
+    from jobs.paint_streets import Config
 
     drive = tmp_path / "streets" / "drive" / "scene-1"
     (drive / "class_id").mkdir(parents=True)

@@ -15,8 +15,8 @@ from pipelines.schema.tables import find_shards, read_scenes
 
 @pytest.fixture(scope="session")
 def samples(smoke) -> Path:
-    from jobs.sample_scenes import Config
     from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
 
     model, output = str(smoke / "models/pritti-smoke"), smoke / "generated"
     sample(Config(model=model, output=str(output), num_scenes=9, num_inference_steps=10, batch_size=8, num_glb=1))
@@ -24,8 +24,8 @@ def samples(smoke) -> Path:
 
 
 def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path):
-    from jobs.sample_scenes import Config
     from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
     from models.tensors import EXISTENCE_THRESHOLD
 
     model = str(smoke / "models/pritti-smoke")
@@ -41,15 +41,21 @@ def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path
 
 
 def test_sample_resumes_where_it_stopped(smoke, samples):
-    from jobs.sample_scenes import Config
     from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
 
     shards = find_shards(str(samples))
     before = [s.scene_id for s in read_scenes(str(samples))]
     kept, lost = Path(shards[0].path("scenes")), Path(shards[1].path("rasters"))
     stamp = kept.stat().st_mtime_ns
     lost.unlink()
-    config = Config(model=str(smoke / "models/pritti-smoke"), output=str(samples), num_scenes=9, num_inference_steps=10, batch_size=8)
+    config = Config(
+        model=str(smoke / "models/pritti-smoke"),
+        output=str(samples),
+        num_scenes=9,
+        num_inference_steps=10,
+        batch_size=8,
+    )
     sample(config)
     assert kept.stat().st_mtime_ns == stamp and lost.exists()
     assert [s.scene_id for s in read_scenes(str(samples))] == before
@@ -62,8 +68,8 @@ def test_sample_resumes_where_it_stopped(smoke, samples):
 
 
 def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
-    from jobs.sample_scenes import Config
     from jobs.implementation.sample_scenes import sample
+    from jobs.sample_scenes import Config
 
     asked = []
     monkeypatch.setattr("jobs.implementation.sample_scenes.sample_scenes", lambda request, *_: asked.append(request))
@@ -73,8 +79,8 @@ def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
 
 
 def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
-    from jobs.sweep_samplers import Config
     from jobs.implementation.sweep_samplers import sweep_samplers
+    from jobs.sweep_samplers import Config
 
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
@@ -108,13 +114,13 @@ def test_sample_glb_has_named_node_per_primitive(samples):
 
 def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     from jobs.evaluate_scenes import Config
-    from jobs.implementation.evaluate_scenes import evaluate
     from jobs.evaluate_seams import Config as SeamsConfig
+    from jobs.implementation.evaluate_scenes import evaluate
     from jobs.implementation.evaluate_seams import evaluate_seams
-    from jobs.outpaint_scenes import Config as OutpaintConfig
     from jobs.implementation.outpaint_scenes import outpaint
-    from jobs.sweep_seams import Config as SweepConfig
     from jobs.implementation.sweep_seams import sweep_seams
+    from jobs.outpaint_scenes import Config as OutpaintConfig
+    from jobs.sweep_seams import Config as SweepConfig
 
     model = str(smoke / "models/pritti-smoke")
     options = OutpaintConfig(
@@ -198,8 +204,8 @@ def test_sample_loses_no_scene_after_actor_kill(smoke, samples, tmp_path):
 
 
 def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_path):
-    from jobs.outpaint_scenes import Config
     from jobs.implementation.outpaint_scenes import count_blocks
+    from jobs.outpaint_scenes import Config
     from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
     from pipelines.schema.scene_subset import SceneSubset
@@ -244,14 +250,18 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     (outward,) = outpaint_scenes(request("outward", order="outward", last=(1, 0, 0, 0)), chosen).to_pylist()[1:]
     assert outward["ahead"] == 1
     assert count_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != count_blocks(Config(extent_m=(64.0, 65.0)))
-    for wrong in (Config(extent_m=(32.0, 64.0)), Config(blocks_ahead=0, blocks_behind=0, blocks_left=0, blocks_right=0), Config(blocks_ahead=-1)):
+    for wrong in (
+        Config(extent_m=(32.0, 64.0)),
+        Config(blocks_ahead=0, blocks_behind=0, blocks_left=0, blocks_right=0),
+        Config(blocks_ahead=-1),
+    ):
         with pytest.raises(ValueError, match="expected"):
             count_blocks(wrong)
 
 
 def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
-    from jobs.inpaint_scenes import Config
     from jobs.implementation.inpaint_scenes import inpaint
+    from jobs.inpaint_scenes import Config
 
     config = Config(
         model=str(smoke / "models/pritti-smoke"),

@@ -8,8 +8,8 @@ import numpy as np
 from helpers import SvgPage
 from PIL import Image
 
+from jobs.implementation.inspect_scenes import draw_sheet, write_dataset_report
 from jobs.inspect_scenes import Report, Sheet
-from jobs.implementation.inspect_scenes import draw_sheet, write_dataset_report as write_page
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.reporting.contact_sheet import View, paint_scene
 from pipelines.reporting.scene_index import Catalogue
@@ -25,7 +25,9 @@ def test_paint_tasks_equal_direct_rendering(cluster, town_dataset, tmp_path):
     for k, (above, oblique) in zip(chosen, painted, strict=True):
         assert np.array_equal(above, render_bev(scenes[names[k]], 96, supersample=2))
         assert np.array_equal(oblique, render_3d(scenes[names[k]], 80, 60))
-    config = Sheet(dataset=town_dataset, split="train", sort="vegetation", size_px=96, output=str(tmp_path / "sheet.png"))
+    config = Sheet(
+        dataset=town_dataset, split="train", sort="vegetation", size_px=96, output=str(tmp_path / "sheet.png")
+    )
     sheet = np.asarray(Image.open(draw_sheet(config)))
     order = Catalogue.read(town_dataset, split="train").choose(8, "vegetation")
     picture = render_bev(
@@ -36,7 +38,7 @@ def test_paint_tasks_equal_direct_rendering(cluster, town_dataset, tmp_path):
 
 
 def test_report_job_shows_scenes(cluster, town_dataset, tmp_path):
-    path = write_page(
+    path = write_dataset_report(
         Report(dataset=town_dataset, source="town", split="test", num_examples=2, output=str(tmp_path / "p.html"))
     )
     page = SvgPage(Path(path).read_text("utf-8"))

@@ -17,7 +17,12 @@ def evaluated(smoke) -> Path:
 
     sample(
         sample_scenes.Config(
-            num_scenes=6, run="judged", sampler="dpm++", num_inference_steps=2, noise_scaling=1.01, existence_threshold=0.25
+            num_scenes=6,
+            run="judged",
+            sampler="dpm++",
+            num_inference_steps=2,
+            noise_scaling=1.01,
+            existence_threshold=0.25,
         )
     )
     real, lvae = str(smoke / "datasets/smoke"), str(smoke / "models/lvae-smoke")
@@ -29,8 +34,8 @@ def evaluated(smoke) -> Path:
 
 
 def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
-    from jobs.publish_model import Config
     from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
     from jobs.support.model_directories import pipeline_directory
     from pipelines.generation.sample import load_pipeline
 
@@ -67,8 +72,8 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
 
 
 def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path):
-    from jobs.publish_model import Config
     from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
 
     with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
         publish(Config(name="none", evaluation=str(tmp_path)))
@@ -99,8 +104,8 @@ def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path
 
 
 def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatch, tmp_path):
-    from jobs.publish_model import Config
     from jobs.implementation.publish_model import publish
+    from jobs.publish_model import Config
 
     first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
@@ -121,9 +126,9 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     import torch
 
     from jobs.implementation.publish_model import history
+    from jobs.implementation.train_dit import prepare
     from jobs.support.trainer import as_tensors, tag_weights
     from jobs.train_dit import Config
-    from jobs.implementation.train_dit import prepare
     from pipelines.generation.sample import load_pipeline
     from pipelines.training.data_loader import iterate_batches
     from pipelines.training.latents import digest_weights

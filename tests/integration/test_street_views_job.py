@@ -24,8 +24,8 @@ def town_scenes() -> list[Scene]:
 def test_street_view_and_export_jobs_process_table(town_scenes, tmp_path, cluster):
     from jobs.export_scenes import Config as ExportConfig
     from jobs.implementation.export_scenes import export
-    from jobs.render_streets import Config
     from jobs.implementation.render_streets import render
+    from jobs.render_streets import Config
 
     nothing = np.zeros_like(town_scenes[1].occupied)
     bare = replace(town_scenes[1], scene_id="bare", occupied=nothing, height_m=np.zeros(nothing.shape, np.float32))

@@ -101,8 +101,8 @@ def test_studio_rejects_foreign_pages_and_hosts(studio_url):
 
 
 def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
-    from jobs.serve_studio import Config
     from jobs.implementation.serve_studio import serve
+    from jobs.serve_studio import Config
 
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

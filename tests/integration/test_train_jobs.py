@@ -58,8 +58,8 @@ def test_train_logs_run_and_model_to_mlflow(home):
 
 
 def test_train_lvae_leaves_finished_run_unchanged(home):
-    from jobs.train_lvae import Config
     from jobs.implementation.train_lvae import train
+    from jobs.train_lvae import Config
 
     before = weights(home / "models/lvae-smoke")
     train(Config(preset="smoke"))
@@ -71,9 +71,9 @@ def test_train_lvae_leaves_finished_run_unchanged(home):
 
 def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
     """A worker is killed during training; Ray Train starts another from the last checkpoint."""
+    from jobs.implementation.train_lvae import prepare
     from jobs.support.trainer import fit
     from jobs.train_lvae import Config
-    from jobs.implementation.train_lvae import prepare
 
     marker, seen = str(tmp_path / "died"), tmp_path / "validated"
     run = prepare(Config(preset="smoke", name="lvae-killed", checkpoint_every=3))
@@ -96,9 +96,9 @@ def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
 
 def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monkeypatch):
     import jobs.support.trainer
+    from jobs.implementation.train_dit import prepare, train
     from jobs.support.trainer import fit
     from jobs.train_dit import Config
-    from jobs.implementation.train_dit import prepare, train
 
     seen = tmp_path / "validated"
 
@@ -130,8 +130,8 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
 
 
 def test_train_lvae_with_two_workers_matches_one(home):
-    from jobs.train_lvae import Config
     from jobs.implementation.train_lvae import train
+    from jobs.train_lvae import Config
 
     output = train(Config(preset="smoke", name="lvae-two", num_workers=2))
     one, two = weights(home / "models/lvae-smoke"), weights(Path(output))
@@ -140,8 +140,8 @@ def test_train_lvae_with_two_workers_matches_one(home):
 
 
 def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
-    from jobs.train_lvae import Config
     from jobs.implementation.train_lvae import train
+    from jobs.train_lvae import Config
 
     kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
     assert train(Config(preset="smoke", name="decoder", train_object_decoder_of=str(kept))) == str(output)
@@ -165,8 +165,8 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
 def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
     from jobs.encode_latents import Config
     from jobs.implementation.encode_latents import encode
-    from jobs.preprocess_scenes import Town
     from jobs.implementation.preprocess_scenes import main
+    from jobs.preprocess_scenes import Town
 
     main(Town(output=str(tmp_path), num_train=8, num_test=8, seed=5))
     with pytest.raises(ValueError, match=r"lvae-smoke has another LayoutSpec: \w+ is .*, expected .*; use the dataset"):
@@ -175,8 +175,8 @@ def test_encode_rejects_lvae_of_another_dataset(home, tmp_path):
 
 
 def test_train_lvae_names_truncated_shard(home, tmp_path):
-    from jobs.train_lvae import Config
     from jobs.implementation.train_lvae import train
+    from jobs.train_lvae import Config
 
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
     for shard in find_shards(str(tmp_path / "data"), split="train"):

@@ -26,8 +26,8 @@ def town_scenes(town_drive_3) -> list:
 
 
 def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config
     from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     meshes, output = tmp_path / "meshes", tmp_path / "out"
     for k, scene in enumerate(town_scenes):
@@ -65,15 +65,17 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
 def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
     from jobs.implementation.evaluate_scenes import evaluate
-    from jobs.import_scenes import Config
     from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(export_glb(scene))
     output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
-    scores = evaluate(EvaluateConfig(real, "test", output, balance_labels=False, output=str(tmp_path / "scores"), num_actors=1))
+    scores = evaluate(
+        EvaluateConfig(real, "test", output, balance_labels=False, output=str(tmp_path / "scores"), num_actors=1)
+    )
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
     assert generation["random_frechet"]["value"] < 1e-4  # identical images
@@ -81,8 +83,8 @@ def test_evaluate_scores_imported_scenes(smoke, tmp_path):
 
 
 def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
-    from jobs.import_scenes import Config
     from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     for k, scene in enumerate(town_scenes[:3]):
         write_voxels(str(tmp_path / "in" / f"scene{k}.npz"), scene)
@@ -106,8 +108,8 @@ def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
 
 
 def test_import_rejects_input_without_scenes(cluster, tmp_path):
-    from jobs.import_scenes import Config
     from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
 
     (tmp_path / "a.glb").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"none of the 1 files could be read; the first: .*a\.glb"):

@@ -276,13 +276,13 @@ def test_variant_names_are_valid_for_files_and_mlflow():
 
 
 def test_study_without_trials_releases_its_directory(tmp_path):
-    from jobs.implementation.ablate_lvae import guard_study as claim
+    from jobs.implementation.ablate_lvae import guard_study
 
-    claim(str(tmp_path), {"dataset": "/nowhere"})
+    guard_study(str(tmp_path), {"dataset": "/nowhere"})
     (tmp_path / "mlflow.json").write_text("{}")
-    claim(str(tmp_path), {"dataset": "/somewhere"})
+    guard_study(str(tmp_path), {"dataset": "/somewhere"})
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "cells-seed0.json").write_text("{}")
-    claim(str(tmp_path), {"dataset": "/somewhere"})
+    guard_study(str(tmp_path), {"dataset": "/somewhere"})
     with pytest.raises(ValueError, match="holds a study with dataset=/somewhere, asked for /nowhere"):
-        claim(str(tmp_path), {"dataset": "/nowhere"})
+        guard_study(str(tmp_path), {"dataset": "/nowhere"})

@@ -44,8 +44,8 @@ def test_painter_depends_on_image_prompt_and_seed(controlnet_weights):
 
 
 def test_painter_names_missing_weights(controlnet_weights, tmp_path):
-    from jobs.paint_streets import Config
     from jobs.implementation.paint_streets import paint
+    from jobs.paint_streets import Config
 
     with pytest.raises(ValueError, match="--diffusion is missing"):
         paint(Config(controlnet=controlnet_weights[1]))

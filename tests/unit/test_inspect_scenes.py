@@ -12,8 +12,8 @@ import trimesh
 from helpers import REJECT_REASON, TOWN_SLOTS, SvgPage, random_scene
 from scipy.spatial import ConvexHull
 
+from jobs.implementation.inspect_scenes import draw_scenes, write_dataset_report
 from jobs.inspect_scenes import OneScene, Report
-from jobs.implementation.inspect_scenes import draw_scenes, write_dataset_report as write_page
 from models.scene import CATEGORIES, ELLIPSOID, Grid
 from pipelines.io.mesh_export import triangulate_cuboids, triangulate_ellipsoids
 from pipelines.rendering.render import render_3d, render_bev
@@ -253,7 +253,7 @@ def test_dataset_maps_of_many_sequences_fit_page(sequences):
 
 
 def test_dataset_page_works_without_dataset_json(generated, tmp_path):
-    path = write_page(Report(dataset=generated, pictures=0, output=str(tmp_path / "page.html")))
+    path = write_dataset_report(Report(dataset=generated, num_examples=0, output=str(tmp_path / "page.html")))
     page = SvgPage(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
     for absent in ("p95", "slots", "Split map", "Label thresholds", "Rejected"):
@@ -266,8 +266,8 @@ def test_dataset_page_works_without_dataset_json(generated, tmp_path):
 
 
 def test_draw_scenes_runs_without_ray(generated, tmp_path, monkeypatch):
-    monkeypatch.setattr("jobs.inspect_scenes.start_ray", None)
-    written = draw_scenes(OneScene(dataset=generated, count=2, seed=1, glb=True, output=str(tmp_path)))
+    monkeypatch.setattr("jobs.implementation.inspect_scenes.start_ray", None)
+    written = draw_scenes(OneScene(dataset=generated, max_scenes=2, seed=1, glb=True, output=str(tmp_path)))
     assert sorted(path.rsplit(".", 1)[1] for path in written) == ["glb", "glb", "png", "png"]
     names = [path.rsplit("/", 1)[1].removesuffix(".png") for path in written if path.endswith(".png")]
     assert set(names) <= {f"generated-x-0-{k}" for k in range(4)} and len(set(names)) == 2
@@ -275,7 +275,7 @@ def test_draw_scenes_runs_without_ray(generated, tmp_path, monkeypatch):
     assert sum(re.fullmatch(r"[a-z_]+_\d{4}", node) is not None for node in nodes) == 9
     (again,) = draw_scenes(OneScene(ids=(names[0],), dataset=generated, output=str(tmp_path / "again")))
     assert Path(again).read_bytes() == (tmp_path / f"{names[0]}.png").read_bytes()
-    with pytest.raises(ValueError, match="--count is 0, expected at least 1"):
-        draw_scenes(OneScene(dataset=generated, count=0))
+    with pytest.raises(ValueError, match="--max-scenes is 0, expected at least 1"):
+        draw_scenes(OneScene(dataset=generated, max_scenes=0))
     with pytest.raises(ValueError, match="no split=test; there are source="):
         draw_scenes(OneScene(dataset=generated, split="test"))

@@ -17,6 +17,7 @@ from models.lvae import LayoutVAE
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
 from models.tensors import encode_layout, make_layout_batch
 from models.training import ExecutionConfig, OptimizerConfig, Trainer, make_lvae_trainer, sample_corruption
+from models.vae.config import nest_flat_options, override_options
 from models.vae.ground import (
     HEIGHT_WEIGHT,
     LOGITS_PER_PX,
@@ -282,7 +283,6 @@ def test_losses_equal_their_equations():
     assignment = match_primitives(features, logit, truth, real, spec.slots, spec.slots)
     got = [float(v) for v in compute_object_losses(features, logit, truth, real, assignment, spec, spec.slots)]
 
-    from models.vae.config import nest_flat_options, override_options
     from models.vae.losses import OBJECT_WEIGHTS
 
     want = np.zeros(3)
@@ -379,7 +379,9 @@ def test_latent_noise_is_per_sample_with_stated_scale():
 
 
 def test_lvae_retrains_more_proposals_on_same_latents():
-    old, new = (small_lvae(shortcut=True, objects={"decoder": "cells", "min_proposals_per_cell": least}) for least in (1, 3))
+    old, new = (
+        small_lvae(shortcut=True, objects={"decoder": "cells", "min_proposals_per_cell": least}) for least in (1, 3)
+    )
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
     new.freeze_all_but_object_decoder(old.state_dict())
     with torch.no_grad():

@@ -129,8 +129,8 @@ def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
 
 
 def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch):
-    from jobs.support.tracking import client, tracking_uri
     from jobs.support.scores import publish_scores
+    from jobs.support.tracking import client, tracking_uri
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
