@@ -46,7 +46,7 @@ def main() -> None:
     for label in ("low", "medium", "high"):
         pipeline.use_sampler("dpm++")
         made[label] = pipeline.generate([label], seed=SEED, num_inference_steps=20)[0]
-    larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, resampling=RePaintConfig.guided())
+    larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, repaint=RePaintConfig.guided())
     above = stacked([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stacked(street_views(larger), 0)
     below = stacked([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
