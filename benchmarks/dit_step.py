@@ -55,7 +55,7 @@ def products(dit: DiT, batch: int) -> Callable[[], None]:
 @torch.inference_mode()
 def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel, batch: int, rounds: int) -> None:
     """Prints the time of a step each way."""
-    c, timesteps = ours.config, Diffusion().visited(250).tolist()
+    c, timesteps = ours.config, Diffusion().select_timesteps(250).tolist()
     latent, label = torch.randn(batch, c.channels, c.size, c.size), torch.arange(batch) % 3
     at = [torch.full((batch,), t) for t in timesteps]
     start = time.perf_counter()

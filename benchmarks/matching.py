@@ -50,7 +50,7 @@ def main() -> None:
         given = (features, logit, truth.features, truth.real, spec.slots, spec.slots, PAPER_WEIGHTS)
         found: dict[str, torch.Tensor] = {}
         ways = {
-            "padded": lambda _, given=given, found=found: found.update(padded=plain.match(*given)),
+            "padded": lambda _, given=given, found=found: found.update(padded=plain.match_primitives(*given)),
             "ours": lambda _, given=given, found=found: found.update(ours=match_primitives(*given)),
         }
         torch.set_num_threads(1)

@@ -35,8 +35,8 @@ def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
 
 
 @torch.no_grad()
-def match(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
-    """As models.vae.matching.match."""
+def match_primitives(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
+    """As models.vae.matching.match_primitives."""
     assignment = torch.full(logit.shape, -1, dtype=torch.long)
     for sample in range(len(features)):
         slot = proposal = 0
@@ -52,8 +52,8 @@ def match(features, logit, truth, real, slots, proposals, weights) -> torch.Tens
     return assignment
 
 
-def object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
-    """As models.vae.losses.object_losses."""
+def compute_object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
+    """As models.vae.losses.compute_object_losses."""
     totals = [features.new_zeros(()) for _ in range(3)]
     batch = len(features)
     for sample in range(batch):
@@ -79,8 +79,8 @@ def object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, pr
 @contextlib.contextmanager
 def in_place_of_ours():
     """Within, the objective and the object encoder are the plain ones."""
-    kept = losses.match, losses.compute_object_losses, ObjectEncoder.without_padding
-    losses.match, losses.compute_object_losses = match, object_losses
+    kept = losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding
+    losses.match_primitives, losses.compute_object_losses = match_primitives, compute_object_losses
     ObjectEncoder.without_padding = lambda self, features, real: (
         features,
         real,
@@ -89,7 +89,7 @@ def in_place_of_ours():
     try:
         yield
     finally:
-        losses.match, losses.compute_object_losses, ObjectEncoder.without_padding = kept
+        losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding = kept
 
 
 def total_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:

@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
 
-from models.pipeline import scheduler
 from models.sampling.diffusion import Diffusion, sample_with_scheduler
-from models.sampling.schedulers import SAMPLERS
+from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 
 DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of these
 STEPS = (10, 20, 25, 50)
@@ -39,9 +38,10 @@ def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
 
 def main() -> None:
     warnings.filterwarnings("ignore", module="diffusers")
-    base = scheduler().config
-    ways = {name: kind.from_config(base, **options) for name, (kind, options) in SAMPLERS.items()}
-    del ways["ddpm"], ways["sde-dpm++"]  # noise on the way
+    paper = SchedulerConfig.ddpm()
+    base = paper.config
+    # The other samplers add noise.
+    ways = {name: paper.with_sampler(name).build() for name in SAMPLERS if name not in ("ddpm", "sde-dpm++")}
     ways |= {f"DDIM, {way}": DDIMScheduler.from_config(base, timestep_spacing=way) for way in ("trailing", "linspace")}
     dpm = DPMSolverMultistepScheduler
     ways |= {

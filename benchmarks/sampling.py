@@ -26,8 +26,9 @@ from models.dit import DiT
 from models.labels import LABELS
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.pipeline import PrITTIPipeline, scheduler
+from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS
+from models.sampling.schedulers import SchedulerConfig
 from pipelines.generation.sample import load_pipeline
 from pipelines.schema.tables import Shard
 
@@ -48,7 +49,7 @@ def untrained(preset: str) -> PrITTIPipeline:
     lvae = LayoutVAE(layout=LayoutSpec().with_resolution(vae.raster_px).to_dict(), **vae.architecture())
     channels, size, _ = lvae.latent_shape
     dit = DiT(**row.architecture(), channels=channels, size=size, layout=dict(lvae.config.layout))
-    pipeline = PrITTIPipeline(lvae, dit, scheduler())
+    pipeline = PrITTIPipeline(lvae, dit, SchedulerConfig.ddpm())
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
 
@@ -69,7 +70,7 @@ def main(config: Config) -> None:
         marks = [clock()]
         latents = pipeline.sample_latents(labels, number, range(config.batch), config.steps)
         marks.append(clock())
-        identities = [pipeline.identity("run", number, k, label) for k, label in enumerate(labels)]
+        identities = [pipeline.new_identity("run", number, k, label) for k, label in enumerate(labels)]
         scenes = pipeline.decode(latents, identities)
         marks.append(clock())
         with tempfile.TemporaryDirectory() as directory:
