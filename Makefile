@@ -64,4 +64,4 @@ browser:
 	touch $@
 
 clean:
-	rm -rf .venv runs build *.egg-info .coverage
+	rm -rf .venv runs build dist *.egg-info .coverage
