@@ -1,4 +1,4 @@
-"""What benchmarks share: the machine and commit in words, A against B interleaved, raw data to work on."""
+"""Shared by the benchmarks: a description of the machine, interleaved timing and raw data."""
 
 from __future__ import annotations
 
@@ -18,14 +18,18 @@ DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives
 
 
 def where() -> str:
-    """Machine, versions and commit in one line."""
-    return f"{provenance.describe_machine()}, {provenance.list_versions()}, numpy {np.__version__}, commit {provenance.find_commit()}"
+    """Describe the machine, versions and commit in one line."""
+    machine, versions, commit = provenance.describe_machine(), provenance.list_versions(), provenance.find_commit()
+    return f"{machine}, {versions}, numpy {np.__version__}, commit {commit}"
 
 
 def interleaved(
     ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, list[float]]:
-    """CPU seconds (or `clock`'s) of each way per round, in turn: a busy machine slows all alike. Called with the round."""
+    """Time each way once per round, in turn, so that a busy machine slows all of them.
+
+    Each way is called with the number of the round. Returns seconds by way, of the CPU or of `clock`.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for k in range(rounds):
         for name, way in ways.items():
@@ -36,18 +40,18 @@ def interleaved(
 
 
 def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
-    """median (lowest to highest)."""
+    """Format values as median (lowest to highest)."""
     low, middle, high = (scale * f(values) for f in (min, statistics.median, max))
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
-    """How many times longer `slow` took than `fast`, round by round."""
+    """Format the ratios of `slow` to `fast`, round by round."""
     return spread([a / b for a, b in zip(slow, fast, strict=True)], digits=digits) + " x"
 
 
 def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
-    """The drive with poses every `spacing_m` along its path, as KITTI-360 has them (0.3 to 1.1 m)."""
+    """Return the drive with poses every `spacing_m` along its path, as KITTI-360 has them (0.3 to 1.1 m)."""
     xyz = drive.world_from_imu[:, :, 3]
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(xyz, axis=0), axis=1).cumsum()])
     at = np.arange(0, along[-1], spacing_m)
@@ -58,7 +62,7 @@ def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
 
 
 def write_raw(root: Path, seeds: tuple[int, ...] = DENSE_SEEDS, spacing_m: float = 1.0) -> None:
-    """KITTI-360's own files of dense towns under ROOT, one sequence each; nothing is redone."""
+    """Write dense towns as KITTI-360's own files under `root`, one sequence each; existing ones are kept."""
     for seed in seeds:
         if not (root / f"data_poses/2013_05_28_drive_{seed:04d}_sync/poses.txt").exists():
             write_kitti360(with_dense_poses(generate_town(seed), spacing_m), root)

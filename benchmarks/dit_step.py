@@ -1,10 +1,12 @@
-"""A denoising step of the diffusion transformer on the CPU: ours, the original's code with the same weights, diffusers' class.
+"""Time a denoising step of the diffusion transformer on the CPU.
+
+Compares ours, the original's code with the same weights, and diffusers' class.
 
 python benchmarks/dit_step.py                      DiT-B, batch 1 and 8; some minutes
 python benchmarks/dit_step.py --preset kitti360-l --batches 1
 
-All in turn, by the clock. Also: the share of the roof that the matrix products set, and guidance at scale 1 against a
-batch that is always doubled.
+Times are wall-clock seconds, measured in turn. Also compares ours with its matrix products alone, which bound it from
+below, and guidance at scale 1 with a batch that is always doubled.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class Config:
 
 
 def products(dit: DiT, batch: int) -> Callable[[], None]:
-    """The matrix products of a step alone, each as one call on inputs that are there: what no code on this machine is below."""
+    """Return a function that runs only the matrix products of a step: a lower bound of its time on this machine."""
     c, tokens = dit.config, (dit.config.size // dit.config.patch) ** 2
     wide, deep = torch.randn(batch * tokens, c.width), torch.randn(batch * tokens, 4 * c.width)
     q = torch.randn(batch, c.heads, tokens, c.width // c.heads)
@@ -54,7 +56,7 @@ def products(dit: DiT, batch: int) -> Callable[[], None]:
 
 @torch.inference_mode()
 def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel, batch: int, rounds: int) -> None:
-    """Prints the time of a step each way."""
+    """Print the time of a step for each way."""
     c, timesteps = ours.config, Diffusion().select_timesteps(250).tolist()
     latent, label = torch.randn(batch, c.channels, c.size, c.size), torch.arange(batch) % 3
     at = [torch.full((batch,), t) for t in timesteps]
@@ -86,7 +88,7 @@ def main(config: Config) -> None:
     print(where(), f"{config.threads} threads")
     torch.manual_seed(0)
     ours = DiT(**DIT_PRESETS[config.preset].architecture()).eval().requires_grad_(False)
-    for parameter in ours.parameters():  # zeros, as at the start, would hide most of the network
+    for parameter in ours.parameters():  # with the initial zeros, most of the network would have no effect
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.02)
     c = ours.config

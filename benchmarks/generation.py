@@ -1,7 +1,7 @@
-"""Precision and recall, and FID, of 2048-d features: filter and verify, and eigenvalues, against ADM's formulas as written.
+"""Time precision, recall and FID of 2048-d features against ADM's formulas as written.
 
-python benchmarks/generation.py                      both against ADM at 1,000 samples a side, ours also at 10,000
-python benchmarks/generation.py --samples 61913      ours at that number alone, over Ray: memory and time
+python benchmarks/generation.py                      1,000 samples a side with both, 10,000 with ours
+python benchmarks/generation.py --samples 61913      ours only, on Ray: memory and time
 
 Two kinds of features: with a spectrum that falls as Inception's does (2,048 dimensions, most of the variance in a few
 dozen), and isotropic noise, the worst case, in which every distance is about the same. Wall-clock seconds, all cores.
@@ -37,7 +37,10 @@ def features(count: int, seed: int, falling: bool) -> np.ndarray:
 
 
 def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
-    """As ADM's evaluator: distances |x|^2 - 2 x.y + |y|^2 in float16, whole rows sorted for the radius."""
+    """Compute precision and recall as ADM's evaluator does.
+
+    Distances are |x|^2 - 2 x.y + |y|^2 in float16, and whole rows are sorted to find the radius.
+    """
     sides = [torch.from_numpy(side).half() for side in (real, generated)]
 
     def distances(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -52,7 +55,7 @@ def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) ->
 
 
 def adm_frechet(a: Moments, b: Moments) -> float:
-    """By a general matrix square root."""
+    """Compute the Frechet distance with a general matrix square root, as ADM does."""
     root = scipy.linalg.sqrtm(a.covariance @ b.covariance).real
     return float(np.square(a.mean - b.mean).sum() + np.trace(a.covariance + b.covariance - 2 * root))
 
@@ -72,7 +75,8 @@ def against_adm() -> None:
         time.perf_counter,
     )
     print(
-        f"precision and recall, 1,000 a side: ADM {spread(found['ADM'])} s, ours {spread(found['ours'])} s: {ratios(*found.values())}"
+        f"precision and recall, 1,000 a side: ADM {spread(found['ADM'])} s, ours {spread(found['ours'])} s: "
+        f"{ratios(*found.values())}"
     )
     theirs, ours = adm_precision_recall(real, generated), compute_neighbourhoods(real, generated)[0]
     print(f"  ADM {theirs[0]:.4f} {theirs[1]:.4f}, ours, exact, {ours.precision:.4f} {ours.recall:.4f}")
@@ -83,7 +87,8 @@ def against_adm() -> None:
         time.perf_counter,
     )
     print(
-        f"FID from moments: sqrtm {spread(found['sqrtm'])} s, eigenvalues {spread(found['eigenvalues'])} s: {ratios(*found.values())}"
+        f"FID from moments: sqrtm {spread(found['sqrtm'])} s, eigenvalues {spread(found['eigenvalues'])} s: "
+        f"{ratios(*found.values())}"
     )
     print(f"  relative difference {abs(adm_frechet(a, b) / compute_frechet_distance(a, b) - 1):.1e}")
 

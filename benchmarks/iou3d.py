@@ -1,4 +1,4 @@
-"""Exact IoU3D of rotated boxes: pairs per second and errors; sampled IoU3D of ellipsoids: the same.
+"""Measure speed and errors of exact IoU3D of rotated boxes and of sampled IoU3D of ellipsoids.
 
 python benchmarks/iou3d.py
 
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def overlapping_pairs() -> None:
-    """Arbitrarily rotated boxes that truly overlap: ours against manifold3d, per pair."""
+    """Time overlapping boxes of any rotation: ours against manifold3d, per pair."""
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
     kept = np.flatnonzero(compute_iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
@@ -59,11 +59,14 @@ def overlapping_pairs() -> None:
     seconds = interleaved(ways, ROUNDS)
     ours, theirs = ([s / n for s in seconds[name]] for name, n in (("ours", len(kept)), ("manifold3d", len(few))))
     rates = [[1e-3 / s for s in per_pair] for per_pair in (ours, theirs)]
-    print(f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}")  # fmt: skip
+    print(
+        f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, "
+        f"manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}"
+    )
 
 
 def whole_scenes() -> None:
-    """Every predicted with every true box of a scene, most of them culled: by their bounds, and in AP3D by category."""
+    """Time all pairs of predicted and true boxes of a scene; bounds cull most of them, in AP3D also categories."""
     rng = np.random.default_rng(1)
     scenes = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
     truths = [(extract_boxes(scene), scene.category) for scene in scenes]
@@ -78,13 +81,24 @@ def whole_scenes() -> None:
             survive = sum(
                 int(mask[find_overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
             )
-            seconds = interleaved({kind: lambda _, s=sides, w=masks: [compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)]}, ROUNDS)[kind]  # fmt: skip
+            seconds = interleaved(
+                {
+                    kind: lambda _, s=sides, w=masks: [
+                        compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)
+                    ]
+                },
+                ROUNDS,
+            )[kind]
             per_scene = [1e3 * s / len(sides) for s in seconds]
-            print(f"{name}, {kind}: {spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, {100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene")  # fmt: skip
+            print(
+                f"{name}, {kind}: "
+                f"{spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, "
+                f"{100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene"
+            )
 
 
 def errors() -> None:
-    """Errors of IoU against manifold3d; where that differs by more than the tolerance, half-space intersection decides."""
+    """Print errors against manifold3d, or against half-space intersection where manifold3d is off the tolerance."""
     print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
     total = wrong = 0
     for name, (a, b) in pairs(np.random.default_rng(0)).items():
@@ -101,7 +115,7 @@ def errors() -> None:
 
 
 def ellipsoids() -> None:
-    """Sampled on 4,096 points: spheres in closed form, stretched alike, which keeps IoU and makes them ellipsoids."""
+    """Print errors against the closed form of spheres; stretching both makes ellipsoids and keeps the IoU."""
     rng, n = np.random.default_rng(2), 2_000
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
     lens = sphere_lens(*radius, distance)
@@ -114,7 +128,11 @@ def ellipsoids() -> None:
     ]
     error = compute_ellipsoid_iou3d_pairs(*sides) - exact
     seconds = interleaved({"ours": lambda _: compute_ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
-    print(f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, root mean square {np.sqrt(np.mean(error**2)):.5f}; {spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core")  # fmt: skip
+    print(
+        f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, "
+        f"root mean square {np.sqrt(np.mean(error**2)):.5f}; "
+        f"{spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core"
+    )
     real = [s.select(s.category == ELLIPSOID) for s in (generate_town(seed).scene(100) for seed in DENSE_SEEDS)]
     pair = [(extract_boxes(s), disturbed(rng, extract_boxes(s), 0.1)) for s in real if len(s)]
     survive = [len(find_overlapping_bounds(a, b)[0]) for a, b in pair]

@@ -1,4 +1,4 @@
-"""What a layout VAE's decoders make of latents that are a little off, as a diffusion model's are.
+"""Evaluate how well a layout VAE decodes latents with small errors, as sampled latents have them.
 
 python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
 
@@ -43,7 +43,7 @@ class Config:
 
 
 def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
-    """Scenes from their posterior means with noise of so many deviations; ids and labels stay."""
+    """Decode posterior means with noise of the given number of deviations; ids and labels are kept."""
     generator = torch.Generator().manual_seed(seed)
     made = []
     for scene in scenes:
@@ -55,7 +55,7 @@ def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> li
 
 
 def said(scenes: list[Scene], dataset: Dataset) -> str:
-    """Mean counts of the categories that there are, and how valid scenes are."""
+    """Format mean counts of the categories and the validity of scenes."""
     offset_m = find_slab_offset_m(dataset.spec.surface)
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
     found = compute_validity_rates(np.array([compute_scene_validity(scene, offset_m) for scene in scenes]))

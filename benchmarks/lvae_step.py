@@ -1,6 +1,6 @@
-"""A training step of the layout VAE: where its time goes, and against the plain version of its objective.
+"""Time a training step of the layout VAE by part, and against the plain version of its objective.
 
-The comparison is made with the paper's DETR decoder: nobody would pad to the thousands of proposals of the cells.
+The comparison uses the paper's DETR decoder: padding to the thousands of proposals of the cells would be unfair.
 
 python benchmarks/lvae_step.py                   town, batch 8, and kitti360, batch 2; several minutes
 python benchmarks/lvae_step.py --presets town
@@ -34,7 +34,7 @@ class Config:
 
 
 def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch.Tensor) -> dict[str, float]:
-    """Seconds of one step by part."""
+    """Run one step and return the seconds of its parts, and its loss."""
     clock = time.perf_counter()
     seconds = {}
 
@@ -92,7 +92,7 @@ def main(config: Config) -> None:
                 with plain.in_place_of_ours() if way == "plain" else contextlib.nullcontext():
                     rounds[way].append(step(*trained, batch, noise))
             assert abs(rounds["ours"][k]["loss"] / rounds["plain"][k]["loss"] - 1) < 1e-3, "not the same objective"
-        rounds = {way: found[1:] for way, found in rounds.items()}  # the first warms up
+        rounds = {way: found[1:] for way, found in rounds.items()}  # the first round warms up
         total = {
             way: [sum(v for part, v in r.items() if part != "loss") for r in found] for way, found in rounds.items()
         }

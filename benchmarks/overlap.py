@@ -1,10 +1,10 @@
-"""What a block knows of a neighbour 32 m back: the shifted latent (`copy`, the paper) against encoding anew (`reencode`).
+"""Compare known latents of a block: shifted from its neighbour (`copy`, the paper) or re-encoded (`reencode`).
 
 python benchmarks/overlap.py --lvae DIRECTORY
 
-Real pairs: both blocks are cut from the same town, 32 m apart along the street. The second one's known half comes from the
-first, its new half is the truth's; then it is decoded, and its known half compared with the truth. "own latent" is the
-ceiling: the second block encoded as a whole.
+Both blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent comes
+from the first block, the new half from the true scene. It is decoded, and its known half is compared with the true
+scene. "own latent" is the upper bound: the second block encoded as a whole.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Config:
 
 
 def pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
-    """Scenes of a town and those 32 m ahead of each, in a frame of their own with the same heading and height."""
+    """Return scenes of a town and the scenes 32 m ahead, each in its own frame with the same heading and height."""
     drive, grid = generate_town(seed), Grid()
     large = replace(grid, front_m=grid.front_m + STEP_M, rows=grid.rows + round(STEP_M / grid.resolution_m))
     found = []
@@ -54,7 +54,7 @@ def pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
 
 @torch.inference_mode()
 def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str, float]]:
-    """Drift of the second block's known half, by way."""
+    """Print the drift of the known half of the second block for each way."""
     spec = lvae.spec
 
     def encode(scenes: Sequence[Scene]) -> torch.Tensor:

@@ -1,7 +1,7 @@
-"""The layout VAE's objective as one would write it first from the paper: the yardstick of the other benchmarks.
+"""The layout VAE's objective written in the obvious way from the paper: the baseline of the other benchmarks.
 
-Matching pads the truth to as many rows as there are proposals and fills whole cost tensors; losses go sample by sample
-and category by category; the object encoder computes on padded slots too. Same values, more work.
+Matching pads the true primitives to the number of proposals and fills whole cost tensors. Losses loop over samples and
+categories. The object encoder computes padded slots, too. The values are the same at a higher cost.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from models.vae.objects import ObjectEncoder
 
 
 def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
-    """(n, n) cost of every pair of one sample and category, truth padded to n rows (supplement Eq. "match")."""
+    """Compute the (n, n) costs of one sample and category, truth padded to n rows (supplement Eq. "match")."""
     n, missing = len(features), len(features) - len(truth)
     truth = F.pad(truth, (0, 0, 0, missing))
     real = F.pad(real, (0, missing))
@@ -36,7 +36,7 @@ def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
 
 @torch.no_grad()
 def match_primitives(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
-    """As models.vae.matching.match_primitives."""
+    """Match as models.vae.matching.match_primitives does."""
     assignment = torch.full(logit.shape, -1, dtype=torch.long)
     for sample in range(len(features)):
         slot = proposal = 0
@@ -53,7 +53,7 @@ def match_primitives(features, logit, truth, real, slots, proposals, weights) ->
 
 
 def compute_object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
-    """As models.vae.losses.compute_object_losses."""
+    """Compute the losses as models.vae.losses.compute_object_losses does."""
     totals = [features.new_zeros(()) for _ in range(3)]
     batch = len(features)
     for sample in range(batch):
@@ -78,7 +78,7 @@ def compute_object_losses(features, logit, truth, real, assignment, spec: Layout
 
 @contextlib.contextmanager
 def in_place_of_ours():
-    """Within, the objective and the object encoder are the plain ones."""
+    """Context in which the objective and the object encoder are the plain ones."""
     kept = losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding
     losses.match_primitives, losses.compute_object_losses = match_primitives, compute_object_losses
     ObjectEncoder.without_padding = lambda self, features, real: (
@@ -93,7 +93,7 @@ def in_place_of_ours():
 
 
 def total_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:
-    """The square problem's cost of an assignment, padding included, over all samples and categories; float64."""
+    """Sum the cost of an assignment over all samples and categories, padding included, in float64."""
     total = 0.0
     for sample in range(len(features)):
         slot = proposal = 0

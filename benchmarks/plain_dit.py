@@ -1,6 +1,6 @@
-"""The original Diffusion Transformer as its paper's code has it: layer norms, attention, MLP and adaLN as modules of their own.
+"""The original Diffusion Transformer as in its paper's code: norms, attention, MLP and adaLN are separate modules.
 
-Takes the weights of `models.dit.DiT` by name; for comparison only.
+It loads the weights of `models.dit.DiT` by name. For comparison only.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Preprocessing on one core: speed by stage, against ray casting per pose, agreement, size, memory, reading back.
+"""Measure preprocessing on one core: speed by stage and against ray casting, agreement, size, memory, reading.
 
 python benchmarks/preprocess.py                    about four minutes; raw data are written once
 python benchmarks/preprocess.py --raw KITTI-360    any directory in KITTI-360's layout
@@ -49,7 +49,7 @@ class Config:
 
 
 def density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
-    """Mean primitives and slabs in a crop."""
+    """Return the mean numbers of primitives and slabs in a crop."""
     primitives, slabs = [], []
     for k in poses:
         local = drive.pose(int(k)).to_ego(drive.ground.vertices_m)
@@ -79,7 +79,7 @@ def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
 
 
 def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
-    """CPU milliseconds per scene by stage: shards of 256 as pass 1 writes them."""
+    """Measure CPU milliseconds per scene by stage: shards of 256 as pass 1 writes them."""
     spent = dict.fromkeys(("cut and rasterise", "to tables", "write Parquet"), 0.0)
     for number, start in enumerate(range(0, len(poses), 256)):
         clock = time.process_time()
@@ -103,7 +103,7 @@ def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, fl
 
 
 def agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
-    """Shares: of pixel and class decisions that agree with rays, of common pixels within 1 cm; worst metres."""
+    """Return shares: of pixel and class decisions that agree with rays, of common pixels within 1 cm; worst metres."""
     same, within, worst = [], [], 0.0
     for index in indices:
         scene = drive.scene(int(index), "train", grid)
@@ -118,7 +118,7 @@ def agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, flo
 
 
 def stored_exactly(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
-    """Whether all masks come back from the tables as they were cut, and the largest height error in metres."""
+    """Return whether tables hold all masks exactly, and the largest height error in metres."""
     stored = Shard(out, "kitti360", "train", 0).scenes()[: len(poses)]
     masks, worst = True, 0.0
     for scene, index in zip(stored, poses, strict=False):
@@ -157,10 +157,16 @@ def main(config: Config) -> None:
     drive, report = kitti360.read_drive(raw, sequence)
     parse = time.process_time() - clock
     megabytes = xml.stat().st_size / 1e6
-    print(f"read      sequence {sequence}: {megabytes:.0f} MB of XML, {report.objects} objects in {parse:.1f} s, {megabytes / parse:.1f} MB/s")  # fmt: skip
+    print(
+        f"read      sequence {sequence}: {megabytes:.0f} MB of XML, {report.objects} objects in {parse:.1f} s, "
+        f"{megabytes / parse:.1f} MB/s"
+    )
     poses = np.linspace(0, len(drive) - 1, min(config.scenes, len(drive))).astype(int)
     primitives, slabs = density(drive, poses[:: max(1, len(poses) // 50)], grid)
-    print(f"density   {primitives:.0f} primitives and {slabs:.0f} slabs in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}")  # fmt: skip
+    print(
+        f"density   {primitives:.0f} primitives and {slabs:.0f} slabs "
+        f"in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}"
+    )
     with tempfile.TemporaryDirectory() as out:
         rounds = [speed(drive, poses, grid, f"{out}/{k}") for k in range(3)]
         for stage in rounds[0]:
@@ -168,7 +174,10 @@ def main(config: Config) -> None:
         reading = 1e3 * parse / len(drive)
         total = [sum(r.values()) + reading for r in rounds]
         print(f"speed     reading the XML, shared by {len(drive)} poses: {reading:.2f} ms per scene")
-        print(f"speed     all stages: {spread(total)} ms per scene, {spread([1e3 / t for t in total], digits=0)} scenes/s and core")  # fmt: skip
+        print(
+            f"speed     all stages: {spread(total)} ms per scene, "
+            f"{spread([1e3 / t for t in total], digits=0)} scenes/s and core"
+        )
 
         some = poses[:: max(1, len(poses) // config.rays)][: config.rays]
         near, shard = drive.at(poses[:256], grid), np.arange(min(256, len(poses)))
@@ -176,24 +185,42 @@ def main(config: Config) -> None:
         seconds = interleaved(
             {
                 "rays": lambda k: cast_rays(near, int(order[k]), grid),
-                "ours": lambda k: [near.ground.rasterise(near.pose(int(i)), grid, len(near.ground_classes)) for i in shard[:BATCH]],
+                "ours": lambda k: [
+                    near.ground.rasterise(near.pose(int(i)), grid, len(near.ground_classes)) for i in shard[:BATCH]
+                ],
             },
             config.rays,
-        )  # fmt: skip
+        )
         seconds["ours"] = [value / BATCH for value in seconds["ours"]]
-        print(f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}")  # fmt: skip
+        print(
+            f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, "
+            f"ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}"
+        )
         same, within, worst = agreement(drive, some, grid)
-        print(f"rays      agreement {100 * same:.4f} % of pixel and class decisions, {100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)")  # fmt: skip
+        print(
+            f"rays      agreement {100 * same:.4f} % of pixel and class decisions, "
+            f"{100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)"
+        )
 
         masks, worst = stored_exactly(drive, poses[:64], grid, f"{out}/0")
         sizes = {
             name: sum(p.stat().st_size for p in Path(out, "0", name).rglob("*.parquet")) / len(poses) / 1e3
             for name in ("scenes", "primitives", "rasters")
         }
-        print(f"size      {sum(sizes.values()):.1f} kB per scene ({', '.join(f'{k} {v:.1f}' for k, v in sizes.items())}); masks exact: {masks}, heights within {1000 * worst:.1f} mm")  # fmt: skip
+        print(
+            f"size      {sum(sizes.values()):.1f} kB per scene "
+            f"({', '.join(f'{k} {v:.1f}' for k, v in sizes.items())}); "
+            f"masks exact: {masks}, heights within {1000 * worst:.1f} mm"
+        )
 
         shards = [Shard(f"{out}/0", "kitti360", "train", k) for k in range(-(-len(poses) // 256))]
-        manifest = {"source": "kitti360", "split": "train", "number": 0, "scenes": 1, "ground_classes": list(drive.ground_classes)}  # fmt: skip
+        manifest = {
+            "source": "kitti360",
+            "split": "train",
+            "number": 0,
+            "scenes": 1,
+            "ground_classes": list(drive.ground_classes),
+        }
         manifest["extremes"] = shard_writer.compute_extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
         spec = compute_training_statistics([manifest], f"{out}/0", grid, None).spec
         for pixels in (256, 128):

@@ -1,10 +1,10 @@
-"""Preprocessing on Ray: one worker against two, and a simulated cluster of many nodes on one machine.
+"""Measure preprocessing on Ray: one worker against two, and a simulated cluster of many nodes on one machine.
 
     python benchmarks/preprocess_scaling.py                 about six minutes
     python benchmarks/preprocess_scaling.py --nodes 16      many-node part with 16 simulated nodes of one CPU
 
-What can be told on one machine about many: the driver's CPU time and its traffic per scene. They must be small and
-must not grow with the number of nodes, for the driver is one.
+One machine shows the CPU time of the driver and its traffic per scene. Both must be small and must not grow with the
+number of nodes, because there is one driver.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class Run:
     shards: int
     seconds: float
     driver_seconds: float  # CPU of the driver process
-    manifest_bytes: int  # what came back to it
+    manifest_bytes: int  # of manifests that return to the driver
 
 
 def timed(tasks: list[ShardTask]) -> Run:
-    """One ingest on the Ray that runs."""
+    """Time one ingest on the running Ray cluster."""
     received = []
     with tempfile.TemporaryDirectory() as out:
         start, clock = time.perf_counter(), time.process_time()
@@ -68,7 +68,7 @@ def timed(tasks: list[ShardTask]) -> Run:
 
 
 def warm_up(tasks: list[ShardTask]) -> None:
-    """Workers import what they need before the clock starts."""
+    """Make the workers import their modules before the clock starts."""
     timed(tasks[:2])
 
 
@@ -99,7 +99,10 @@ def main(config: Config) -> None:
     for workers, found in runs.items():
         rate = spread([r.scenes / r.seconds for r in found], digits=0)
         share = spread([100 * r.driver_seconds / r.seconds for r in found], digits=1)
-        print(f"workers {workers}: {found[0].scenes} scenes in {found[0].shards} shards, {rate} scenes/s, driver busy {share} % of the time")  # fmt: skip
+        print(
+            f"workers {workers}: {found[0].scenes} scenes in {found[0].shards} shards, {rate} scenes/s, "
+            f"driver busy {share} % of the time"
+        )
     gain = [a.seconds / b.seconds for a, b in zip(runs[1], runs[2], strict=True)]
     print(f"two workers against one: {spread(gain)} x")
 

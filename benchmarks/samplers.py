@@ -1,9 +1,9 @@
-"""How far samplers of few steps are off, on data whose best prediction of the noise is known: Gaussian ones.
+"""Measure errors of samplers with few steps on Gaussian data, for which the best noise prediction is known.
 
 python benchmarks/samplers.py
 
-Without noise on the way a sampler is linear there: what it makes of the starting noise, over the deviation of the data,
-is 1 if it is right. Float64; the same on every machine.
+A sampler that adds no noise is linear on such data. The deviation of its samples over that of the data is 1 if it is
+exact. Float64; the same on every machine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEPS = (10, 20, 25, 50)
 
 
 def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
-    """Deviation of what is drawn over that of the data."""
+    """Return the deviation of the samples over that of the data."""
     alpha_bar = Diffusion().alpha_bar
 
     def model(latent: torch.Tensor, timestep: torch.Tensor, label: torch.Tensor) -> torch.Tensor:

@@ -1,10 +1,10 @@
-"""From noise to tables: how much of it is sampling, decoding, and writing.
+"""Measure the time of sampling, decoding and writing scenes, and the peak memory.
 
 python benchmarks/sampling.py                       the town presets, untrained: the work is the same
 python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
 
-CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50 steps. Memory is the
-process's peak, and what of it Python, torch and the weights are.
+Times are CPU seconds of one thread. The target is that all work after sampling takes at most a tenth of its time at 50
+steps. Memory is the peak of the process, and the share of Python, torch and the weights.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def main(config: Config) -> None:
         with tempfile.TemporaryDirectory() as directory:
             Shard(directory, "generated-run", "generated", 0).write(scenes)
         marks.append(clock())
-        if number:  # the first warms up
+        if number:  # the first round warms up
             for name, start, end in zip(seconds, marks, marks[1:], strict=False):
                 seconds[name].append((end - start) / config.batch)
     for name, found in seconds.items():

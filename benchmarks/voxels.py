@@ -1,4 +1,4 @@
-"""Voxelising a scene at 256 x 256 x 32: runs of levels against testing voxel centres primitive by primitive.
+"""Time voxelisation of a scene at 256 x 256 x 32: runs of levels against tests of voxel centres per primitive.
 
 python benchmarks/voxels.py
 
@@ -28,7 +28,7 @@ PAPER_OBJECTS = 514
 
 
 def plain(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
-    """`voxelise` as one would write it first."""
+    """`voxelize` written in the obvious way."""
     out = np.zeros(voxels.shape, np.uint8)
     grid = voxels.columns
     surface, winner = scene.surface()
@@ -54,13 +54,13 @@ def plain(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 
 def tilted(scene: Scene, rng: np.random.Generator) -> Scene:
-    """The scene with every primitive leaning by a few degrees, as decoders give them."""
+    """Return the scene with every primitive tilted by a few degrees, as decoded ones are."""
     axis = rng.normal(size=(len(scene), 3))
     return replace(scene, rotation=(Rotation.from_rotvec(0.05 * axis).as_matrix() @ scene.rotation).astype(np.float32))
 
 
 def crowded(scenes: list[Scene]) -> Scene:
-    """Primitives of several scenes in one place, as many as the paper has slots."""
+    """Return one scene with the primitives of several, as many as the paper has slots."""
     joined = {
         name: np.concatenate([getattr(s, name) for s in scenes])
         for name in ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
@@ -88,7 +88,11 @@ def main() -> None:
         )
         per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
         filled = np.mean([(voxelize(s, voxels) != EMPTY).mean() for s in scenes])
-        print(f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ")  # fmt: skip
+        print(
+            f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): "
+            f"plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: "
+            f"{ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ"
+        )
     truth, found = voxelize(dense[0], voxels), voxelize(leaning[0], voxels)
     confusion = interleaved({"confusion": lambda _: compute_voxel_confusion(truth, found)}, ROUNDS)["confusion"]
     print(f"confusion matrix of two grids: {spread(confusion, 1e3, 1)} ms")
