@@ -99,7 +99,8 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
         ValueError: An option of a branch is unknown.
     """
     options = nest_flat_options(config)
-    for name, kind in (("ground", GroundConfig), ("objects", ObjectConfig)):
+    kinds: dict[str, Any] = {"ground": GroundConfig, "objects": ObjectConfig}
+    for name, kind in kinds.items():
         if isinstance(entries := options.get(name), Mapping):
             try:
                 options[name] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})

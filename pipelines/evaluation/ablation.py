@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import ray.data
@@ -218,7 +219,7 @@ class Variant:
     """
 
     architecture: Mapping[str, object] = field(default_factory=dict)
-    options: Mapping[str, object] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 BRANCHES = {

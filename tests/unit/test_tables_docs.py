@@ -312,7 +312,7 @@ def test_tables_page_objects_seen_again(answers, town):
     for k, name in enumerate(CATEGORIES):
         if name in answer.index:
             assert answer.loc[name].tolist() == [seen_again[k], moved[k], mistaken[k]]
-    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.translate.sum() > 0
+    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
 
 
 def test_tables_page_scene_contents(answers, town, fake):
