@@ -14,7 +14,7 @@ from typing import Any, Literal, cast, get_args
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_to_config
@@ -24,7 +24,7 @@ FREQUENCIES = 256
 Prediction = Literal["epsilon", "v_prediction"]
 
 
-def embed_timesteps(timestep: Float[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
+def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
     """Sinusoidal embedding of a timestep, cosines first."""
     half = FREQUENCIES // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
@@ -59,7 +59,7 @@ class DiTBlock(nn.Module):
         self.modulation = nn.Linear(width, 6 * width)
 
     def forward(
-        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6d"]
+        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"]
     ) -> Float[Tensor, "batch n d"]:
         """`modulation` is what the layer of that name makes of the condition."""
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
@@ -98,9 +98,9 @@ class DiT(ConfiguredModel):
         label: str = "vegetation",
         num_labels: int = 3,
         layout: dict | None = None,
-        shift: tuple[float, ...] | None = None,
-        scale: tuple[float, ...] | None = None,
-        prediction: Prediction = "epsilon",
+        shift: Sequence[float] | None = None,
+        scale: Sequence[float] | None = None,
+        prediction: Prediction | str = "epsilon",
     ) -> None:
         super().__init__()
         if prediction not in get_args(Prediction):

@@ -54,7 +54,7 @@ class LayoutVAE(ConfiguredModel):
         objects: ObjectConfig = LayoutVAEConfig.objects,
         shortcut: bool = False,
         split_latent: bool = True,
-        branches: Branches = "both",
+        branches: Branches | str = "both",
     ) -> None:
         super().__init__()
         if branches not in BRANCHES:

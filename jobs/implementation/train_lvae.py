@@ -181,10 +181,10 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
 def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """List the options of a LayoutVAE by name, without the layout and those of the object decoder."""
     found: list[tuple[str, Any]] = []
-    for name in sorted(set(options) - {"layout"}):
-        value = asdict(options[name]) if is_dataclass(options[name]) else options[name]
-        entries = sorted(value.items()) if isinstance(value, Mapping) else [(name, value)]
-        found += [entry for entry in entries if entry[0] not in OF_OBJECT_DECODER]
+    for name, option in options.items():
+        value = asdict(option) if is_dataclass(option) and not isinstance(option, type) else option
+        entries = list(value.items()) if isinstance(value, Mapping) else [(name, value)]
+        found += [entry for entry in entries if name != "layout" and entry[0] not in OF_OBJECT_DECODER]
     return found
 
 

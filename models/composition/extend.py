@@ -20,7 +20,7 @@ from models.tensors import make_empty_scene
 Side = Literal["ahead", "behind", "left", "right"]
 
 
-def expand_grid(grid: Grid, side: Side, pixels: int) -> Grid:
+def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
     """Add pixels to a grid on one side.
 
     Raises:
@@ -183,7 +183,7 @@ def inpaint_blocks(
 def extend_scene(
     model: SceneGenerator,
     scene: Scene,
-    side: Side,
+    side: Side | str,
     label: str,
     seed: int = 0,
     overlap: float = 0.5,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation,
 Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a region
 
 
-def contains_points(corners_m: Sequence[Sequence[float]] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
 
     Raises ValueError for fewer than three corners or numbers that are not finite.
@@ -36,7 +36,7 @@ def contains_points(corners_m: Sequence[Sequence[float]] | np.ndarray, x_m: np.n
     return inside
 
 
-def select_polygon(grid: Grid, corners_m: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def select_polygon(grid: Grid, corners_m: Sequence[Any] | np.ndarray) -> np.ndarray:
     """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
     return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
@@ -78,7 +78,7 @@ def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
     return grid.upsample_cells(find_region_cells(region, size))
 
 
-def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents) -> Tensor:
+def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents | str) -> Tensor:
     """(b, c, h, w) float32, 1 = regenerate. The first half of a split latent's channels is the ground's.
 
     Raises:

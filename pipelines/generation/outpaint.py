@@ -23,7 +23,7 @@ from models.composition.outpaint import (
     rank_outward,
 )
 from models.sampling.repaint import RePaintConfig
-from models.scene import Scene
+from models.scene import UNSET, Scene
 from models.tensors import make_empty_scene
 from pipelines.generation.sample import (
     Request,
@@ -116,9 +116,9 @@ def read_block(path: str, empty: Scene) -> SceneBlock:
     latent, (datum_m, known_ground) = arrays.pop("latent"), arrays.pop("of_block").tolist()
     scene = replace(
         empty,
-        heading_rad=None,
-        instance_id=None,
-        label=None,
+        heading_rad=UNSET,
+        instance_id=UNSET,
+        label=UNSET,
         **{name: value.numpy() for name, value in arrays.items()},
     )
     return SceneBlock(scene, latent, datum_m, known_ground)

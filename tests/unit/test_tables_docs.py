@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT, random_scene
 
-from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, make_yaw_rotation
+from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
 from pipelines.preprocess.sources import argoverse2, kitti360
@@ -127,9 +127,9 @@ def invented(scene: Scene, index: int) -> Scene:
         frame=index,
         size_m=some.size_m * np.float32(0.8),
         existence=np.linspace(0.3, 1, len(some), dtype=np.float32),
-        heading_rad=None,
-        instance_id=None,
-        label=None,
+        heading_rad=UNSET,
+        instance_id=UNSET,
+        label=UNSET,
         world_xyz_m=(0.0, 0.0, 0.0),
         world_yaw_rad=0.0,
         world_from_imu=None,
