@@ -32,13 +32,19 @@ PICTURES, CORES = 50_000, 2  # what an evaluation on the paper's scale draws
 def plain(scene: Scene, supersample: int) -> np.ndarray:
     """`bev_picture` at one pixel per raster pixel, as one would write it first."""
     grid = scene.grid
-    fine = Grid(grid.front_m, grid.left_m, grid.resolution_m / supersample, grid.rows * supersample, grid.cols * supersample)  # fmt: skip
+    # fmt: skip
+    fine = Grid(
+        grid.front_m, grid.left_m, grid.resolution_m / supersample, grid.rows * supersample, grid.cols * supersample
+    )
     x, y = fine.x_m(), fine.y_m()
     height, class_id = np.full((grid.rows, grid.cols), -np.inf), np.full((grid.rows, grid.cols), EMPTY)
     for k, name in enumerate(scene.ground_classes):
         higher = scene.occupied[k] & (scene.height_m[k] >= height)
         height[higher], class_id[higher] = scene.height_m[k][higher], GROUND_CLASS_ID[name]
-    height, class_id = (np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id))  # fmt: skip
+    # fmt: skip
+    height, class_id = (
+        np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id)
+    )
     # Boxes before ellipsoids, the last box first: what comes later must lie higher.
     for i in sorted(range(len(scene)), key=lambda i: (scene.category[i] == ELLIPSOID, -i)):
         center, rotation, half = (part[i].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m / 2))
@@ -75,8 +81,16 @@ def main(dataset: str = "") -> None:
         chosen = SceneSubset(dataset, limit=SCENES).shards()
         scenes = [scene for shard, rows in chosen for scene in shard.scenes(rows)]
     else:
-        scenes = [drive.scene(k) for drive in map(generate_town, DENSE_SEEDS) for k in np.linspace(0, len(drive) - 1, SCENES // len(DENSE_SEEDS)).astype(int)]  # fmt: skip
-    print(f"{len(scenes)} scenes with {np.mean([len(s) for s in scenes]):.0f} primitives and {np.mean([s.occupied.any(axis=(1, 2)).sum() for s in scenes]):.1f} ground classes each")  # fmt: skip
+        # fmt: skip
+        scenes = [
+            drive.scene(k)
+            for drive in map(generate_town, DENSE_SEEDS)
+            for k in np.linspace(0, len(drive) - 1, SCENES // len(DENSE_SEEDS)).astype(int)
+        ]
+    # fmt: skip
+    print(
+        f"{len(scenes)} scenes with {np.mean([len(s) for s in scenes]):.0f} primitives and {np.mean([s.occupied.any(axis=(1, 2)).sum() for s in scenes]):.1f} ground classes each"
+    )
     for supersample in (1, 2):
         differ = [(plain(s, supersample) != render_bev(s, supersample=supersample)).any(axis=-1) for s in scenes]
         seconds = interleaved(
@@ -88,7 +102,10 @@ def main(dataset: str = "") -> None:
         )
         per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
         minutes = [ms / 1e3 * PICTURES / CORES / 60 for ms in per_scene["ours"]]
-        print(f"supersampling {supersample}: plain {spread(per_scene['plain'], 1, 1)} ms, ours {spread(per_scene['ours'])} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {PICTURES:,} pictures on {CORES} cores {spread(minutes, 1, 1)} minutes; {np.sum(differ)} of {np.size(differ)} pixels differ")  # fmt: skip
+        # fmt: skip
+        print(
+            f"supersampling {supersample}: plain {spread(per_scene['plain'], 1, 1)} ms, ours {spread(per_scene['ours'])} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {PICTURES:,} pictures on {CORES} cores {spread(minutes, 1, 1)} minutes; {np.sum(differ)} of {np.size(differ)} pixels differ"
+        )
 
 
 if __name__ == "__main__":

@@ -59,7 +59,10 @@ def overlapping_pairs() -> None:
     seconds = interleaved(ways, ROUNDS)
     ours, theirs = ([s / n for s in seconds[name]] for name, n in (("ours", len(kept)), ("manifold3d", len(few))))
     rates = [[1e-3 / s for s in per_pair] for per_pair in (ours, theirs)]
-    print(f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}")  # fmt: skip
+    # fmt: skip
+    print(
+        f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}"
+    )
 
 
 def whole_scenes() -> None:
@@ -78,9 +81,20 @@ def whole_scenes() -> None:
             survive = sum(
                 int(mask[find_overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
             )
-            seconds = interleaved({kind: lambda _, s=sides, w=masks: [compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)]}, ROUNDS)[kind]  # fmt: skip
+            # fmt: skip
+            seconds = interleaved(
+                {
+                    kind: lambda _, s=sides, w=masks: [
+                        compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)
+                    ]
+                },
+                ROUNDS,
+            )[kind]
             per_scene = [1e3 * s / len(sides) for s in seconds]
-            print(f"{name}, {kind}: {spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, {100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene")  # fmt: skip
+            # fmt: skip
+            print(
+                f"{name}, {kind}: {spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, {100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene"
+            )
 
 
 def errors() -> None:
@@ -114,7 +128,10 @@ def ellipsoids() -> None:
     ]
     error = compute_ellipsoid_iou3d_pairs(*sides) - exact
     seconds = interleaved({"ours": lambda _: compute_ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
-    print(f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, root mean square {np.sqrt(np.mean(error**2)):.5f}; {spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core")  # fmt: skip
+    # fmt: skip
+    print(
+        f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, root mean square {np.sqrt(np.mean(error**2)):.5f}; {spread([1e-3 * n / s for s in seconds], 1, 1)} thousand pairs/s/core"
+    )
     real = [s.select(s.category == ELLIPSOID) for s in (generate_town(seed).scene(100) for seed in DENSE_SEEDS)]
     pair = [(extract_boxes(s), disturbed(rng, extract_boxes(s), 0.1)) for s in real if len(s)]
     survive = [len(find_overlapping_bounds(a, b)[0]) for a, b in pair]

@@ -39,7 +39,10 @@ def main() -> None:
     spec = LayoutSpec()
     truth = town_batch(spec.with_resolution(32), BATCH)
     print(where())
-    print(f"batch {BATCH}, {spec.num_slots} slots in {len(spec.slots)} categories, {float(truth.real.sum(1).float().mean()):.0f} real primitives a scene")  # fmt: skip
+    # fmt: skip
+    print(
+        f"batch {BATCH}, {spec.num_slots} slots in {len(spec.slots)} categories, {float(truth.real.sum(1).float().mean()):.0f} real primitives a scene"
+    )
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(truth.features.shape, generator=generator)
     for name, features in (
@@ -57,10 +60,16 @@ def main() -> None:
         seconds = interleaved(ways, 7)
         cost = {k: plain.total_cost(*given[:4], a, *given[4:]) for k, a in found.items()}
         difference = abs(cost["ours"] - cost["padded"]) / cost["padded"]
-        print(f"{name}: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}; total costs differ by {difference:.1e}")  # fmt: skip
+        # fmt: skip
+        print(
+            f"{name}: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}; total costs differ by {difference:.1e}"
+        )
         torch.set_num_threads(os.cpu_count())
         seconds = interleaved(ways, 7, time.perf_counter)
-        print(f"  on all cores, by the clock: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}")  # fmt: skip
+        # fmt: skip
+        print(
+            f"  on all cores, by the clock: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}"
+        )
 
 
 def shuffled(features: torch.Tensor, spec: LayoutSpec, generator: torch.Generator) -> torch.Tensor:

@@ -2,9 +2,9 @@
 
 python benchmarks/overlap.py --lvae DIRECTORY
 
-Real pairs: both blocks are cut from the same town, 32 m apart along the street. The second one's known half comes from the
-first, its new half is the truth's; then it is decoded, and its known half compared with the truth. "own latent" is the
-ceiling: the second block encoded as a whole.
+Real pairs: both blocks are cut from the same town, 32 m apart along the street. The second one's known half comes from
+the first, its new half is the truth's; then it is decoded, and its known half compared with the truth. "own latent" is
+the ceiling: the second block encoded as a whole.
 """
 
 from __future__ import annotations

@@ -157,10 +157,16 @@ def main(config: Config) -> None:
     drive, report = kitti360.read_drive(raw, sequence)
     parse = time.process_time() - clock
     megabytes = xml.stat().st_size / 1e6
-    print(f"read      sequence {sequence}: {megabytes:.0f} MB of XML, {report.objects} objects in {parse:.1f} s, {megabytes / parse:.1f} MB/s")  # fmt: skip
+    # fmt: skip
+    print(
+        f"read      sequence {sequence}: {megabytes:.0f} MB of XML, {report.objects} objects in {parse:.1f} s, {megabytes / parse:.1f} MB/s"
+    )
     poses = np.linspace(0, len(drive) - 1, min(config.scenes, len(drive))).astype(int)
     primitives, slabs = density(drive, poses[:: max(1, len(poses) // 50)], grid)
-    print(f"density   {primitives:.0f} primitives and {slabs:.0f} slabs in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}")  # fmt: skip
+    # fmt: skip
+    print(
+        f"density   {primitives:.0f} primitives and {slabs:.0f} slabs in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}"
+    )
     with tempfile.TemporaryDirectory() as out:
         rounds = [speed(drive, poses, grid, f"{out}/{k}") for k in range(3)]
         for stage in rounds[0]:
@@ -168,7 +174,10 @@ def main(config: Config) -> None:
         reading = 1e3 * parse / len(drive)
         total = [sum(r.values()) + reading for r in rounds]
         print(f"speed     reading the XML, shared by {len(drive)} poses: {reading:.2f} ms per scene")
-        print(f"speed     all stages: {spread(total)} ms per scene, {spread([1e3 / t for t in total], digits=0)} scenes/s and core")  # fmt: skip
+        # fmt: skip
+        print(
+            f"speed     all stages: {spread(total)} ms per scene, {spread([1e3 / t for t in total], digits=0)} scenes/s and core"
+        )
 
         some = poses[:: max(1, len(poses) // config.rays)][: config.rays]
         near, shard = drive.at(poses[:256], grid), np.arange(min(256, len(poses)))
@@ -181,19 +190,35 @@ def main(config: Config) -> None:
             config.rays,
         )  # fmt: skip
         seconds["ours"] = [value / BATCH for value in seconds["ours"]]
-        print(f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}")  # fmt: skip
+        # fmt: skip
+        print(
+            f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}"
+        )
         same, within, worst = agreement(drive, some, grid)
-        print(f"rays      agreement {100 * same:.4f} % of pixel and class decisions, {100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)")  # fmt: skip
+        # fmt: skip
+        print(
+            f"rays      agreement {100 * same:.4f} % of pixel and class decisions, {100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)"
+        )
 
         masks, worst = stored_exactly(drive, poses[:64], grid, f"{out}/0")
         sizes = {
             name: sum(p.stat().st_size for p in Path(out, "0", name).rglob("*.parquet")) / len(poses) / 1e3
             for name in ("scenes", "primitives", "rasters")
         }
-        print(f"size      {sum(sizes.values()):.1f} kB per scene ({', '.join(f'{k} {v:.1f}' for k, v in sizes.items())}); masks exact: {masks}, heights within {1000 * worst:.1f} mm")  # fmt: skip
+        # fmt: skip
+        print(
+            f"size      {sum(sizes.values()):.1f} kB per scene ({', '.join(f'{k} {v:.1f}' for k, v in sizes.items())}); masks exact: {masks}, heights within {1000 * worst:.1f} mm"
+        )
 
         shards = [Shard(f"{out}/0", "kitti360", "train", k) for k in range(-(-len(poses) // 256))]
-        manifest = {"source": "kitti360", "split": "train", "number": 0, "scenes": 1, "ground_classes": list(drive.ground_classes)}  # fmt: skip
+        # fmt: skip
+        manifest = {
+            "source": "kitti360",
+            "split": "train",
+            "number": 0,
+            "scenes": 1,
+            "ground_classes": list(drive.ground_classes),
+        }
         manifest["extremes"] = shard_writer.compute_extremes([drive.scene(int(k), "train", grid) for k in poses[:50]])
         spec = compute_training_statistics([manifest], f"{out}/0", grid, None).spec
         for pixels in (256, 128):

@@ -99,7 +99,10 @@ def main(config: Config) -> None:
     for workers, found in runs.items():
         rate = spread([r.scenes / r.seconds for r in found], digits=0)
         share = spread([100 * r.driver_seconds / r.seconds for r in found], digits=1)
-        print(f"workers {workers}: {found[0].scenes} scenes in {found[0].shards} shards, {rate} scenes/s, driver busy {share} % of the time")  # fmt: skip
+        # fmt: skip
+        print(
+            f"workers {workers}: {found[0].scenes} scenes in {found[0].shards} shards, {rate} scenes/s, driver busy {share} % of the time"
+        )
     gain = [a.seconds / b.seconds for a, b in zip(runs[1], runs[2], strict=True)]
     print(f"two workers against one: {spread(gain)} x")
 

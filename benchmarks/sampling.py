@@ -3,8 +3,8 @@
 python benchmarks/sampling.py                       the town presets, untrained: the work is the same
 python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
 
-CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50 steps. Memory is the
-process's peak, and what of it Python, torch and the weights are.
+CPU seconds of one thread, in turn; the target is that everything after sampling takes at most a tenth of it at 50
+steps. Memory is the process's peak, and what of it Python, torch and the weights are.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 python benchmarks/street.py
 
-Dense towns of about 250 primitives, cameras along their roads. Embree casts a ray per pixel at the whole mesh, ellipsoids as
-facets, as one would write it first; building its tree counts once a scene, as our triangles do. Ours also says what normal
-each pixel has, and meets ellipsoids exactly. CPU seconds of one thread; target 250 ms a frame.
+Dense towns of about 250 primitives, cameras along their roads. Embree casts a ray per pixel at the whole mesh,
+ellipsoids as facets, as one would write it first; building its tree counts once a scene, as our triangles do. Ours
+also says what normal each pixel has, and meets ellipsoids exactly. CPU seconds of one thread; target 250 ms a frame.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ FRAMES = 8  # of a scene
 def cast(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
     """Class ids (h, w) by embree."""
     soup = triangulate_scene(scene)
-    mesh = trimesh.Trimesh(soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False)  # fmt: skip
+    # fmt: skip
+    mesh = trimesh.Trimesh(
+        soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False
+    )
     pictures = []
     for camera in cameras:
         lens = camera.lens
@@ -68,13 +71,25 @@ def main() -> None:
         cameras = place_cameras(plan_drive(extract_road_network(scene)), request)
         chosen += [(scene, cameras)] if cameras else []
     frames = sum(len(cameras) for _, cameras in chosen)
-    print(f"{len(chosen)} scenes of {np.mean([len(scene) for scene, _ in chosen]):.0f} primitives, {frames} frames of {request.lens.width} x {request.lens.height}")  # fmt: skip
-    same = [a == b for scene, cameras in chosen for a, b in zip(cast(scene, cameras), look(scene, cameras), strict=True)]  # fmt: skip
+    # fmt: skip
+    print(
+        f"{len(chosen)} scenes of {np.mean([len(scene) for scene, _ in chosen]):.0f} primitives, {frames} frames of {request.lens.width} x {request.lens.height}"
+    )
+    # fmt: skip
+    same = [
+        a == b for scene, cameras in chosen for a, b in zip(cast(scene, cameras), look(scene, cameras), strict=True)
+    ]
     ways = {"embree": cast, "ours": look, "ours, shaded and written": write}
-    seconds = interleaved({name: lambda _, way=way: [way(*one) for one in chosen] for name, way in ways.items()}, ROUNDS)  # fmt: skip
+    # fmt: skip
+    seconds = interleaved(
+        {name: lambda _, way=way: [way(*one) for one in chosen] for name, way in ways.items()}, ROUNDS
+    )
     for name, values in seconds.items():
         print(f"{name}: {spread([1e3 * value / frames for value in values], 1, 0)} ms a frame")
-    print(f"embree / ours: {ratios(seconds['embree'], seconds['ours'])}; {100 * np.mean(same):.2f} % of pixels of one class (facets differ from ellipsoids at their rims)")  # fmt: skip
+    # fmt: skip
+    print(
+        f"embree / ours: {ratios(seconds['embree'], seconds['ours'])}; {100 * np.mean(same):.2f} % of pixels of one class (facets differ from ellipsoids at their rims)"
+    )
 
 
 if __name__ == "__main__":

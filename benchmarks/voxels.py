@@ -88,7 +88,10 @@ def main() -> None:
         )
         per_scene = {way: [1e3 * s / len(scenes) for s in values] for way, values in seconds.items()}
         filled = np.mean([(voxelize(s, voxels) != EMPTY).mean() for s in scenes])
-        print(f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ")  # fmt: skip
+        # fmt: skip
+        print(
+            f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ"
+        )
     truth, found = voxelize(dense[0], voxels), voxelize(leaning[0], voxels)
     confusion = interleaved({"confusion": lambda _: compute_voxel_confusion(truth, found)}, ROUNDS)["confusion"]
     print(f"confusion matrix of two grids: {spread(confusion, 1e3, 1)} ms")

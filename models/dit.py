@@ -78,9 +78,9 @@ class DiT(ConfiguredModel):
     Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
     divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
 
-    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction", sqrt(alpha_bar)
-    noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A small network then need
-    not carry its input's noise through all its layers.
+    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction",
+    sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A
+    small network then need not carry its input's noise through all its layers.
     """
 
     positions: Tensor
@@ -173,9 +173,16 @@ class DiT(ConfiguredModel):
 
     @torch.no_grad()
     def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
-        """`forward` for these timesteps and labels alone: what depends on nothing else is computed once, not in every step.
+        """Compute the conditioning of these timesteps and labels once and return `forward` for them.
 
-        The modulations are a third of the weights, which each step would read for a row or two. IndexError for others.
+        The modulation layers hold a third of the weights; each step would read them for a row or two.
+
+        Args:
+            timesteps: Timesteps that will be used.
+            labels: Class indices that will be used, the null label included.
+
+        Returns:
+            A denoiser. It raises IndexError for another timestep or label.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
         labels = sorted(set(labels))

@@ -81,7 +81,11 @@ class Grid:
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 
     def intersect(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """(rows, cols) of this grid and of the other that show the same place. ValueError if not aligned to whole pixels."""
+        """Slices (rows, cols) of this grid and of the other that show the same place.
+
+        Raises:
+            ValueError: The grids are not aligned to whole pixels.
+        """
         row0 = (other.front_m - self.front_m) / self.resolution_m
         col0 = (other.left_m - self.left_m) / self.resolution_m
         aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
@@ -208,8 +212,8 @@ class Scene:
         return len(self.category)
 
     def __repr__(self) -> str:
-        grid = self.grid
-        return f"Scene({self.scene_id!r}, {len(self)} primitives, ground {grid.rows} x {grid.cols} at {grid.resolution_m} m)"
+        ground = f"{self.grid.rows} x {self.grid.cols} at {self.grid.resolution_m} m"
+        return f"Scene({self.scene_id!r}, {len(self)} primitives, ground {ground})"
 
     @property
     def volume_m3(self) -> np.ndarray:

@@ -132,8 +132,8 @@ LOGIT_NORMAL = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half 
 def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
     """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
 
-    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these. Logit-normal, as in
-    SD3 (Esser et al., 2024).
+    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these.
+    Logit-normal, as in SD3 (Esser et al., 2024).
     """
     if density == "logit_normal":
         uniform = torch.sigmoid(LOGIT_NORMAL[0] + LOGIT_NORMAL[1] * torch.special.ndtri(uniform))
@@ -236,7 +236,7 @@ class Trainer:
     def _losses(
         self, network: Callable[..., Any], arrays: dict[str, Tensor], positions: list[int]
     ) -> dict[str, Tensor] | None:
-        """The parts of the loss by `network`, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
+        """The parts of the loss of `network`, or None if it is not finite. Each sample has its own noise."""
         generators = [make_keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
         try:
             with self.execution.autocast(self.device):

@@ -11,8 +11,8 @@ os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included. Not so in packages
-# with local functions that Ray pickles: checked functions cannot be pickled by value.
+# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included. Not so in
+# packages with local functions that Ray pickles: checked functions cannot be pickled by value.
 CHECKED = ("models", *(f"pipelines.{name}" for name in ("editing", "geometry", "io", "metrics", "rendering", "schema")))
 install_import_hook([*CHECKED, "pipelines.preprocess.sources", "pipelines.reporting"], "typechecker.check_types")
 

@@ -103,9 +103,9 @@ def introduction_sections(
             "What this is",
             [
                 "A layout VAE and a diffusion transformer were trained from random weights on a procedural "
-                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. The "
-                "method is the paper's; the models are small and the training is short. Longer runs of the same command "
-                "give better scenes.",
+                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. "
+                "The method is the paper's; the models are small and the training is short. Longer runs of the "
+                "same command give better scenes.",
             ],
         ),
         KeyFigures(

@@ -223,7 +223,7 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
 
 
 def sample_layouts(shards: list, counts: list[int], spec) -> dict:
-    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset (LayoutVAE.init_from_data)."""
+    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset, for `init_from_data`."""
 
     read, parts = LayoutReader(spec), []
     for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):

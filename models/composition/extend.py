@@ -83,7 +83,7 @@ def to_block_frame(
 
 
 def require_blocks(model: SceneGenerator, scene: Scene) -> None:
-    """Raises ValueError if a scene has another resolution or other ground classes than the model, or is below one block."""
+    """Raises ValueError if a scene is smaller than a block or has not the model's resolution and ground classes."""
     spec, block = model.spec, model.spec.grid
     if scene.grid.resolution_m != block.resolution_m or scene.ground_classes != spec.ground_classes:
         raise ValueError(f"{scene}: the model needs {block.resolution_m} m and {', '.join(spec.ground_classes)}")
@@ -139,8 +139,8 @@ def inpaint_blocks(
 ) -> Iterator[InpaintStep]:
     """Regenerate a region of a scene of any size, block by block, once per index; the last step holds the result.
 
-    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit for
-    bit.
+    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit
+    for bit.
 
     Args:
         model, scene: The model and the scene, at least one block large.

@@ -54,7 +54,11 @@ def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> n
 
 
 def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, margin_m: float = 1.0) -> np.ndarray:
-    """(rows, cols) pixels within the upright bounds of primitives, grown by a margin. IndexError for none of that number."""
+    """(rows, cols) pixels within the upright bounds of primitives, grown by a margin.
+
+    Raises:
+        IndexError: The scene has no primitive of that number.
+    """
     chosen = scene.select(np.asarray(primitives, int))
     region = np.zeros((scene.grid.rows, scene.grid.cols), bool)
     upright = make_yaw_rotation(chosen.yaw_rad)
@@ -98,10 +102,10 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
 def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
     """Combine a scene with its regenerated part; everything outside the region is the input's, bit for bit.
 
-    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known ground
-    at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region differs
-    slightly from the scene although the latent there does not: a known object near the border may be decoded a little
-    inside the region. Such copies are removed.
+    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known
+    ground at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region
+    differs slightly from the scene although the latent there does not: a known object near the border may be decoded a
+    little inside the region. Such copies are removed.
 
     Args:
         scene: Input.

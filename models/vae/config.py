@@ -14,7 +14,8 @@ class GroundConfig:
     """Ground branch: a convolutional autoencoder of raster maps (models/vae/ground.py).
 
     Args:
-        channels: Width of each block; all blocks but the last halve the resolution. Four blocks give the paper's factor 8.
+        channels: Width of each block; all blocks but the last halve the resolution. Four blocks give the paper's
+            factor 8.
         norm_groups: Groups of each group normalisation.
         pixel_unshuffle: Side of the pixel blocks that become channels first; 1 in the paper, none.
         attention: Self-attention over all cells in the middle of both networks, as in the paper.

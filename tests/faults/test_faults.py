@@ -661,14 +661,15 @@ def write_av2(root: Path) -> None:
         folder = root / "train" / log
         (folder / "map").mkdir(parents=True)
         n = 6 * len(SWEEPS)
-        yaw = rng.uniform(-3, 3, n)
+        yaw, spans = rng.uniform(-3, 3, n), ((1, 15), (-7, 7), (0, 1))
+        categories = ("REGULAR_VEHICLE", "BUS", "DOG", "SIGN", "PEDESTRIAN", "EGO_VEHICLE")
         boxes = {
             "timestamp_ns": np.repeat(SWEEPS, 6),
             "track_uuid": [f"{log}-{k % 6}" for k in range(n)],
-            "category": [("REGULAR_VEHICLE", "BUS", "DOG", "SIGN", "PEDESTRIAN", "EGO_VEHICLE")[k % 6] for k in range(n)],
+            "category": [categories[k % 6] for k in range(n)],
             **{name: rng.uniform(1, 4, n) for name in argoverse2.SIZE},
             **dict(zip(argoverse2.QUATERNION, [np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], strict=True)),
-            **{name: rng.uniform(*span, n) for name, span in zip(argoverse2.TRANSLATION, ((1, 15), (-7, 7), (0, 1)), strict=True)},
+            **{name: rng.uniform(*span, n) for name, span in zip(argoverse2.TRANSLATION, spans, strict=True)},
         }  # fmt: skip
         time = np.concatenate([SWEEPS, SWEEPS + 50_000_000])
         poses = {"timestamp_ns": time} | {name: np.zeros(len(time)) for name in argoverse2.QUATERNION}

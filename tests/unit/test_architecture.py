@@ -51,7 +51,7 @@ def find_imports(root: Path) -> dict[str, set[str]]:
 
 
 def collapse(graph: dict[str, set[str]], package: str) -> dict[str, dict[str, str]]:
-    """Imports between the direct children of a package, whether modules or folders, each with one import as an example."""
+    """Imports between the direct children of a package, modules or folders, each with one import as an example."""
     edges: dict[str, dict[str, str]] = {}
     for module, targets in graph.items():
         for target in targets:
