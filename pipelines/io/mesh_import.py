@@ -23,6 +23,7 @@ that fit neither within FIT_M (shapes.py) are refused.
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 
@@ -131,11 +132,11 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     )
 
 
-def _read_metadata(extras: dict) -> dict:
-    """What a Scene says of itself as a whole, checked. Raises LookupError, TypeError or ValueError."""
+def _read_metadata(extras: dict) -> dict[str, Any]:
+    """Read and check the fields of a Scene as a whole. Raises LookupError, TypeError or ValueError."""
     said, classes = extras["grid"], tuple(extras["ground_classes"])
-    lengths = [float(said[name]) for name in ("front_m", "left_m", "resolution_m")]
-    grid = Grid(*lengths, int(said["rows"]), int(said["cols"]))
+    lengths = front_m, left_m, resolution_m = tuple(float(said[name]) for name in ("front_m", "left_m", "resolution_m"))
+    grid = Grid(front_m, left_m, resolution_m, int(said["rows"]), int(said["cols"]))
     sound = np.isfinite(lengths).all() and grid.resolution_m > 0 < min(grid.rows, grid.cols)
     if not sound or grid.rows * grid.cols > MAX_PIXELS:
         raise ValueError(f"its grid is {said}; export it again")

@@ -1,9 +1,9 @@
 """Scenes <-> Parquet tables: the project's one schema, for real and generated scenes alike.
 
-Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
+A dataset directory holds `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
 hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
-same order, so a reader never joins. Units are in the names, and every file says itself what its columns mean:
-docs/tables.md, for people who never read this.
+same order, so a reader never joins. Units are in the names, and the metadata of every file describes its columns.
+docs/tables.md documents the tables for users.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from pipelines.runtime import storage
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # what 16 bits hold
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # the largest height that 16 bits hold
 
-# What the categories and ground classes hold, for people who look at columns and not at code.
+# Meanings of the categories and ground classes, for the descriptions of columns.
 # fmt: off
 CATEGORY_MEANING = {
     "vegetation_cuboid":    "trees, bushes and hedges annotated as boxes",
@@ -52,10 +52,10 @@ GROUND_MEANING = {
 
 
 def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
-    """A schema that explains itself, from rows of (name, type, unit, description); unit "" where none applies.
+    """Make a self-describing schema from rows of (name, type, unit, description); unit "" where none applies.
 
-    Every field carries `unit` and `description`. DuckDB does not show those, so the same rows stand once more, as
-    JSON, among the table's own key-values, under `pritti_columns`.
+    Every field has the metadata `unit` and `description`. DuckDB does not show field metadata, so the table's metadata
+    repeats the rows as JSON under `pritti_columns`.
     """
     fields, rows = [], []
     for name, kind, unit, meaning in columns:
@@ -167,7 +167,7 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
 
 
 def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
-    """(height, occupied) as bytes: only occupied pixels carry a height, each as the difference to the one before."""
+    """Return (height, occupied) as bytes; only occupied pixels have a height, as the difference to the one before."""
     steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
     if len(steps) and np.abs(steps).max() > 32767:
         raise ValueError(f"scene {scene.scene_id}: ground heights beyond ±327 m, worst {scene.height_m.max()}")
@@ -225,7 +225,7 @@ def _make_fixed_lists(values: np.ndarray, width: int) -> pa.Array:
 
 
 def make_primitives_table(scenes: Sequence[Scene]) -> pa.Table:
-    """The rows of `primitives` for some scenes, one or more."""
+    """Return the rows of `primitives` for one or more scenes."""
 
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
@@ -269,7 +269,7 @@ def _make_rasters_table(scenes: Sequence[Scene]) -> pa.Table:
 
 
 def make_scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
-    """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
+    """Return one aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
     return {
         "scenes": _make_scenes_table(scenes),
         "primitives": make_primitives_table(scenes),
@@ -288,7 +288,19 @@ def parse_scenes(
     split: str,
     rows: Sequence[int] | None = None,
 ) -> Iterator[Scene]:
-    """The Scenes of one shard, or only those in `rows`, in that order; one at a time."""
+    """Yield the Scenes of one shard, or only those in `rows` in that order.
+
+    Args:
+        scenes: The shard's rows of `scenes`.
+        primitives: Its rows of `primitives`.
+        rasters: Its rows of `rasters`.
+        source: Value of the source column.
+        split: Value of the split column.
+        rows: Numbers of the scenes (default: all).
+
+    Raises:
+        ValueError: The tables do not hold the same scenes in the same order, or a category is unknown.
+    """
     fields = _read_primitive_fields(primitives)
     rows = list(range(len(scenes)) if rows is None else rows)
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
@@ -321,8 +333,8 @@ def parse_scenes(
 
 
 def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
-    """(n,) int8 index into CATEGORIES. Raises ValueError for a name that is none."""
-    category = pc.index_in(names, pa.array(CATEGORIES))
+    """(n,) int8 index into CATEGORIES. Raises ValueError for an unknown name."""
+    category = pc.index_in(names, pa.array(CATEGORIES))  # pyright: ignore[reportAttributeAccessIssue]
     if category.null_count:
         raise ValueError("primitives hold a category of another version; preprocess again")
     return category.to_numpy().astype(np.int8)
@@ -377,10 +389,10 @@ class Shard:
         return storage.read_parquet(self.path(table), columns, schema)
 
     def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
-        """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
-        tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
+        """Return its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
+        scenes, primitives, rasters = (self.read(table) for table in ("scenes", "primitives", "rasters"))
         try:
-            return list(parse_scenes(*tables, self.source, self.split, rows))
+            return list(parse_scenes(scenes, primitives, rasters, self.source, self.split, rows))
         except ValueError as error:
             raise ValueError(f"{self.path('scenes')}: {error}") from error
 
@@ -393,7 +405,7 @@ class Shard:
 
 
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
-    """The shards of a table, in order. Raises ValueError if there is none: nothing passes on empty input."""
+    """Return the shards of a table, in order. Raises ValueError if there is none, so that no job accepts empty input."""
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
         *_, source_part, split_part, name = path.split("/")
@@ -417,7 +429,7 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
 def read_scenes(
     root: str, source: str | None = None, split: str | None = None, limit: int | None = None
 ) -> Iterator[Scene]:
-    """Scenes of a dataset directory, shard by shard."""
+    """Yield scenes of a dataset directory, shard by shard; at most `limit`."""
     left = limit
     for shard in find_shards(root, "scenes", source, split):
         for scene in shard.scenes():
