@@ -87,7 +87,7 @@ class _Separation:
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
-        """For each pair up to CANDIDATES places (k, 2) where its boxes do not overlap, the shortest push first.
+        """Find up to CANDIDATES places (k, 2) for each pair where its boxes do not overlap, the shortest push first.
 
         Two boxes that overlap at both ends of a straight way overlap all along it (Brunn-Minkowski: their common volume is
         log-concave), so a direction whose longest push does not part them is given up at once.
@@ -127,7 +127,7 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
+        """(k,) bool: whether a box of the pair, in places (k, 2), overlaps a third box too much and more than now."""
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
@@ -136,7 +136,7 @@ class _Separation:
         over = then > GOAL_IOU3D
         if over.any():
             over &= then > compute_iou3d_matrix(self.now.take(pair), around)
-        return over.any(axis=(1, 2))
+        return np.any(over, axis=(1, 2))
 
 
 def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Extract the roads of a Scene as lines from the road mask: centrelines with height and width, joined at nodes.
 
-The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks. Spurs that the outline causes are pruned,
-and forks closer together than the road is wide become one node. The mask is extended beyond the scene's border by its
-edge values, so that a road leaves the scene straight.
+The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks. Spurs caused by the outline are pruned.
+Forks closer together than the road is wide become one node. The mask is extended beyond the scene's border by its edge
+values, so that a road leaves the scene straight.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def _resample_line(line: np.ndarray, spacing: float) -> np.ndarray:
 def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
     """(h, w) height of the road in cells of CELL_M; outside the road, the height of the nearest road."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
-    known = scene.occupied[index].any(axis=0)
+    known = np.any(scene.occupied[index], axis=0)
     height_m = np.where(scene.occupied[index], scene.height_m[index], -np.inf).max(axis=0, initial=-np.inf)
     if not known.any():
         return np.zeros(shape)

@@ -16,6 +16,9 @@ from uuid import uuid4
 
 import numpy as np
 import trimesh
+import trimesh.exchange.gltf
+import trimesh.exchange.ply
+import trimesh.visual
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids

@@ -117,8 +117,10 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     if (off > COLOR_TOLERANCE).any():
         raise ValueError(f"{(off > COLOR_TOLERANCE).sum()} ground vertices have the colour of none of its classes")
     height_m, occupied = rasterize_ground(vertices_m, class_id, about["ground_classes"], about["grid"])
+    if scene_id:
+        about["scene_id"] = scene_id
     return Scene(
-        **about | ({"scene_id": scene_id} if scene_id else {}),
+        **about,
         category=category,
         center_m=center_m.astype(np.float32),
         rotation=rotation.astype(np.float32),

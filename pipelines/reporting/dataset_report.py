@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -331,7 +332,7 @@ def make_reader_sections(facts: DatasetFacts) -> list[Section]:
         return []
     names = list(dict.fromkeys(name for report in reports.values() for name in report))
 
-    def amount(value: object) -> int | None:
+    def amount(value: Any) -> int | None:
         if isinstance(value, Mapping):
             return sum(value.values())
         return len(value) if isinstance(value, list) else value

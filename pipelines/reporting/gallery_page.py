@@ -33,7 +33,7 @@ CAPTIONS = ("vegetation_density", "vehicle_density", "num_primitives")
 
 
 def pack_scenes(row: dict) -> list[dict]:
-    """Row in: a shard, rows in it and their places. Rows out: per scene its place, picture and content for the viewer."""
+    """Row in: a shard, rows in it and their places. Rows out: each scene's place, picture and viewer content."""
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):

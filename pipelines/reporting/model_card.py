@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from models.tensors import EXISTENCE_THRESHOLD
@@ -113,8 +113,8 @@ class ModelCard:
         yield from render_table(("file", "SHA-256"), self.checksums.items())
 
 
-def render_table(head: Sequence[str], rows: Sequence[Sequence[str]] | Iterator) -> Iterator[str]:
-    """Lines of a Markdown table, an empty one after it."""
+def render_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a Markdown table and an empty line."""
     yield "| " + " | ".join(head) + " |"
     yield "|" + "---|" * len(head)
     for row in rows:

@@ -70,21 +70,29 @@ def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) 
 
 
 # fmt: off
-_FRAME = "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles counter-clockwise from x, seen from above."
+_FRAME = (
+    "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles "
+    "counter-clockwise from x, seen from above."
+)
 _SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
-_SEQUENCE = ("sequence", pa.string(), "", "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
+_SEQUENCE = ("sequence", pa.string(), "",
+             "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
 
 SCENES = _make_schema(
-    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and totals. " + _FRAME,
+    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and "
+    "totals. " + _FRAME,
     _SCENE_ID,
     _SEQUENCE,
-    ("frame",                pa.int64(),   "1; av2: ns", "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
+    ("frame",                pa.int64(),   "1; av2: ns",
+     "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
     ("x_m",                  pa.float64(), "m",   "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
     ("y_m",                  pa.float64(), "m",   "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
     ("z_m",                  pa.float64(), "m",   "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
-    ("yaw_rad",              pa.float64(), "rad", "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
+    ("yaw_rad",              pa.float64(), "rad",
+     "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
     # A variable list: Parquet has no null of a fixed size.
-    ("world_from_imu",       pa.list_(pa.float64()), "1; m", "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
+    ("world_from_imu",       pa.list_(pa.float64()), "1; m",
+     "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
     ("vegetation_density",   pa.string(),  "",    "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing was."),
     ("vehicle_density",      pa.string(),  "",    "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
     ("vegetation_volume_m3", pa.float64(), "m3",  "Sum of the volumes of all vegetation primitives; overlaps count twice."),
@@ -96,7 +104,8 @@ SCENES = _make_schema(
 )
 
 PRIMITIVES = _make_schema(
-    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen from several poses has a row in each. " + _FRAME,
+    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen "
+    "from several poses has a row in each. " + _FRAME,
     _SCENE_ID,
     ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
     ("label",       pa.string(),  "",    "Class name as the source dataset spells it; generated primitives: the category."),
@@ -109,16 +118,21 @@ PRIMITIVES = _make_schema(
     ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
     ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
     ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
-    ("heading_rad", pa.float32(), "rad", "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
-    ("rotation",    pa.list_(pa.float32(), 9), "1", "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
-    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5", "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
+    ("heading_rad", pa.float32(), "rad",
+     "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
+    ("rotation",    pa.list_(pa.float32(), 9), "1",
+     "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
+    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5",
+     "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
     ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
 )
 
 RASTERS = _make_schema(
-    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from above. " + _FRAME,
+    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from "
+    "above. " + _FRAME,
     _SCENE_ID,
-    ("height",         pa.binary(),  "height_step_m", "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
+    ("height",         pa.binary(),  "height_step_m",
+     "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
     ("occupied",       pa.binary(),  "",    "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
     ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
     ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
@@ -139,7 +153,8 @@ REJECTS = _make_schema(
 
 
 EDITS = _make_schema(
-    "One row per primitive that a step of the list of edits touched, in the scene that was given under the same scene_id.",
+    "One row per primitive that a step of the list of edits touched, in the scene that was given under the "
+    "same scene_id.",
     _SCENE_ID,
     ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
     ("edit",       pa.string(),  "",    "remove, duplicate, translate, rotate, scale, relabel, snap or repair."),
@@ -155,7 +170,8 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """(C, h, w) posterior moments per scene; float16, channels first."""
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
     return _make_schema(
-        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the rasters.",
+        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the "
+        "rasters.",
         _SCENE_ID,
         ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
         ("logvar", tensor, "1", "Natural logarithm of its variance: float16 (channel, row, col) in C order."),
