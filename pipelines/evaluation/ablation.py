@@ -412,7 +412,7 @@ def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """Chart IoU3D lost with the angle against width / length: Cholesky at each noise, other encodings at the largest."""
+    """Chart IoU3D lost with the angle against width / length: Cholesky at each noise, others at the largest noise."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"

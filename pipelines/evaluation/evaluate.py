@@ -140,7 +140,7 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
 
 
 def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
-    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each; the tasks share one copy of the features."""
+    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each, which share one copy of the features."""
     sides = prepare_features(real, generated, k)
     shared = [ray.put(side) for side in sides]
     radii = [

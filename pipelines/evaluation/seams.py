@@ -30,7 +30,7 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class SeamLines:
-    """Seams in metres from a scene's far edge (rows) and left edge (cols); without any, the edges of its middle block."""
+    """Seams in metres from a scene's far edge (rows) and left edge (cols); by default the edges of its middle block."""
 
     rows_m: tuple[float, ...] = ()
     cols_m: tuple[float, ...] = ()

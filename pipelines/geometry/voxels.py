@@ -256,7 +256,7 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     return _Runs(row * np.int32(grid.cols) + col, chosen[one], middle_m - reach_m, middle_m + reach_m)
 
 
-# --------------------------------------------------------------------------------------------- what the range leaves out
+# ------------------------------------------------------------------------------------- primitives outside of the range
 
 
 @dataclass(frozen=True)

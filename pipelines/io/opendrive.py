@@ -1,8 +1,8 @@
-"""The roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes, junctions.
+"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes, junctions.
 
-Each line of roads.py is a road of cubics through points of its centreline, with one driving lane or more on either side;
-where lines meet, each road stops short of the node and a connecting road leads from it to every other one. OpenDRIVE's
-inertial frame is the scene frame; the header's offset says where that lies in the world. Right-hand traffic.
+Each line of centerlines.py becomes a road of cubics through points of its centreline, with one or more driving lanes on
+either side. Where lines meet, each road ends before the node, and a connecting road leads from it to every other road.
+OpenDRIVE's inertial frame is the scene frame; the header's offset is its position in the world. Right-hand traffic.
 """
 
 from __future__ import annotations

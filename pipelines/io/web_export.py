@@ -29,10 +29,7 @@ def export_web_scene(scene: Scene) -> dict:
 
 def _export_ground(scene: Scene) -> dict:
     height_m, winner = scene.surface()
-    if (winner < 0).all():
-        filled_m = height_m
-    else:
-        filled_m = height_m[find_nearest_true(winner >= 0)]
+    filled_m = height_m if (winner < 0).all() else height_m[find_nearest_true(winner >= 0)]
     step = max(winner.shape) / (NODES - 1)
     rows, cols = (max(2, round(n / step) + 1) for n in winner.shape)
     at = [np.linspace(-0.5, n - 0.5, count) for n, count in zip(winner.shape, (rows, cols), strict=True)]

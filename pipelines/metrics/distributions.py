@@ -1,8 +1,8 @@
-"""How layouts are made, as histograms per scene, and how far two sources differ in them; no pictures, no weights.
+"""Describe layouts by histograms per scene, and measure how far two sources differ; without pictures or weights.
 
 A scene gives a vector of counts over fixed bins. Vectors add up to the histogram of a source, and resampled scenes to
-its draws. Sources differ by the Wasserstein distance in the histogram's own unit, or where bins have no order by the
-Jensen-Shannon divergence in bits. Bins bound how fine a difference can be seen; they are narrow where objects are small.
+its draws. Sources differ by the Wasserstein distance in the histogram's unit, or by the Jensen-Shannon divergence in
+bits if bins have no order. The bin width limits the resolution; bins are narrow where objects are small.
 """
 
 from __future__ import annotations

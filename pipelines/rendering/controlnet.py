@@ -24,7 +24,7 @@ MULTIPLE_PX = 8  # the sides of the network's pictures are multiples of this
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """Options of painting. `diffusion` and `controlnet` are local directories in diffusers' layout, safetensors only."""
+    """Options of painting. `diffusion` and `controlnet` are local directories of diffusers models, as safetensors."""
 
     diffusion: str
     controlnet: str
@@ -46,7 +46,10 @@ class Painter:
 
     def __init__(self, request: PhotoRequest) -> None:
         """Load the models. Raises ValueError if a directory does not hold one."""
-        from diffusers import ControlNetModel, StableDiffusionControlNetPipeline
+        from diffusers import (
+            ControlNetModel,  # pyright: ignore[reportPrivateImportUsage]
+            StableDiffusionControlNetPipeline,  # pyright: ignore[reportPrivateImportUsage]
+        )
         from diffusers.utils.logging import disable_progress_bar
 
         disable_progress_bar()

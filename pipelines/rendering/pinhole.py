@@ -1,8 +1,8 @@
 """Render a Scene for a pinhole camera: classes, instances and depth, exact and deterministic, on the CPU.
 
-In the image plane 1 / depth is linear over a flat triangle. The kernel that casts vertical rays (rasterize.py) therefore
-casts camera rays as well, on 1 / depth instead of height. The intersection of each ray with an ellipsoid is exact, by a
-quadratic equation. The camera frame is KITTI-360's: x right, y down, z ahead; metres. Pixel centres lie at whole
+In the image plane 1 / depth is linear over a flat triangle. The kernel that casts vertical rays (rasterize.py) can
+therefore cast camera rays, on 1 / depth instead of height. The intersection of each ray with an ellipsoid is exact, by
+a quadratic equation. The camera frame is KITTI-360's: x right, y down, z ahead; metres. Pixel centres lie at whole
 numbers (u to the right, v down).
 """
 
@@ -25,7 +25,7 @@ CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels. The default is KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
+    """Intrinsics in pixels. Default: KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
 
     width: int = 1408
     height: int = 376

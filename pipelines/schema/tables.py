@@ -76,7 +76,8 @@ _FRAME = (
 )
 _SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
 _SEQUENCE = ("sequence", pa.string(), "",
-             "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
+             "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: "
+             "the seed.")
 
 SCENES = _make_schema(
     "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and "
@@ -85,22 +86,34 @@ SCENES = _make_schema(
     _SEQUENCE,
     ("frame",                pa.int64(),   "1; av2: ns",
      "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
-    ("x_m",                  pa.float64(), "m",   "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
-    ("y_m",                  pa.float64(), "m",   "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
-    ("z_m",                  pa.float64(), "m",   "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
+    ("x_m",                  pa.float64(), "m",
+     "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
+    ("y_m",                  pa.float64(), "m",
+     "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
+    ("z_m",                  pa.float64(), "m",
+     "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
     ("yaw_rad",              pa.float64(), "rad",
      "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
     # A variable list: Parquet has no null of a fixed size.
     ("world_from_imu",       pa.list_(pa.float64()), "1; m",
      "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
-    ("vegetation_density",   pa.string(),  "",    "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing was."),
-    ("vehicle_density",      pa.string(),  "",    "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
-    ("vegetation_volume_m3", pa.float64(), "m3",  "Sum of the volumes of all vegetation primitives; overlaps count twice."),
+    ("vegetation_density",   pa.string(),  "",
+     "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing "
+     "was."),
+    ("vehicle_density",      pa.string(),  "",
+     "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
+    ("vegetation_volume_m3", pa.float64(), "m3",
+     "Sum of the volumes of all vegetation primitives; overlaps count twice."),
     ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all vehicles, big and small."),
     ("num_primitives",       pa.int32(),   "1",   "Number of primitives of all categories."),
-    *[(f"num_{name}",        pa.int32(),   "1",   f"Number of {name} primitives: {CATEGORY_MEANING[name]}.") for name in CATEGORIES],
-    *[(f"{name}_area_m2",    pa.float64(), "m2",  f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.") for name in GROUND_CLASSES],
-    ("primitive_offset",     pa.int64(),   "1",   "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
+    *[(f"num_{name}",        pa.int32(),   "1",
+       f"Number of {name} primitives: {CATEGORY_MEANING[name]}.")
+      for name in CATEGORIES],
+    *[(f"{name}_area_m2",    pa.float64(), "m2",
+       f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.")
+      for name in GROUND_CLASSES],
+    ("primitive_offset",     pa.int64(),   "1",
+     "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
 )
 
 PRIMITIVES = _make_schema(
@@ -108,12 +121,17 @@ PRIMITIVES = _make_schema(
     "from several poses has a row in each. " + _FRAME,
     _SCENE_ID,
     ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
-    ("label",       pa.string(),  "",    "Class name as the source dataset spells it; generated primitives: the category."),
+    ("label",       pa.string(),  "",
+     "Class name as the source dataset spells it; generated primitives: the category."),
     ("kind",        pa.string(),  "",    "Shape that fills the box: cuboid or ellipsoid."),
-    ("instance_id", pa.int64(),   "",    "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects apart."),
+    ("instance_id", pa.int64(),   "",
+     "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects "
+     "apart."),
     ("x_m",         pa.float32(), "m",   "x of the centre in the scene frame: distance ahead of the ego vehicle."),
-    ("y_m",         pa.float32(), "m",   "y of the centre in the scene frame: distance to the left of the ego vehicle."),
-    ("z_m",         pa.float32(), "m",   "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
+    ("y_m",         pa.float32(), "m",
+     "y of the centre in the scene frame: distance to the left of the ego vehicle."),
+    ("z_m",         pa.float32(), "m",
+     "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
     ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes that are not the height axis."),
     ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
     ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
@@ -124,7 +142,8 @@ PRIMITIVES = _make_schema(
      "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
     ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5",
      "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
-    ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
+    ("existence",   pa.float32(), "1",
+     "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
 )
 
 RASTERS = _make_schema(
@@ -133,13 +152,16 @@ RASTERS = _make_schema(
     _SCENE_ID,
     ("height",         pa.binary(),  "height_step_m",
      "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
-    ("occupied",       pa.binary(),  "",    "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
+    ("occupied",       pa.binary(),  "",
+     "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
     ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
     ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
     ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is farthest ahead."),
     ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is leftmost."),
-    ("front_m",        pa.float64(), "m",   "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
-    ("left_m",         pa.float64(), "m",   "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
+    ("front_m",        pa.float64(), "m",
+     "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
+    ("left_m",         pa.float64(), "m",
+     "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
     ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
 )
 
@@ -421,7 +443,7 @@ class Shard:
 
 
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
-    """Return the shards of a table, in order. Raises ValueError if there is none, so that no job accepts empty input."""
+    """Return the shards of a table, in order. Raises ValueError if there is none: no job accepts empty input."""
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
         *_, source_part, split_part, name = path.split("/")

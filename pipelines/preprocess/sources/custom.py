@@ -354,8 +354,9 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     fallen = np.flatnonzero(world_from_ego[:, 2, 2] < MIN_UP)
     if len(fallen):
         raise ValueError(
-            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])}; give"
-            " the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other axes)"
+            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])};"
+            " give the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other"
+            " axes)"
         )
     return frame, world_from_ego
 
@@ -399,7 +400,7 @@ def _is_text(value: object) -> bool:
 
 
 def _is_whole(value: object) -> bool:
-    """Whether this is an integer of 0 or more. Floats are allowed: pandas turns integers in a column with nulls to them."""
+    """Whether this is an integer of 0 or more; a float may hold it, as in pandas' columns with nulls."""
     return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 

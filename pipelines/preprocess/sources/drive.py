@@ -58,9 +58,10 @@ class SlabGround:
 
     @cached_property
     def _upper(self) -> tuple[np.ndarray, np.ndarray]:
-        """The triangles without undersides, and the slab of each.
+        """Return the triangles without undersides, and the slab of each.
 
-        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
+        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the
+        second half of its vertices is its first half, moved down (format of KITTI-360).
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
