@@ -74,7 +74,7 @@ class InpaintRequest(Request):
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
-    """How far a raw decode is off outside the region, as sums: pixels and squared metres, primitives and their IoU3D."""
+    """Sum the errors of a raw decode outside the region: pixels, squared metres, primitives and their IoU3D."""
     given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied
     sums = sum_pairs(given, made)
@@ -89,7 +89,7 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
 
 
 def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Of all sums together: ground IoU, height RMSE, share of the objects found again, their mean IoU3D; None for 0 / 0."""
+    """Compute ground IoU, height RMSE, share of objects found and their mean IoU3D from all sums; None for 0 / 0."""
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 
     def share(above: str, below: str) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import pyarrow as pa
 import ray
@@ -260,7 +261,7 @@ def run_batches(
     )
     room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
     count = min(num_actors, max(len(waiting), len(done)), max(1, room))  # one without room would take a killed one's
-    workers = [actor.remote(request, chosen) for _ in range(count)]
+    workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
     finally:  # an error's traceback would keep them, and their CPUs, alive

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,8 +75,9 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
-    """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
-    options = asdict(request) | also | {"weights": f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"}
+    """Bind source generated-<run> of a directory to one request and to the weights of its model (run_guard.py)."""
+    options: dict[str, Any] = asdict(request) | also
+    options["weights"] = f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"
     del options["model"]  # the same weights in another directory are the same model
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
     if not options.get("repair"):  # absent in the records of earlier versions
@@ -105,7 +107,7 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
 def find_scene_label(scene: Scene, kind: str) -> str:
     """A scene's label for a model conditioned on `kind`. Raises ValueError if the scene has none."""
     label = compose_label(kind, scene.vegetation_density, scene.vehicle_density)
-    if label not in LABELS[kind]:
+    if label is None or label not in LABELS[kind]:
         raise ValueError(
             f"scene {scene.scene_id} has no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
         )

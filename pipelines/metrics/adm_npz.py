@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -54,7 +54,7 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Stream at the first number, shape and type of a C-ordered array; ValueError if it is anything else."""
+    """Open a C-ordered array: stream at its first number, shape and type. Raises ValueError for any other array."""
     if f"{name}.npy" not in archive.namelist():
         raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
     with archive.open(f"{name}.npy") as stream:
@@ -71,7 +71,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tupl
         needed, held = math.prod(shape) * dtype.itemsize, archive.getinfo(f"{name}.npy").file_size - stream.tell()
         if held != needed:
             raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write it again")
-        yield stream, shape, dtype
+        yield cast(zipfile.ZipExtFile, stream), shape, dtype
 
 
 def read_picture_shape(path: str) -> tuple[int, int, int, int]:
@@ -99,7 +99,7 @@ def _iterate_batches(path: str, shape: tuple[int, int, int, int], batch: int) ->
     with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (stream, _, _):
         for start in range(0, shape[0], batch):
             pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
-            if (read := stream.readinto(pictures)) != pictures.nbytes:
+            if (read := stream.readinto(pictures.data)) != pictures.nbytes:
                 raise ValueError(f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write it again")
             yield pictures
 

@@ -114,16 +114,17 @@ def compute_neighbourhoods(
     """
     sides = prepare_features(real, generated, k)
     radii = [compute_ball_radii(side, range(len(side)), k) for side in sides]
-    return judge_neighbours(k, [find_within(*sides, *radii, range(len(real)))])
+    return judge_neighbours(k, [find_within(sides[0], sides[1], radii[0], radii[1], range(len(real)))])
 
 
 def judge_neighbours(
     k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> list[NeighbourhoodScores]:
     """A Neighbourhood for each k from what `within` gave for all parts of the real samples, in order."""
-    in_real, in_generated, covered = zip(*parts, strict=True)
-    found = sum(in_real), np.concatenate(in_generated, axis=1), np.concatenate(covered, axis=1)
-    return [NeighbourhoodScores(size, *(part[index] for part in found)) for index, size in enumerate(k)]
+    parts_in_real, parts_in_generated, parts_covered = zip(*parts, strict=True)
+    in_real = np.asarray(sum(parts_in_real))
+    in_generated, covered = (np.concatenate(part, axis=1) for part in (parts_in_generated, parts_covered))
+    return [NeighbourhoodScores(size, in_real[i], in_generated[i], covered[i]) for i, size in enumerate(k)]
 
 
 def check_k(k: Sequence[int]) -> int:

@@ -1,7 +1,7 @@
-"""Reconstruction scores: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1 Metrics, Tab. 1, 2).
+"""Score reconstructions: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1, Tab. 1, 2).
 
-One record per scene, cheap to make anywhere and to add up in any grouping; one function per table turns the sum into
-numbers. Everything is accumulated over the whole dataset before it is divided.
+Each scene gives one record; records can be added in any grouping. One function per table computes scores from the sum,
+so that every ratio is one of sums over the whole dataset.
 """
 
 from __future__ import annotations

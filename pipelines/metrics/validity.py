@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORIES, CATEGORY_INDEX, DRIVABLE_CLASSES, ROAD_CLASSES, VEGETATION, VEHICLES, Scene
+from pipelines.geometry.masks import label_parts
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
@@ -121,11 +121,11 @@ def _find_overlapping(scene: Scene) -> np.ndarray:
 def _make_mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
     """(H, W) bool: any of the classes occupies the pixel (classes may overlap)."""
     index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
-    return scene.occupied[index].any(axis=0)
+    return np.any(scene.occupied[index], axis=0)
 
 
 def _find_largest_component(mask: np.ndarray) -> tuple[float, int]:
     """Share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
-    components, _ = ndimage.label(mask)
+    components, _ = label_parts(mask)
     sizes = np.bincount(components.ravel())[1:]
     return (float(sizes.max() / sizes.sum()), 1) if len(sizes) else (0.0, 0)

@@ -152,10 +152,17 @@ def make_pictures_shard(path: str) -> np.ndarray:
 
 
 def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
-    """Import everything: ids of the scenes, in order, and how many files were rejected, as in imported-<name>.json.
+    """Import all files of a request. Another call resumes an interrupted one, and reads shards with rejects again.
 
-    Goes on where it stopped; shards with rejects are read again, for files get repaired. Raises ValueError if the output
-    holds an import of other files under this name, or if no file could be read.
+    Args:
+        request: Files, and the name and directory of the import.
+        on_shard: Receives the number of files of each finished shard.
+
+    Returns:
+        Content of imported-<name>.json: ids of the scenes, in order, and number of rejected files.
+
+    Raises:
+        ValueError: The output holds an import of other files under this name, or no file can be read.
     """
     record = storage.join_uri(request.output, f"imported-{request.name}.json")
     options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}
@@ -164,8 +171,8 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
         made = storage.read_json(record)
         if differing := [name for name in options if made.get(name) != options[name]]:
             raise ValueError(
-                f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose another"
-                " --name or --output"
+                f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose"
+                " another --name or --output"
             )
         there = storage.exists(request.target) if request.kind == "npz" else all(shard.is_written() for shard in shards)
         if made.get("rejects") == 0 and there:

@@ -1,4 +1,4 @@
-"""Street views along the roads of scenes: one Ray task per scene; images, cameras, a contact sheet and a moving picture."""
+"""Render street views along the roads of scenes, one Ray task per scene: images, cameras, contact sheet, animation."""
 
 from __future__ import annotations
 

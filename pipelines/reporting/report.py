@@ -132,7 +132,10 @@ def _render_body(section: Section) -> str:
         case Pictures():
             return _render_paragraph(section.note) + _render_pictures(section)
         case Charts():
-            return f'{_render_paragraph(section.note)}<div class="charts">{"".join(map(_render_chart, section.charts))}</div>'
+            return (
+                f"{_render_paragraph(section.note)}<div "
+                f'class="charts">{"".join(map(_render_chart, section.charts))}</div>'
+            )
         case Table():
             return _render_paragraph(section.note) + _render_table(section)
     raise ValueError(f"not a section of a report: {section!r}")

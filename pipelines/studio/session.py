@@ -1,7 +1,7 @@
-"""The studio: one scene per visitor, made, edited, inpainted and extended; every step can be undone.
+"""The studio: each visitor generates, edits, inpaints and extends one scene, and can undo every step.
 
-`Desk` is a visitor's scene and its history, without any web; `studio_app` is the HTTP interface around it. Long work runs
-in a thread, one at a time over all visitors, says how far it is and can be cancelled.
+`Session` holds a visitor's scene and its history, independent of HTTP; `build_studio_app` is the HTTP interface. Long
+operations run in a thread, one at a time over all visitors, report their progress and can be cancelled.
 """
 
 from __future__ import annotations

@@ -140,17 +140,18 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     frame, world_from_ego = read_poses(root, name)
     boxes, polygons = _read_boxes(folder), _read_polygons(folder)
     classes = classes or tuple(c for c in GROUND_CLASSES if c in polygons.texts("class"))
+    ground = _make_ground(polygons, classes)
     drive = Drive(
         source=SOURCE,
         sequence=name,
         **_make_boxes(boxes),
         ground_classes=classes,
-        ground=_make_ground(polygons, classes),
+        ground=ground,
         frame=frame,
         world_from_imu=world_from_ego,
     )
     _check_in_sight(boxes.path, drive.center_m, world_from_ego)
-    _check_in_sight(polygons.path, drive.ground.triangles_m.reshape(-1, 3), world_from_ego)
+    _check_in_sight(polygons.path, ground.triangles_m.reshape(-1, 3), world_from_ego)
     moving = drive.timestamp[drive.timestamp != STATIC]
     if len(moving) and not np.isin(moving, frame).any():
         raise ValueError(
@@ -353,8 +354,9 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     fallen = np.flatnonzero(world_from_ego[:, 2, 2] < MIN_UP)
     if len(fallen):
         raise ValueError(
-            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])}; give"
-            " the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other axes)"
+            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])};"
+            " give the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other"
+            " axes)"
         )
     return frame, world_from_ego
 
@@ -398,8 +400,8 @@ def _is_text(value: object) -> bool:
 
 
 def _is_whole(value: object) -> bool:
-    """Whether this is an integer of 0 or more; a float will do, pandas makes them of integers beside a null."""
-    return type(value) in (int, float) and 0 <= value <= MAX_WHOLE and value == value // 1
+    """Whether this is an integer of 0 or more; a float may hold it, as in pandas' columns with nulls."""
+    return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:

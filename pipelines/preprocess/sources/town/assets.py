@@ -46,9 +46,9 @@ class Site:
 
 
 def draw_sizes(
-    rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0
+    rng: np.random.Generator, what: str, n: int, scale: float | np.ndarray | tuple[float, float, float] = 1.0
 ) -> np.ndarray:
-    """(n, 3) extents drawn for a kind of thing; l >= w."""
+    """(n, 3) random extents of a kind of object, in metres, length >= width; `scale` is one factor or (3,)."""
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
     drawn = (np.array(median) * scale * factor).clip(low, high)

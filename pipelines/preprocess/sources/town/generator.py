@@ -285,9 +285,9 @@ def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
 
 def list_slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
     """(4 n - 4, 3) faces of a slab in KITTI-360's order: top, bottom, then two per side."""
-    top = np.array(top)
+    upper = np.array(top)
     ring = np.arange(n - 1)
     first = np.stack([ring, ring + 1, n + ring], axis=1)
     second = np.stack([ring + 1, n + ring + 1, n + ring], axis=1)
     sides = np.stack([first, second], axis=1).reshape(-1, 3)
-    return np.concatenate([top, top + n, sides, [[0, n - 1, n], [n - 1, n, 2 * n - 1]]])
+    return np.concatenate([upper, upper + n, sides, [[0, n - 1, n], [n - 1, n, 2 * n - 1]]])

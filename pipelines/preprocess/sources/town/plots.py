@@ -137,7 +137,7 @@ def _plant_borders(
 ) -> None:
     """Hedges and walls round a plot, open at the gate (s0, s1) and before a court; steps and low walls inside."""
     g0, g1 = gate
-    lines = []
+    lines: list[tuple[float, float, float, float]] = []
     if not court and setback > 1.2:
         gate_right = g1 > g0 > width / 2
         lines.append(
