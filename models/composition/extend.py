@@ -35,7 +35,7 @@ def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
     return replace(grid, left_m=grid.left_m + (more_m if side == "left" else 0), cols=grid.cols + pixels)
 
 
-def tile_side(grid: Grid, side: Side, block: Grid, step_px: int) -> Iterator[Grid]:
+def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterator[Grid]:
     """Blocks of the model's size along one side of a grid, every `step_px`; the last one ends with the grid."""
     along = grid.cols if side in ("ahead", "behind") else grid.rows
     size = block.cols if side in ("ahead", "behind") else block.rows
