@@ -118,7 +118,7 @@ class Edit(ABC):
 
     @abstractmethod
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        """The scene with its chosen (n,) primitives changed, and which primitive each of its own (m,) was before.
+        """Return the scene with its chosen (n,) primitives changed, and the previous number (m,) of each primitive.
 
         Raises ValueError for a broken result.
         """

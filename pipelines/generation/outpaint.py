@@ -1,4 +1,4 @@
-"""Scenes -> larger scenes: blocks as Ray tasks, each as soon as the blocks that it depends on are done."""
+"""Extend scenes by blocks over Ray: an actor generates a block as soon as the blocks that it depends on are done."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MAX_RETRIES = 3  # of a block whose process died
 
 @dataclass(frozen=True)
 class OutpaintRequest(Request):
-    """How to extend scenes; `label` None means each scene's own. `num_blocks`: ahead, behind, left, right."""
+    """Options of outpainting. `label` None keeps each scene's label; `num_blocks` are ahead, behind, left, right."""
 
     label: str | None
     seed: int
@@ -63,11 +63,11 @@ class OutpaintRequest(Request):
         return f"{self.source}-{self.seed}-{number:07d}"
 
     def blocks_directory(self, number: int) -> str:
-        """Directory of a scene's blocks, until they are stitched together."""
+        """Return the directory of a scene's blocks; it is deleted once they are stitched together."""
         return storage.join_uri(self.output, "blocks", self.run, f"{number:07d}")
 
     def make_block_grid(self, size: int) -> BlockGrid:
-        """Blocks of `size` latent cells."""
+        """Return the grid of blocks of `size` latent cells."""
         return BlockGrid.from_overlap(size, self.overlap, rank=RANKS[self.order], num_blocks=self.num_blocks)
 
 
@@ -109,7 +109,7 @@ def write_block(block: SceneBlock, path: str) -> None:
 
 
 def read_block(path: str, empty: Scene) -> SceneBlock:
-    """Raises ValueError naming a file that is missing or damaged."""
+    """Read a block. Raises ValueError naming a file that is missing or damaged."""
     try:
         arrays = load(storage.read_bytes(path))
     except SafetensorError as error:
@@ -126,7 +126,7 @@ def read_block(path: str, empty: Scene) -> SceneBlock:
 
 
 class Outpainter:
-    """Actor with a pipeline: generates blocks and stitches a scene's blocks together."""
+    """Actor with a pipeline that generates blocks and stitches a scene's blocks together."""
 
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
@@ -137,14 +137,14 @@ class Outpainter:
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
     def load_scene(self, number: int) -> Scene:
-        """The given scene on the model's grid."""
+        """Return the given scene on the model's grid."""
         shard, row = self.chosen[number]
         return resample_to_model_grid(shard.scenes([row])[0], self.pipeline.spec)
 
     def load_blocks(
         self, number: int, indices: Sequence[BlockIndex]
     ) -> tuple[BlockComposer, Scene, dict[BlockIndex, SceneBlock]]:
-        """A scene's composer, the given scene, and its generated blocks `indices` together with the given one."""
+        """Return a scene's composer, the given scene, and its generated blocks `indices` with the given block."""
         given = self.load_scene(number)
         empty = make_empty_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
         directory = self.request.blocks_directory(number)

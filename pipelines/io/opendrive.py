@@ -19,7 +19,7 @@ from models.scene import Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
 KNOT_M = 5.0  # between points of a reference line
-LANE_M = 3.5  # a road's half of about so many metres is one lane
+LANE_M = 3.5  # half a road of about this width is one lane
 LEAST_ROAD_M = 2.0  # what is left of a road between its junctions
 CLEAR = 1.3  # half widths of the widest road that every road stops short of a node
 SAMPLES = 64  # of a cubic, for its length

@@ -25,7 +25,7 @@ PICTURES = "arr_0"
 
 
 class StoredGaussian(NamedTuple):
-    """What `frechet.frechet_distance` needs of a set of features."""
+    """Mean and covariance of a set of features, for `frechet.compute_frechet_distance`."""
 
     mean: np.ndarray  # (d,) float64
     covariance: np.ndarray  # (d, d) float64
@@ -41,7 +41,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """The archive. ValueError naming the file for a missing, truncated or damaged one, whenever that shows."""
+    """Open the archive. Raises ValueError naming a missing, truncated or damaged file, also during reading."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
@@ -85,10 +85,18 @@ def read_picture_shape(path: str) -> tuple[int, int, int, int]:
 
 
 def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
-    """uint8 arrays (batch, height, width, 3), the last one shorter, in the order of the file; one in memory at a time.
+    """Read pictures in batches, in the order of the file, with one batch in memory at a time.
 
-    path is local or a URI; the archive may be compressed. Raises ValueError, naming the file, at once if it is
-    missing, truncated, of another type or pickled, and while reading if its checksum does not fit.
+    Args:
+        path: Local path or URI of the archive, which may be compressed.
+        batch: Pictures per batch.
+
+    Returns:
+        Iterator of uint8 arrays (batch, height, width, 3); the last one may be shorter.
+
+    Raises:
+        ValueError: The file is missing, truncated, of another type or pickled (raised immediately), or its checksum is
+            wrong (raised while reading). The message names the file.
     """
     if batch < 1:
         raise ValueError(f"a batch holds at least 1 picture, got {batch}")

@@ -93,7 +93,7 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
 
 
 def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, str], object]) -> tuple[list[str], list]:
-    """Scene ids of a shard's files and what `read(index, scene id, uri)` makes of them; writes its rejects, if any."""
+    """Return the scene ids of a shard's files and the results of `read(index, scene id, uri)`; write its rejects."""
     names, contents, rejects = [], [], []
     for index, name, uri in request.files_of(shard):
         try:
@@ -129,7 +129,7 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
 
 
 def write_pictures(row: dict, request: ImportRequest) -> dict:
-    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures beside the final file."""
+    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures next to the final file."""
     shard = request.shards()[row["shard"]]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):

@@ -132,7 +132,7 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     `classes` are the ground classes of the whole dataset (`ground_classes`), None those of this drive alone.
     `timestamp` is the frame of a moving box, else STATIC; `instance_id` the given number, of a text a hash that is
     equal on every machine, -1 where there is none; `heading_rad` the yaw of the x axis where that is known.
-    Raises ValueError, naming file and row, for whatever is missing or makes no sense.
+    Raises ValueError naming file and row of a missing or invalid value.
     """
     folder = Path(root, name)
     if not folder.is_dir():
@@ -442,7 +442,7 @@ def _make_boxes(table: _Table) -> dict[str, np.ndarray]:
 
 
 def _make_instance_ids(table: _Table) -> np.ndarray:
-    """(rows,) int64: numbers as they are, texts by the first 63 bits of their BLAKE2 hash, -1 where there is none."""
+    """(rows,) int64: numbers unchanged, texts as the first 63 bits of their BLAKE2 hash, -1 for nulls."""
     ids = []
     for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
         if _is_text(value):

@@ -66,7 +66,7 @@ def plant_strip(
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
-    """Cars parked at s; most look the way the traffic beside them goes."""
+    """Park cars at s; most point in the direction of the adjacent lane."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
     site.sheet.boxes(

@@ -3,7 +3,7 @@
     drive = town_drive(7)          # one town and one drive through its streets
     scene = drive.scene(0)         # what lies ahead of the first pose
 
-numpy only. The same seed gives the same town (under one numpy); a change of what comes out raises TOWN_VERSION.
+numpy only. The same seed gives the same town (under one numpy); a change of its output raises TOWN_VERSION.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ POSE_SPACING_M = 10.0
 IMU_HEIGHT_M = 0.93  # above the true surface of the road, as KITTI-360's
 METRES_PER_FRAME = 0.7
 
-# KITTI-360's own names (its XML spelling) -> our categories; vegetation is told apart by its shape.
+# KITTI-360's names (in the spelling of its XML) -> our categories; the shape decides the category of vegetation.
 LABEL_CATEGORY = {
     "vegetation": "vegetation_cuboid",
     "truck": "vehicle_big",

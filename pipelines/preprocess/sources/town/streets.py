@@ -171,7 +171,7 @@ def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
     points: list[tuple[float, float]] = []
     for quadrant, (su, sv) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
         first, second = arms[quadrant], arms[(quadrant + 1) % 4]
-        # The end of an arm is a straight edge: its two corners come from the quadrants beside it.
+        # The end of an arm is a straight edge; the two adjacent quadrants add one corner each.
         along_first = (hu + r, hv) if quadrant % 2 == 0 else (hu, hv + r)
         along_second = (hu, hv + r) if quadrant % 2 == 0 else (hu + r, hv)
         if first and second:
