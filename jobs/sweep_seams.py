@@ -21,8 +21,8 @@ from jobs.support.options import GenerationOptions
 @dataclass(frozen=True)
 class Config(GenerationOptions):
     settings: tuple[tuple[int, int, int, float, float], ...] = (
-        (250, 10, 10, 0, 1), (250, 5, 5, 0, 1), (250, 1, 1, 0, 1), (50, 10, 10, 0, 1), (50, 5, 5, 0, 1), (50, 1, 1, 0, 1),
-        (50, 1, 1, 1, 1), (50, 1, 1, 1, 0),
+        (250, 10, 10, 0, 1), (250, 5, 5, 0, 1), (250, 1, 1, 0, 1), (50, 10, 10, 0, 1), (50, 5, 5, 0, 1),
+        (50, 1, 1, 0, 1), (50, 1, 1, 1, 1), (50, 1, 1, 1, 0),
     )  # fmt: skip
     """Settings, five numbers each: steps, jump length, resamplings, pseudoinverse guidance, eta."""
     overlap: float = 0.5

@@ -14,7 +14,7 @@ from typing import Any, Literal, cast, get_args
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from torch import Tensor, nn
 
 from models.base import ConfiguredModel, register_to_config
@@ -24,7 +24,7 @@ FREQUENCIES = 256
 Prediction = Literal["epsilon", "v_prediction"]
 
 
-def embed_timesteps(timestep: Float[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
+def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
     """Sinusoidal embedding of a timestep, cosines first."""
     half = FREQUENCIES // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
@@ -59,7 +59,7 @@ class DiTBlock(nn.Module):
         self.modulation = nn.Linear(width, 6 * width)
 
     def forward(
-        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6d"]
+        self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"]
     ) -> Float[Tensor, "batch n d"]:
         """`modulation` is what the layer of that name makes of the condition."""
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
@@ -78,9 +78,9 @@ class DiT(ConfiguredModel):
     Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
     divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
 
-    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction", sqrt(alpha_bar)
-    noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A small network then need
-    not carry its input's noise through all its layers.
+    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction",
+    sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A
+    small network then need not carry its input's noise through all its layers.
     """
 
     positions: Tensor
@@ -98,9 +98,9 @@ class DiT(ConfiguredModel):
         label: str = "vegetation",
         num_labels: int = 3,
         layout: dict | None = None,
-        shift: tuple[float, ...] | None = None,
-        scale: tuple[float, ...] | None = None,
-        prediction: Prediction = "epsilon",
+        shift: Sequence[float] | None = None,
+        scale: Sequence[float] | None = None,
+        prediction: Prediction | str = "epsilon",
     ) -> None:
         super().__init__()
         if prediction not in get_args(Prediction):
@@ -173,9 +173,16 @@ class DiT(ConfiguredModel):
 
     @torch.no_grad()
     def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
-        """`forward` for these timesteps and labels alone: what depends on nothing else is computed once, not in every step.
+        """Compute the conditioning of these timesteps and labels once and return `forward` for them.
 
-        The modulations are a third of the weights, which each step would read for a row or two. IndexError for others.
+        The modulation layers hold a third of the weights; each step would read them for a row or two.
+
+        Args:
+            timesteps: Timesteps that will be used.
+            labels: Class indices that will be used, the null label included.
+
+        Returns:
+            A denoiser. It raises IndexError for another timestep or label.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
         labels = sorted(set(labels))

@@ -81,7 +81,7 @@ class LayoutSpec:
         return replace(self, grid=replace(self.grid, rows=pixels, cols=pixels, resolution_m=extent_m / pixels))
 
     def feature_unit(self, length_m: float) -> tuple[float, ...]:
-        """(9,) a length in normalised features: of the centre, and of the Cholesky entries, which are roots of metres."""
+        """(9,) a length in normalised features, those of the centre and of the Cholesky entries (roots of metres)."""
         return tuple(
             unit / (high - low)
             for bounds, unit in ((self.center_bounds_m, length_m), (self.cholesky_bounds, length_m**0.5))

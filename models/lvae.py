@@ -54,7 +54,7 @@ class LayoutVAE(ConfiguredModel):
         objects: ObjectConfig = LayoutVAEConfig.objects,
         shortcut: bool = False,
         split_latent: bool = True,
-        branches: Branches = "both",
+        branches: Branches | str = "both",
     ) -> None:
         super().__init__()
         if branches not in BRANCHES:
@@ -97,7 +97,9 @@ class LayoutVAE(ConfiguredModel):
 
     @torch.no_grad()
     def init_from_data(self, batch: LayoutBatch) -> None:
-        """Initialise every output to its mean over `batch`, a sample of training layouts (shortcuts: models/vae/ground.py).
+        """Initialise every output to its mean over `batch`, a sample of training layouts.
+
+        For shortcuts see models/vae/ground.py.
 
         Adam moves a bias by about the learning rate per step. From zero, it would spend thousands of steps on learning
         that a pole is thin and that most pixels are not road.
@@ -175,8 +177,8 @@ class LayoutVAE(ConfiguredModel):
 
         Args:
             noise: Standard normal noise of the reparameterisation.
-            corruption: Additional noise on the latent, in units of each channel's standard deviation over the cells of a
-                scene. Decoders learn to tolerate errors in sampled latents.
+            corruption: Additional noise on the latent, in units of each channel's standard deviation over the cells of
+                a scene. Decoders learn to tolerate errors in sampled latents.
 
         Differs from the paper, which has no such noise. Zheng et al. (RAE, 2025) train decoders with it; here encoders
         are trained with them, and each scene draws its own strength (models.training.sample_corruption).

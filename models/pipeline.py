@@ -1,4 +1,4 @@
-"""PrITTIPipeline: layout VAE and DiT as one object in diffusers' conventions; labels and seeds in, Scenes out. No Ray."""
+"""PrITTIPipeline: layout VAE and DiT as one object in diffusers' conventions. It turns labels and seeds into Scenes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ class PrITTIPipeline:
     Args:
         lvae: Layout VAE.
         dit: Diffusion transformer on its latents.
-        scheduler: A SchedulerConfig or a scheduler of diffusers: noise schedule and sampler (default: the paper's DDPM).
+        scheduler: A SchedulerConfig or a scheduler of diffusers: noise schedule and sampler (default: the paper's
+            DDPM).
         noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`); not in
             the paper.
         existence_threshold: A scene keeps the primitives whose existence probability is higher; 0.3 in the paper.
@@ -113,7 +114,8 @@ class PrITTIPipeline:
         """Load a pipeline from a local directory or by the name of released weights; nothing is downloaded.
 
         Args:
-            directory: What `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town" (models/pretrained.py).
+            directory: What `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town"
+                (models/pretrained.py).
             torch_dtype: Data type of the parameters (default: as stored).
 
         Raises:
@@ -166,7 +168,13 @@ class PrITTIPipeline:
         self.scheduler_config, self._scheduler = SchedulerConfig(type(scheduler).__name__, config), scheduler
 
     def use_sampler(self, name: str) -> None:
-        """Sample with one of `SAMPLERS` ("ddpm" is the paper's). Any other scheduler of diffusers may be set as `scheduler`."""
+        """Sample with one of `SAMPLERS`; "ddpm" is the paper's.
+
+        Any other scheduler of diffusers may be set as `scheduler`.
+
+        Raises:
+            ValueError: The name is unknown.
+        """
         self.scheduler = self.scheduler_config.with_sampler(name)
 
     @property
@@ -423,7 +431,8 @@ class PrITTIPipeline:
             composite: Take everything outside the regions from the input. Otherwise it is the decoders' reconstruction.
 
         Raises:
-            ValueError: A scene is not on the model's grid, or the model's latent is not split and `contents` is not "both".
+            ValueError: A scene is not on the model's grid, or the model's latent is not split and `contents` is not
+                "both".
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:

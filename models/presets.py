@@ -101,7 +101,7 @@ TOWN_TRAINING: dict[str, Any] = {"normalise_latents": True, "learning_rate": 1e-
 # fmt: off
 DIT_PRESETS: dict[str, DiTPreset] = {
     #                         lvae        patch depth width heads batch  steps
-    "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, normalise_latents=True, learning_rate=1e-3),
+    "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, True, 1e-3),
     "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "town":        DiTPreset("town",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     # The paper gives three days on four A100s, not a number of steps.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +81,11 @@ class Grid:
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 
     def intersect(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """(rows, cols) of this grid and of the other that show the same place. ValueError if not aligned to whole pixels."""
+        """Slices (rows, cols) of this grid and of the other that show the same place.
+
+        Raises:
+            ValueError: The grids are not aligned to whole pixels.
+        """
         row0 = (other.front_m - self.front_m) / self.resolution_m
         col0 = (other.left_m - self.left_m) / self.resolution_m
         aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
@@ -100,7 +104,7 @@ class Grid:
         h, w = cells.shape
         return cells.repeat(self.rows // h, axis=0).repeat(self.cols // w, axis=1)
 
-    def pixel(self, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pixel(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """(row, col) of the pixel that holds each point; may lie outside the grid."""
         row = np.floor((self.front_m - np.asarray(x_m)) / self.resolution_m).astype(np.int64)
         col = np.floor((self.left_m - np.asarray(y_m)) / self.resolution_m).astype(np.int64)
@@ -146,7 +150,7 @@ def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     return np.stack(rows, -2)
 
 
-_UNSET = cast(np.ndarray, None)  # replaced by the default that fits the number of primitives
+UNSET = np.zeros(0)  # replaced by the default that fits the number of primitives
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +175,14 @@ class Scene:
     height_m: np.ndarray  # (G, H, W) float32
     occupied: np.ndarray  # (G, H, W) bool
     grid: Grid = field(default_factory=Grid)
-    existence: np.ndarray = _UNSET  # (n,) float32; default: 1, as for annotated primitives
-    heading_rad: np.ndarray = _UNSET  # (n,) float32; default: NaN
-    instance_id: np.ndarray = _UNSET  # (n,) int64; default: -1, none
-    label: np.ndarray = _UNSET  # (n,) str, the dataset's own class name; default: the category's
+    existence: np.ndarray = field(
+        default_factory=lambda: UNSET
+    )  # (n,) float32; default: 1, as for annotated primitives
+    heading_rad: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) float32; default: NaN
+    instance_id: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) int64; default: -1, none
+    label: np.ndarray = field(
+        default_factory=lambda: UNSET
+    )  # (n,) str, the dataset's own class name; default: the category's
     world_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_yaw_rad: float = 0.0
     world_from_imu: np.ndarray | None = None
@@ -190,7 +198,7 @@ class Scene:
             "label": np.array([CATEGORIES[c] for c in self.category], dtype=object),
         }
         for name, value in defaults.items():
-            if getattr(self, name) is None:
+            if getattr(self, name) is UNSET:
                 object.__setattr__(self, name, value)
         shape = (len(self.ground_classes), self.grid.rows, self.grid.cols)
         expected = {"center_m": (n, 3), "rotation": (n, 3, 3), "size_m": (n, 3), "height_m": shape, "occupied": shape}
@@ -204,8 +212,8 @@ class Scene:
         return len(self.category)
 
     def __repr__(self) -> str:
-        grid = self.grid
-        return f"Scene({self.scene_id!r}, {len(self)} primitives, ground {grid.rows} x {grid.cols} at {grid.resolution_m} m)"
+        ground = f"{self.grid.rows} x {self.grid.cols} at {self.grid.resolution_m} m"
+        return f"Scene({self.scene_id!r}, {len(self)} primitives, ground {ground})"
 
     @property
     def volume_m3(self) -> np.ndarray:
@@ -255,7 +263,7 @@ class Scene:
         np.copyto(top, 0, where=winner < 0)
         return top, winner
 
-    def select(self, keep: np.ndarray) -> Scene:
+    def select(self, keep: np.ndarray | slice | Sequence[int]) -> Scene:
         """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
         return replace(self, **{name: getattr(self, name)[keep] for name in PER_PRIMITIVE})
 

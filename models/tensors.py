@@ -10,7 +10,7 @@ import torch
 from models.batch import LayoutBatch
 from models.geometry.cholesky import compute_cholesky_parameters, decode_cholesky_boxes
 from models.layout import FEATURES, LayoutSpec
-from models.scene import CATEGORY_INDEX, Grid, Scene, canonicalize_boxes
+from models.scene import CATEGORY_INDEX, UNSET, Grid, Scene, canonicalize_boxes
 
 EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
@@ -160,9 +160,9 @@ def decode_layout(
         rotation=rotation.astype(np.float32),
         size_m=size.astype(np.float32),
         existence=layout.existence[kept].astype(np.float32),
-        heading_rad=None,
-        instance_id=None,
-        label=None,
+        heading_rad=UNSET,
+        instance_id=UNSET,
+        label=UNSET,
         ground_classes=spec.ground_classes,
         height_m=np.where(occupied, height, 0).astype(np.float32),
         occupied=occupied,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -89,7 +89,7 @@ class NonFiniteLossError(ValueError):
         self.step, self.positions = step, positions
 
 
-LossFunction = Callable[[nn.Module, dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
+LossFunction = Callable[[Callable[..., Any], dict[str, Tensor], list[torch.Generator]], dict[str, Tensor]]
 
 
 def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
@@ -110,7 +110,9 @@ def make_layout_loss(
 ) -> LossFunction:
     """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
 
-    def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
+    def loss(
+        model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
+    ) -> dict[str, Tensor]:
         device = arrays["real"].device
         batch = LayoutBatch.from_compact(arrays)
         noise = sample_noise(generators, latent_shape, device)
@@ -130,8 +132,8 @@ LOGIT_NORMAL = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half 
 def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
     """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
 
-    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these. Logit-normal, as in
-    SD3 (Esser et al., 2024).
+    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these.
+    Logit-normal, as in SD3 (Esser et al., 2024).
     """
     if density == "logit_normal":
         uniform = torch.sigmoid(LOGIT_NORMAL[0] + LOGIT_NORMAL[1] * torch.special.ndtri(uniform))
@@ -149,7 +151,9 @@ def make_diffusion_loss(
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0])[:, None, None]
 
-    def loss(model: nn.Module, arrays: dict[str, Tensor], generators: list[torch.Generator]) -> dict[str, Tensor]:
+    def loss(
+        model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
+    ) -> dict[str, Tensor]:
         mean, logvar, label = arrays["mean"].float(), arrays["logvar"].float(), arrays["label"]
         device = mean.device
         latent = mean + (0.5 * logvar).exp() * sample_noise(generators, shape, device)
@@ -229,8 +233,10 @@ class Trainer:
         self.update_ema()
         return totals | {"grad_norm": norm}
 
-    def _losses(self, network: nn.Module, arrays: dict[str, Tensor], positions: list[int]) -> dict[str, Tensor] | None:
-        """The parts of the loss by `network`, None if it is not finite. Each sample's noise is its own, wherever it is computed."""
+    def _losses(
+        self, network: Callable[..., Any], arrays: dict[str, Tensor], positions: list[int]
+    ) -> dict[str, Tensor] | None:
+        """The parts of the loss of `network`, or None if it is not finite. Each sample has its own noise."""
         generators = [make_keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
         try:
             with self.execution.autocast(self.device):

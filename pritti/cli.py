@@ -16,7 +16,10 @@ from pritti import __version__
 
 def job_files() -> dict[str, Path]:
     """Return the executables of the installed jobs package by command name, such as sample-scenes."""
-    (directory,) = find_spec("jobs").submodule_search_locations
+    spec = find_spec("jobs")
+    if spec is None or not spec.submodule_search_locations:
+        raise ValueError("the package jobs is not installed; install pritti-on-ray again")
+    (directory,) = spec.submodule_search_locations
     files = sorted(path for path in Path(directory).glob("*.py") if path.stem != "__init__")
     return {path.stem.replace("_", "-"): path for path in files}
 

@@ -9,6 +9,13 @@ from pathlib import Path
 # Some virtual machines report AMX but stop oneDNN, which uses it for bfloat16, with an illegal instruction.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
+from jaxtyping import install_import_hook
+
+# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included. Not so in
+# packages with local functions that Ray pickles: checked functions cannot be pickled by value.
+CHECKED = ("models", *(f"pipelines.{name}" for name in ("editing", "geometry", "io", "metrics", "rendering", "schema")))
+install_import_hook([*CHECKED, "pipelines.preprocess.sources", "pipelines.reporting"], "typechecker.check_types")
+
 import numpy as np
 import pytest
 from helpers import (
@@ -309,7 +316,7 @@ def studio_url(studio_files, cluster) -> Iterator[str]:
     from jobs.implementation.serve_studio import serve
     from jobs.serve_studio import Config
 
-    yield serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), threads=1))
+    yield serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), num_threads=1))
     ray_serve.shutdown()
 
 

@@ -23,6 +23,7 @@ from models.scene import (
     CATEGORY_INDEX,
     KITTI_GROUND_CLASSES,
     PER_PRIMITIVE,
+    UNSET,
     Grid,
     Scene,
     canonicalize_boxes,
@@ -242,7 +243,7 @@ def studio_scene(number: int) -> Scene:
         "rotation": rotation,
         "category": np.full(3, CATEGORY_INDEX["vehicle_small"], np.int8),
     }
-    return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=None, **boxes)
+    return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=UNSET, **boxes)
 
 
 def free_port() -> int:

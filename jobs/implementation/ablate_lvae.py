@@ -30,12 +30,14 @@ from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS, find_preset
 from models.studies.orientation_study import StudyConfig
 from models.tensors import make_layout_batch
+from models.vae.config import override_options
 from pipelines.evaluation import ablation
 from pipelines.evaluation.ablation import Variant
 from pipelines.evaluation.reconstruction import evaluate_reconstruction
 from pipelines.reporting.chart import Chart, make_standalone_svg
 from pipelines.reporting.report import Table
 from pipelines.runtime import storage
+from pipelines.schema.run_guard import guard_options
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
 
@@ -190,11 +192,13 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
             batch_size=config.batch_size,
             seed=seed,
             checkpoint_every=max(1, steps // config.num_checkpoints),
-            **switched.options,
+            **dict(switched.options),
         )
     )
     architecture, *rest = training.build.args
-    return replace(training, build=partial(training.build.func, architecture | switched.architecture, *rest))
+    return replace(
+        training, build=partial(training.build.func, override_options(architecture, switched.architecture), *rest)
+    )
 
 
 def train_variant(config: Branches, variant: str, seed: int, output: str) -> dict:
@@ -248,15 +252,17 @@ def guard_study(output: str, options: dict) -> None:
     Raises:
         ValueError: It holds trials of other options.
     """
-    record = storage.join_uri(output, "study.json")
-    kept = [path for path in storage.list_files(output, ".json") if not path.endswith(("/study.json", "/mlflow.json"))]
-    if kept and storage.exists(record) and (made := storage.read_json(record)) != options:
-        key = next(key for key in sorted(made | options) if made.get(key) != options.get(key))
-        raise ValueError(
-            f"{output} holds a study with {key}={made.get(key)}, asked for {options.get(key)}; "
+    records = ("/study.json", "/mlflow.json")
+    guard_options(
+        storage.join_uri(output, "study.json"),
+        options,
+        is_in_use=lambda: any(not path.endswith(records) for path in storage.list_files(output, ".json")),
+        discard=lambda: None,
+        describe=lambda difference: (
+            f"{output} holds a study with {difference}; "
             "use the same options to resume, or another --output for a new study"
-        )
-    storage.write_json(options, record)
+        ),
+    )
 
 
 def write_tables(

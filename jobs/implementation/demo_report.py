@@ -59,14 +59,16 @@ def one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
     return chosen[:count] or scenes[:count]
 
 
-def curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float], list[float]]]:
+def read_curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float], list[float]]]:
     """Return metric histories of an experiment's last run: label -> (steps, values)."""
     api = client(tracking_uri())
     found = api.get_experiment_by_name(experiment)
+    if found is None:
+        raise ValueError(f"MLflow has no experiment {experiment!r}; run the demo again")
     run_id = api.search_runs([found.experiment_id], max_results=1)[0].info.run_id
     tracker = Tracker(tracking_uri(), run_id)
     histories = {label: tracker.history(name) for name, label in names.items()}
-    return {label: tuple(map(list, zip(*h, strict=True))) for label, h in histories.items() if h}
+    return {label: ([x for x, _ in points], [y for _, y in points]) for label, points in histories.items() if points}
 
 
 def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str, float]) -> None:
@@ -101,9 +103,9 @@ def introduction_sections(
             "What this is",
             [
                 "A layout VAE and a diffusion transformer were trained from random weights on a procedural "
-                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. The "
-                "method is the paper's; the models are small and the training is short. Longer runs of the same command "
-                "give better scenes.",
+                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. "
+                "The method is the paper's; the models are small and the training is short. Longer runs of the "
+                "same command give better scenes.",
             ],
         ),
         KeyFigures(
@@ -177,16 +179,16 @@ def training_charts() -> Charts:
     return Charts(
         "Training",
         [
-            Chart("Layout VAE: total loss", curves("pritti-lvae", losses), "step", "loss", log_y=True),
+            Chart("Layout VAE: total loss", read_curves("pritti-lvae", losses), "step", "loss", log_y=True),
             Chart(
                 "Layout VAE: held-out ground IoU",
-                curves("pritti-lvae", {"validation_ground_iou": "held out"}),
+                read_curves("pritti-lvae", {"validation_ground_iou": "held out"}),
                 "step",
                 "IoU",
             ),
             Chart(
                 "Diffusion transformer: noise error",
-                curves("pritti-dit", losses),
+                read_curves("pritti-dit", losses),
                 "step",
                 "mean squared error",
                 log_y=True,

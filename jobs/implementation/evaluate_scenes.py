@@ -24,14 +24,14 @@ from pipelines.reporting.evaluation_report import format_value, list_headlines, 
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.scene_subset import SceneSubset
+from pipelines.schema.scene_subset import Pick, SceneSubset
 from pipelines.training.latents import digest_weights, load_lvae
 
 
 def evaluate(config: Config) -> dict:
     """Evaluate, write all files, and return the nested metrics of metrics.json."""
     check_evaluate_scenes(config)
-    dataset = None
+    dataset: Dataset | None = None
     if config.lvae or not config.real.endswith(".npz"):
         dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
     named = config.run or config.generated_source or not config.lvae
@@ -41,7 +41,7 @@ def evaluate(config: Config) -> dict:
     sides = select_sides(config, dataset) if wanted else {}
     start_ray()
     with Progress() as bar:
-        if config.lvae:
+        if config.lvae and dataset is not None:
             scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
         if wanted:
             scores["generation"] = evaluate_generation(config, dataset, sides, output, bar)
@@ -63,7 +63,7 @@ def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Sc
     made = sides.get("generated")
     about["generated"] = made and made.root
     sources = {shard.source for shard, _ in made.shards()} if isinstance(made, SceneSubset) else ()
-    if len(sources) == 1:
+    if made is not None and len(sources) == 1:
         about["source"] = sources.pop()
         record = storage.join_uri(made.root, f"{about['source']}.json")
         about["sampling"] = storage.read_json(record) if storage.exists(record) else None
@@ -108,14 +108,14 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
     """
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = absolute(config.generated) if config.generated else home("generated")
-    labels = "balanced" if config.balance_labels else "spread"
+    labels: Pick = "balanced" if config.balance_labels else "spread"
     sides, counts, sizes = {}, {}, {}
     for name, path in (("real", absolute(config.real) if config.real else ""), ("generated", generated)):
         if path.endswith(".npz"):
             count, *sizes[name], _ = read_picture_shape(path)
             counts[name], sides[name] = min(count, config.max_scenes), ImageFile(path, count)
             continue
-        if name == "real":
+        if name == "real" and dataset is not None:
             side = SceneSubset(
                 dataset.root,
                 dataset.source,

@@ -28,7 +28,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         variants=config.num_variants,
         label=config.label or None,
         seed=config.seed,
-        resampling=repaint_settings(config),
+        repaint=repaint_settings(config),
         guidance_scale=config.guidance_scale,
     )
     start_ray()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from math import ceil
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from rich.progress import MofNCompleteColumn, Progress
 
 from jobs.implementation.checks import check_outpaint_scenes
@@ -56,9 +55,9 @@ def outpaint(config: Config) -> pa.Table:
         seed=config.seed,
         overlap=config.overlap,
         mode=config.neighbour_latents,
-        resampling=repaint_settings(config),
+        repaint=repaint_settings(config),
         guidance_scale=config.guidance_scale,
-        last=counts,
+        num_blocks=counts,
         order=config.order,
         batch_size=config.batch_size,
     )
@@ -72,7 +71,7 @@ def outpaint(config: Config) -> pa.Table:
 def main(config: Config) -> None:
     blocks, output = outpaint(config), config.output_directory()
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
-    if bare := pc.sum(pc.less(blocks["known_ground"], HARDLY_KNOWN)).as_py():
+    if bare := int((blocks["known_ground"].to_numpy() < HARDLY_KNOWN).sum()):
         print(
             f"{bare} of {len(blocks)} blocks had almost no known ground, where outpainting fails (as in the paper): "
             f"known_ground below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"

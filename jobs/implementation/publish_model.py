@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,7 +83,6 @@ def write_entry(
 ) -> str:
     """Write weights, card, checksums, scores and pictures of an entry; return the card's version."""
     pipeline.save_pretrained(directory)
-    remove_local_paths(directory)
     sums, kind = compute_checksums(directory), pipeline.dit.config.label
     card = ModelCard(
         name, version, kind, LABELS[kind], trainings, facts, about["sampling"], about["real_split"], scores, sums
@@ -96,13 +96,6 @@ def write_entry(
     for picture, image in draw_examples(about).items():
         storage.write_whole(f"{directory}/{picture}.png", lambda stream, image=image: stream.write(image))
     return card.version
-
-
-def remove_local_paths(directory: str) -> None:
-    """Remove the directory of this machine from which diffusers loaded a model."""
-    for path in storage.list_files(directory, ".json"):
-        content = storage.read_json(path)
-        storage.write_json({key: value for key, value in content.items() if key != "_name_or_path"}, path)
 
 
 def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
@@ -157,7 +150,7 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
     runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
     if not runs:
         if record := read_published_training(digest):
-            return TrainingRecord(**record | {"stage": stage})
+            return TrainingRecord(**{**record, "stage": stage})
         raise ValueError(
             f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); "
             "set MLFLOW_TRACKING_URI"
@@ -176,7 +169,7 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
     )
 
 
-def read_published_training(digest: str) -> dict | None:
+def read_published_training(digest: str) -> dict[str, Any] | None:
     """Return the record of a training run from a published entry of the package or of this machine."""
     for zoo in (str(WEIGHTS), home("zoo")):
         for path in storage.list_files(zoo, TRAINING_NAME):

@@ -49,7 +49,7 @@ def sweep_samplers(config: Config) -> list[dict]:
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
     for steps in config.num_inference_steps:  # raises for an invalid number before hours of valid ones
-        Diffusion().visited(steps)
+        Diffusion().select_timesteps(steps)
     for scaling in config.noise_scalings:
         check_noise_scaling(scaling)
     dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))

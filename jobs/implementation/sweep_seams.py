@@ -37,7 +37,7 @@ def sweep_seams(config: Config) -> list[dict]:
 
     for setting in config.settings:
         RePaintConfig(*setting).transitions()  # raises for an invalid setting before hours of valid ones
-        Diffusion().visited(setting[0])
+        Diffusion().select_timesteps(setting[0])
     output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
@@ -54,7 +54,7 @@ def sweep_seams(config: Config) -> list[dict]:
                 seed=config.seed,
                 overlap=config.overlap,
                 mode=config.neighbour_latents,
-                resampling=RePaintConfig(*setting),
+                repaint=RePaintConfig(*setting),
                 guidance_scale=config.guidance_scale,
                 batch_size=config.batch_size,
             )
@@ -63,7 +63,7 @@ def sweep_seams(config: Config) -> list[dict]:
             measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
             objects = count_objects_per_ha(read_scenes(output, request.source))
             seams = int(measured.seams.sum())
-            rows.append(make_seam_row(request.resampling, seams, objects, estimate_seam_ratios(measured.records)))
+            rows.append(make_seam_row(request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
             pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
     storage.write_json(rows, storage.join_uri(output, "sweep.json"))

@@ -22,15 +22,15 @@ from jobs.support.model_directories import pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, publish_directory
-from jobs.support.value_names import PREDICTION_TYPES, TIMESTEP_SAMPLINGS
+from jobs.support.value_names import RECORDED_PREDICTIONS, RECORDED_TIMESTEPS
 from jobs.train_dit import Config
 from jobs.train_lvae import Config as LVAEConfig
 from models.dit import DiT
 from models.labels import LABELS
 from models.lvae import LayoutVAE
-from models.pipeline import PrITTIPipeline, scheduler
+from models.pipeline import PrITTIPipeline
 from models.presets import DIT_PRESETS, LVAE_PRESETS, DiTPreset, find_preset
-from models.training import ExecutionConfig, OptimizerConfig, make_dit_trainer
+from models.training import ExecutionConfig, OptimizerConfig, TimestepSampling, Trainer, Wrap, make_dit_trainer
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -63,13 +63,13 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     record = trainer.guard_run_name(name, home("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
-    timesteps = TIMESTEP_SAMPLINGS[config.timestep_sampling]
+    timestep_sampling = parse_timestep_sampling(config)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     training = TrainingRun(
         name=name,
         storage_path=home("runs"),
-        build=partial(build, architecture, settings, execution, row.label_dropout, start, timesteps),
+        build=partial(build, architecture, settings, execution, row.label_dropout, start, timestep_sampling),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LatentReader(latents_root, config.label_kind),
         settings=settings,
@@ -80,6 +80,11 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label_kind),
     )
     return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
+
+
+def parse_timestep_sampling(config: Config) -> TimestepSampling:
+    """Return the distribution of training timesteps."""
+    return "logit_normal" if config.timestep_sampling == "logit-normal" else "uniform"
 
 
 def make_smoke_latents(root: str) -> None:
@@ -97,7 +102,7 @@ def resolve_preset(config: Config) -> DiTPreset:
     if config.batch_size is not None:
         row = replace(row, batch_size=config.batch_size)
     if config.prediction_type is not None:
-        row = replace(row, prediction=PREDICTION_TYPES[config.prediction_type])
+        row = replace(row, model=replace(row.model, prediction=config.prediction_type))
     if config.normalise_latents is not None:
         row = replace(row, normalise_latents=config.normalise_latents)
     return row
@@ -160,15 +165,15 @@ def run_identity(
         preset=config.preset,
         batch_size=row.batch_size,
         label=config.label_kind,
-        prediction=row.prediction,
+        prediction=RECORDED_PREDICTIONS[row.model.prediction],
         normalise_latents=row.normalise_latents,
         lvae=latents["lvae_digest"],
         dataset=root,
     )
     if start:
         identity |= {"start_from": start.digest}
-    if config.timestep_sampling != "uniform":  # absent for uniform, so that runs from before this option resume
-        identity |= {"timesteps": TIMESTEP_SAMPLINGS[config.timestep_sampling]}
+    if (sampling := parse_timestep_sampling(config)) != "uniform":  # absent in records of earlier versions
+        identity |= {"timesteps": RECORDED_TIMESTEPS[sampling]}
     return identity
 
 
@@ -215,14 +220,21 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
 
 
 def build(
-    architecture: dict, settings, execution, label_dropout: float, start: Start | None, timesteps: str, device, wrap
-):
+    architecture: dict,
+    settings: OptimizerConfig,
+    execution: ExecutionConfig,
+    label_dropout: float,
+    start: Start | None,
+    timestep_sampling: TimestepSampling,
+    device: torch.device,
+    wrap: Wrap,
+) -> Trainer:
     """Return the Trainer of stage 2, with the same initial weights on every worker."""
     torch.manual_seed(settings.seed)
     model = DiT(**architecture)
     if start:
         model.load_state_dict(start.state)
-    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timesteps)
+    return make_dit_trainer(model, settings, label_dropout, device, wrap, execution, timestep_sampling)
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
@@ -233,8 +245,8 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
         sampling: `noise_scaling` and `existence_threshold`, where they differ from the paper's.
         output: Directory that contains dit/; returned.
     """
-    dit = DiT.from_pretrained(storage.join_uri(output, "dit"), low_cpu_mem_usage=False)
-    pipeline = PrITTIPipeline(load_lvae(lvae), dit, scheduler(), **sampling)
+    dit = DiT.from_pretrained(storage.join_uri(output, "dit"))
+    pipeline = PrITTIPipeline(load_lvae(lvae), dit, **sampling)
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +26,7 @@ from models.batch import LayoutBatch
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS, LVAEPreset, find_preset
-from models.training import ExecutionConfig, OptimizerConfig, make_lvae_trainer
+from models.training import ExecutionConfig, OptimizerConfig, Trainer, Wrap, make_lvae_trainer
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -32,7 +34,7 @@ from pipelines.schema.tables import find_shards
 from pipelines.training.data_loader import LayoutReader, Stream
 from pipelines.training.latents import digest_weights, load_lvae
 
-OF_OBJECT_DECODER = ("decoder", "head_hidden", "least_per_cell")  # keys of an architecture
+OF_OBJECT_DECODER = ("decoder", "head_hidden", "min_proposals_per_cell")  # options of the object branch
 START_SCENES, START_SHARDS = 96, 16  # training scenes from which the model is initialised
 
 
@@ -131,8 +133,8 @@ def run_identity(
     )
     if config.flip or config.jitter:
         identity |= {"augmentation": asdict(augment)}
-    if row.min_proposals_per_cell != 1:  # absent at 1, so that runs from before this option resume
-        identity |= {"least_per_cell": row.min_proposals_per_cell}
+    if (least := row.model.objects.min_proposals_per_cell) != 1:  # absent in records of earlier versions
+        identity |= {"least_per_cell": least}
     return identity
 
 
@@ -163,9 +165,8 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     """
     pipeline = load_pipeline(pipeline_directory(model))
     lvae = pipeline.lvae
-    for key, wanted in architecture.items():
-        built = lvae.config[key]
-        if key not in OF_OBJECT_DECODER and (tuple(built) if isinstance(built, list) else built) != wanted:
+    for (key, built), (_, wanted) in zip(list_kept_options(lvae.config), list_kept_options(architecture), strict=True):
+        if built != wanted:
             raise ValueError(
                 f"--train-object-decoder-of {model}: its {key} is {built}, this preset's {wanted}; "
                 "choose its own preset"
@@ -175,6 +176,16 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
             f"--train-object-decoder-of {model}: its layout differs from this dataset's; choose its own dataset"
         )
     return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict())
+
+
+def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """List the options of a LayoutVAE by name, without the layout and those of the object decoder."""
+    found: list[tuple[str, Any]] = []
+    for name, option in options.items():
+        value = asdict(option) if is_dataclass(option) and not isinstance(option, type) else option
+        entries = list(value.items()) if isinstance(value, Mapping) else [(name, value)]
+        found += [entry for entry in entries if name != "layout" and entry[0] not in OF_OBJECT_DECODER]
+    return found
 
 
 def require_replaceable(name: str, kept: Kept) -> None:
@@ -212,7 +223,7 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
 
 
 def sample_layouts(shards: list, counts: list[int], spec) -> dict:
-    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset (LayoutVAE.start_at)."""
+    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset, for `init_from_data`."""
 
     read, parts = LayoutReader(spec), []
     for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):
@@ -224,17 +235,16 @@ def sample_layouts(shards: list, counts: list[int], spec) -> dict:
 def build(
     architecture: dict,
     layout: dict,
-    settings,
+    settings: OptimizerConfig,
     kl_weight: float,
     latent_noise: float,
-    execution,
+    execution: ExecutionConfig,
     sample: dict,
     kept: Kept | None,
-    device,
-    wrap,
-):
+    device: torch.device,
+    wrap: Wrap,
+) -> Trainer:
     """Return the Trainer of stage 1, with the same initial weights on every worker."""
-
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
     model.init_from_data(LayoutBatch.from_compact(as_tensors(sample)))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import add
+from typing import cast
 
 import numpy as np
 import torch
 
+from models.dit import DiT
 from models.lvae import LayoutVAE
 from models.sampling.diffusion import Diffusion, SamplingSchedule, SceneNoise, make_keyed_generator, sample
 from models.scene import Scene
@@ -55,8 +58,11 @@ class ReconstructionCheck:
         Losses are those of a sampled latent, as in training. Ground IoU, height error and AP3D are those of the mean
         latent, as in the evaluation. The pictures show ground truth above reconstruction.
         """
-        model, scenes = trainer.ema_model().eval(), list(held_out_scenes(self.root, self.source, self.count))
-        spec, sums, losses, rebuilt, matches = model.spec, None, [], [], []
+        model, scenes = (
+            cast(LayoutVAE, trainer.ema_model().eval()),
+            list(held_out_scenes(self.root, self.source, self.count)),
+        )
+        spec, sums, losses, rebuilt, matches = model.spec, [], [], [], []
         for start in range(0, len(scenes), self.batch):
             chosen = scenes[start : start + self.batch]
             batch = make_layout_batch(chosen, spec).to(trainer.device)
@@ -72,11 +78,10 @@ class ReconstructionCheck:
                 matches.append(match_scene(scene, decode_layout(layout, spec, scene, threshold=-1.0)))
                 occupied, height = (v.cpu().numpy() for v in truth)
                 height_m = [spec.height_bounds_m.restore(h[..., None])[..., 0] for h in (height, layout.height)]
-                part = sum_ground(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1])
-                sums = part if sums is None else sums + part
+                sums.append(sum_ground(occupied > 0.5, height_m[0], layout.occupancy > 0.5, height_m[1]))
         model.train()
         scores = compute_ground_scores(
-            sums, spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high])
+            reduce(add, sums), spec.ground_classes, np.array([*spec.height_bounds_m.low, *spec.height_bounds_m.high])
         )
         metrics = {f"validation_{name}": sum(part[name] for part in losses) / len(scenes) for name in losses[0]}
         metrics |= {"validation_ground_iou": scores.iou, "validation_height_rmse_m": scores.height_rmse_m}
@@ -100,7 +105,7 @@ class SamplingCheck:
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the validation loss, with the same noise each time, and pictures of SHOWN generated scenes."""
-        dit, device = trainer.ema_model().eval(), trainer.device
+        dit, device = cast(DiT, trainer.ema_model().eval()), trainer.device
         arrays = held_out_latents(self.root, self.source, self.latents, self.label, self.count)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
         generators = [make_keyed_generator(1, k) for k in range(len(arrays["label"]))]

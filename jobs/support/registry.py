@@ -25,7 +25,7 @@ def register_version(name: str, run_id: str) -> str:
     except MlflowException:
         api.create_registered_model(name, description="PrITTI on Ray: layout VAE and diffusion transformer")
     source = f"{api.get_run(run_id).info.artifact_uri}/{PIPELINE}"
-    version = api.create_model_version(name, source, run_id, await_creation_for=None)
+    version = api.create_model_version(name, source, run_id, await_creation_for=0)
     return f"models:/{name}/{version.version}"
 
 
@@ -43,7 +43,7 @@ def download_pipeline(reference: str) -> str:
         run_id = reference
         if reference.startswith("models:/"):
             name, _, version = reference.removeprefix("models:/").rpartition("/")
-            run_id = api.get_model_version(name, version).run_id
+            run_id = str(api.get_model_version(name, version).run_id)
         directory = os.path.join(home("registry"), run_id)
         if os.path.exists(os.path.join(directory, INDEX_NAME)):
             return directory

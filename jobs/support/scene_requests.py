@@ -19,10 +19,10 @@ def select_scenes(options: SceneOptions) -> SceneSubset:
 def repaint_settings(options: RePaintOptions) -> RePaintConfig:
     """Return the paper's or the guided settings, with every setting that an option overrides."""
     given = {
-        "num_steps": options.num_inference_steps,
+        "num_inference_steps": options.num_inference_steps,
         "jump_length": options.jump_length,
         "resamplings": options.num_resamplings,
-        "known_guidance": options.pseudoinverse_guidance,
+        "pseudoinverse_guidance": options.pseudoinverse_guidance,
         "eta": options.eta,
     }
     start = RePaintConfig.guided() if options.guided else RePaintConfig()

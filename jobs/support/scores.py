@@ -32,9 +32,9 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     """
     rows, known = [], {}
     for name, value in flatten_scores(scores).items():
-        score = value if isinstance(value, Estimate) else Estimate(value, None, None)
-        rows.append({"metric": name} | score._asdict())
-        named = {"": score.value, ".low": score.low, ".high": score.high}
+        score = value._asdict() if isinstance(value, Estimate) else {"value": value, "low": None, "high": None}
+        rows.append({"metric": name} | score)
+        named = {"": score["value"], ".low": score["low"], ".high": score["high"]}
         known |= {name + end: number for end, number in named.items() if number is not None}
     nested = convert_estimates(scores)
     storage.write_json(nested, storage.join_uri(output, "metrics.json"))

@@ -72,8 +72,14 @@ class Tracker:
         run_id = api.create_run(experiment_id, run_name=name).info.run_id
         for key, value in parameters.items():
             api.log_param(run_id, key, value)
-        for key in ("command", "commit", "machine", "versions"):
-            api.set_tag(run_id, key, getattr(provenance, key)())
+        tags = {
+            "command": provenance.format_command(),
+            "commit": provenance.find_commit(),
+            "machine": provenance.describe_machine(),
+            "versions": provenance.list_versions(),
+        }
+        for key, value in tags.items():
+            api.set_tag(run_id, key, value)
         if record:
             storage.write_json({"tracking_uri": uri, "run_id": run_id}, record)
         return cls(uri, run_id)

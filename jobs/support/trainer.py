@@ -19,6 +19,7 @@ import numpy as np
 import ray.train
 import ray.train.torch
 import torch
+from ray import cloudpickle
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 
 from jobs.support.cli import root_cause
@@ -26,6 +27,7 @@ from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
 from models.training import NonFiniteLossError, OptimizerConfig, Trainer
 from pipelines.runtime import storage
+from pipelines.schema.run_guard import guard_options
 from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_batches
 from pipelines.training.latents import digest_weights
 
@@ -162,9 +164,11 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     start_ray(training=True)
     scaling = scaling_for(num_workers, run.stream.batch_size)
     threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
+    work = partial(train_worker, run, threads)
+    packed = cloudpickle.dumps(work)  # pyright: ignore[reportPrivateImportUsage]
     trainer = ray.train.torch.TorchTrainer(
         run_packed,
-        train_loop_config={"packed": ray.cloudpickle.dumps(partial(train_worker, run, threads))},
+        train_loop_config={"packed": packed},
         scaling_config=scaling,
         run_config=RunConfig(
             name=run.name,
@@ -184,6 +188,8 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
             if isinstance(root_cause(failure), ValueError):
                 raise root_cause(failure) from error
         raise
+    if result.checkpoint is None:
+        raise ValueError(f"run {run.name!r} ended without a checkpoint; give more --steps")
     with result.checkpoint.as_directory() as directory:
         publish_directory(os.path.join(directory, "model"), output)
         run.tracker.artifacts(os.path.join(directory, "model"), "model")
@@ -208,22 +214,30 @@ def scaling_for(num_workers: int, batch_size: int) -> ScalingConfig:
 
 
 def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
-    """Bind a run name to its options; return the path of the record of its MLflow run.
+    """Bind a run's name to one set of options.
+
+    Args:
+        name: Name of the run.
+        storage_path: Directory of all runs.
+        identity: Options that a resumed run must share with the run that it continues.
+
+    Returns:
+        Path of the file with its MLflow run.
 
     Raises:
-        ValueError: The name belongs to a run with other options, which has checkpoints.
+        ValueError: The name belongs to other options and has checkpoints.
     """
     directory = storage.join_uri(storage_path, name)
-    record = storage.join_uri(directory, "identity.json")
-    if storage.exists(record) and (made := storage.read_json(record)) != identity:
-        if any("/checkpoint_" in path for path in storage.list_files(directory, ".json")):
-            key = next(key for key in sorted(made | identity) if made.get(key) != identity.get(key))
-            raise ValueError(
-                f"run {name!r} was started with {key}={made.get(key)}, asked for {identity.get(key)}; "
-                "use the same options to resume, or another --name for a new run"
-            )
-        storage.delete_directory(directory)  # it has no checkpoint
-    storage.write_json(identity, record)
+    guard_options(
+        storage.join_uri(directory, "identity.json"),
+        identity,
+        is_in_use=lambda: any("/checkpoint_" in path for path in storage.list_files(directory, ".json")),
+        discard=lambda: storage.delete_directory(directory),
+        describe=lambda difference: (
+            f"run {name!r} was started with {difference}; "
+            "use the same options to resume, or another --name for a new run"
+        ),
+    )
     return storage.join_uri(directory, "mlflow.json")
 
 

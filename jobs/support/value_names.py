@@ -1,7 +1,15 @@
-"""Option values in the field's standard terms -> the values that models/ and pipelines/ take."""
+"""Option values in the field's standard terms -> the values that pipelines/ takes, or that records of runs contain."""
 
-PREDICTION_TYPES = {"epsilon": "noise", "v_prediction": "velocity"}
-TIMESTEP_SAMPLINGS = {"uniform": "even", "logit-normal": "middle"}
-REFERENCES = {"farthest-point": "farthest", "min-distance": "apart", "uniform": "spread"}
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from pipelines.schema.scene_subset import Pick
+
+# Records of training runs keep the names of version 0.1, so that runs of that version resume.
+RECORDED_PREDICTIONS = {"epsilon": "noise", "v_prediction": "velocity"}
+RECORDED_TIMESTEPS = {"uniform": "even", "logit_normal": "middle"}
+REFERENCES: dict[str, Pick] = {"farthest-point": "farthest", "min-distance": "apart", "uniform": "spread"}
 SHEET_PICKS = {"uniform": "spread", "lowest": "lowest", "highest": "highest"}
-EDIT_FRAMES = {"scene": "scene", "object": "own"}
+EDIT_FRAMES: dict[str, Literal["scene", "own"]] = {"scene": "scene", "object": "own"}

@@ -9,8 +9,8 @@ from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 
 # Objects of a category with a higher IoU3D are duplicates (NMS threshold). In the town's 1,000 held-out scenes no two
-# vehicles exceed 0.04 and no two buildings 0.1; the thresholds would remove 4.6 % of its fences, 3.4 % of the signs, 2.2 %
-# of the poles and 0.8 % of the others.
+# vehicles exceed 0.04 and no two buildings 0.1; the thresholds would remove 4.6 % of its fences, 3.4 % of the signs,
+# 2.2 % of the poles and 0.8 % of the others.
 DUPLICATE_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
 DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # crowns grow into each other; used at the border of a known region only
 DUPLICATE_IOU3D[list(VEHICLES)] = 0.05
@@ -21,7 +21,8 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
     """Find objects of a generated scene that are regenerated copies of known ones.
 
     Each known object is matched to at most one generated object of its category, so that the sum of their IoU3D is
-    largest and each exceeds REGENERATED_IOU3D. Objects that exceed DUPLICATE_IOU3D with a known one are copies in any case.
+    largest and each exceeds REGENERATED_IOU3D. Objects that exceed DUPLICATE_IOU3D with a known one are copies in any
+    case.
 
     Args:
         generated: All decoded objects, on both sides of the border.

@@ -20,7 +20,7 @@ from models.tensors import make_empty_scene
 Side = Literal["ahead", "behind", "left", "right"]
 
 
-def expand_grid(grid: Grid, side: Side, pixels: int) -> Grid:
+def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
     """Add pixels to a grid on one side.
 
     Raises:
@@ -35,7 +35,7 @@ def expand_grid(grid: Grid, side: Side, pixels: int) -> Grid:
     return replace(grid, left_m=grid.left_m + (more_m if side == "left" else 0), cols=grid.cols + pixels)
 
 
-def tile_side(grid: Grid, side: Side, block: Grid, step_px: int) -> Iterator[Grid]:
+def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterator[Grid]:
     """Blocks of the model's size along one side of a grid, every `step_px`; the last one ends with the grid."""
     along = grid.cols if side in ("ahead", "behind") else grid.rows
     size = block.cols if side in ("ahead", "behind") else block.rows
@@ -83,7 +83,7 @@ def to_block_frame(
 
 
 def require_blocks(model: SceneGenerator, scene: Scene) -> None:
-    """Raises ValueError if a scene has another resolution or other ground classes than the model, or is below one block."""
+    """Raises ValueError if a scene is smaller than a block or has not the model's resolution and ground classes."""
     spec, block = model.spec, model.spec.grid
     if scene.grid.resolution_m != block.resolution_m or scene.ground_classes != spec.ground_classes:
         raise ValueError(f"{scene}: the model needs {block.resolution_m} m and {', '.join(spec.ground_classes)}")
@@ -139,8 +139,8 @@ def inpaint_blocks(
 ) -> Iterator[InpaintStep]:
     """Regenerate a region of a scene of any size, block by block, once per index; the last step holds the result.
 
-    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit for
-    bit.
+    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit
+    for bit.
 
     Args:
         model, scene: The model and the scene, at least one block large.
@@ -183,7 +183,7 @@ def inpaint_blocks(
 def extend_scene(
     model: SceneGenerator,
     scene: Scene,
-    side: Side,
+    side: Side | str,
     label: str,
     seed: int = 0,
     overlap: float = 0.5,

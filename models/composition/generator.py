@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -19,6 +19,7 @@ StepCallback = Callable[
 ]  # diffusers' callback_on_step_end: pipeline, step, timestep, tensors
 
 
+@runtime_checkable
 class SceneGenerator(Protocol):
     """Encodes, decodes and inpaints scenes of one size."""
 

@@ -21,7 +21,7 @@ from models.scene import Grid, Scene
 
 
 class InfiniteScene:
-    """Blocks of a model in four colours (outpaint.py): each depends on at most nine others, eight neighbours and (0, 0).
+    """Blocks of a model in four colours (outpaint.py); each depends on at most eight neighbours and on block (0, 0).
 
     Block (0, 0) sets the level of the ground. Generated blocks are kept in memory until `drop_block`.
 
@@ -76,7 +76,7 @@ class InfiniteScene:
         self.blocks.pop(index, None)
 
     def get_scene(self, ahead_m: float, behind_m: float, left_m: float, right_m: float) -> Scene:
-        """The rectangle from `behind_m` behind the origin to `ahead_m` ahead and from `right_m` to `left_m`, as one Scene.
+        """One Scene of the rectangle from `behind_m` behind the origin to `ahead_m` ahead, `right_m` to `left_m`.
 
         The rectangle grows to whole pixels.
 

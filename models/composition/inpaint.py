@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation,
 Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a region
 
 
-def contains_points(corners_m: Sequence[Sequence[float]] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
 
     Raises ValueError for fewer than three corners or numbers that are not finite.
@@ -36,7 +36,7 @@ def contains_points(corners_m: Sequence[Sequence[float]] | np.ndarray, x_m: np.n
     return inside
 
 
-def select_polygon(grid: Grid, corners_m: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def select_polygon(grid: Grid, corners_m: Sequence[Any] | np.ndarray) -> np.ndarray:
     """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
     return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
@@ -54,7 +54,11 @@ def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> n
 
 
 def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, margin_m: float = 1.0) -> np.ndarray:
-    """(rows, cols) pixels within the upright bounds of primitives, grown by a margin. IndexError for none of that number."""
+    """(rows, cols) pixels within the upright bounds of primitives, grown by a margin.
+
+    Raises:
+        IndexError: The scene has no primitive of that number.
+    """
     chosen = scene.select(np.asarray(primitives, int))
     region = np.zeros((scene.grid.rows, scene.grid.cols), bool)
     upright = make_yaw_rotation(chosen.yaw_rad)
@@ -78,7 +82,7 @@ def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
     return grid.upsample_cells(find_region_cells(region, size))
 
 
-def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents) -> Tensor:
+def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents | str) -> Tensor:
     """(b, c, h, w) float32, 1 = regenerate. The first half of a split latent's channels is the ground's.
 
     Raises:
@@ -98,10 +102,10 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
 def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
     """Combine a scene with its regenerated part; everything outside the region is the input's, bit for bit.
 
-    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known ground
-    at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region differs
-    slightly from the scene although the latent there does not: a known object near the border may be decoded a little
-    inside the region. Such copies are removed.
+    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known
+    ground at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region
+    differs slightly from the scene although the latent there does not: a known object near the border may be decoded a
+    little inside the region. Such copies are removed.
 
     Args:
         scene: Input.

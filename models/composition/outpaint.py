@@ -3,10 +3,10 @@
 The paper extends a scene to three by three blocks, with the given one in the middle. Any rectangle works the same way
 with more blocks, and so does an unbounded grid; only the order differs in which neighbours are generated.
 
-Block (i, j) lies i steps ahead and j steps left of block (0, 0); a step is (1 - overlap) of a block. The rank of a block
-follows from (i, j) alone. Where blocks overlap, the lowest rank owns the cell; blocks of equal rank never overlap in cells
-that they own. A block is conditioned on the cells that lower ranks own. The result therefore does not depend on when,
-where or in which order blocks are generated.
+Block (i, j) lies i steps ahead and j steps left of block (0, 0); a step is (1 - overlap) of a block. The rank of a
+block follows from (i, j) alone. Where blocks overlap, the lowest rank owns the cell; blocks of equal rank never
+overlap in cells that they own. A block is conditioned on the cells that lower ranks own. The result therefore does not
+depend on when, where or in which order blocks are generated.
 """
 
 from __future__ import annotations

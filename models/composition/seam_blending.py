@@ -1,10 +1,10 @@
 """Blend generated ground into known ground at seams.
 
 A new part is decoded together with the known part, so the decoder draws both sides consistently; but the known side is
-kept as given, and where the two differ by a pixel of kerb or a centimetre of height the seam is visible. The difference at
-the seam is therefore added to the new side and falls off with distance. A decoder that sees a latent half known and half
-new may also draw a step at the seam: a slope there that exceeds MAX_SLOPE and the slope of the known ground is removed in
-the same way. Differs from the paper, which pastes.
+kept as given, and where the two differ by a pixel of kerb or a centimetre of height the seam is visible. The
+difference at the seam is therefore added to the new side and falls off with distance. A decoder that sees a latent
+half known and half new may also draw a step at the seam: a slope there that exceeds MAX_SLOPE and the slope of the
+known ground is removed in the same way. Differs from the paper, which pastes.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ MAX_SLOPE = 0.08  # rise per metre across the seam where known ground is less st
 def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     """Blend generated ground into the known ground at seams; objects keep their height above the ground.
 
-    Per class, its signed distance from the class's edge and its height take up the difference at the nearest known pixel.
-    Far from the class's known pixels, its height takes up the difference of the surfaces where both are of one class.
+    Per class, its signed distance from the class's edge and its height take up the difference at the nearest known
+    pixel. Far from the class's known pixels, its height takes up the difference of the surfaces where both are of one
+    class.
 
     Args:
         generated: Scene on the grid of `known`.
@@ -60,7 +61,8 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
             new_mask, given, limit_px
         )
         inside = _compute_edge_distance(new_mask, np.ones_like(new), limit_px) + weight * shift_px[nearest] > 0
-        # The class's height everywhere: that of its nearest generated pixel, or of the nearest known one if there is none.
+        # The class's height everywhere: that of its nearest generated pixel, or of the nearest known one if there is
+        # none.
         away, place = _find_nearest(known_mask) if known_mask.any() else (np.full(new.shape, np.inf), nearest)
         level_m = new_m[_find_nearest(new_mask)[1]] if new_mask.any() else known_m[place]
         own = _compute_falloff(away * resolution_m)
@@ -111,7 +113,7 @@ def _find_nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.nd
 def _compute_surface_difference(
     generated: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray
 ) -> np.ndarray:
-    """Metres by which the known surface lies above the generated one where both have one class, with a falloff elsewhere."""
+    """Height of the known above the generated surface in metres where their classes agree, with a falloff elsewhere."""
     known_m, known_class = (part[window] for part in known.surface())
     new_m, new_class = (part[window] for part in generated.surface())
     alike = given & (known_class == new_class) & (known_class >= 0)
@@ -134,7 +136,7 @@ def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_step_m: np.ndarray) -> np.ndarray:
-    """A class's level at known pixels as seen from its nearest new pixel, with at most `max_step_m` of rise per pixel."""
+    """A class's level at known pixels as seen from its nearest new pixel, rising by at most `max_step_m` per pixel."""
     if not new.any():
         return level_m
     distance, nearest = _find_nearest(new)

@@ -126,7 +126,9 @@ def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) right-handed axes whose frame tensor is nearest to (..., 9): the maximum of sum_j T(v_j, v_j, v_j, v_j).
+    """Find the right-handed axes (..., 3, 3) whose frame tensor is nearest to (..., 9).
+
+    They maximise sum_j T(v_j, v_j, v_j, v_j).
 
     Monotone ascent: axes <- the orthogonal polar factor of the gradient (Zhai et al., Complete dictionary learning via
     l4-norm maximization, 2020), which triples the correct digits per round, from STARTS fixed frames.

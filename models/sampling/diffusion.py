@@ -234,8 +234,8 @@ def pseudoinverse_guidance(
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
     """Predict the noise, and the direction that moves the estimate of the clean latent towards the known part.
 
-    Pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement: the transposed Jacobian of the clean
-    estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting alone does not inform the
+    Pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement: the transposed Jacobian of the
+    clean estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting alone does not inform the
     generated part where a network has not learnt to. One call costs about as much as two evaluations.
     """
     with torch.enable_grad():
@@ -257,7 +257,8 @@ def sample_with_scheduler(
 ) -> Float[Tensor, "b c h w"]:
     """Sample clean latents with a scheduler of diffusers, such as DPM-Solver++ or DDIM, after its `set_timesteps`.
 
-    `scheduler` is a SchedulerMixin (diffusers is not imported here). Schedulers that add noise must accept it as an argument, so that each scene keeps its own random numbers.
+    `scheduler` is a SchedulerMixin (diffusers is not imported here). Schedulers that add noise must accept it as an
+    argument, so that each scene keeps its own random numbers.
     """
     latent = noise.draw() * scheduler.init_noise_sigma
     stochastic = str(scheduler.config.get("algorithm_type")).startswith("sde-")

@@ -1,4 +1,4 @@
-"""RePaint (Lugmayr et al., 2022): its options and the order of its sampling steps (paper, supplement B.3, Applications)."""
+"""RePaint (Lugmayr et al., 2022): options and order of its sampling steps (paper, supplement B.3, Applications)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ class RePaintConfig:
     Args:
         num_inference_steps: Number of visited timesteps.
         jump_length, resamplings: See `repaint_transitions`.
-        pseudoinverse_guidance: Guidance weight towards the known region (`diffusion.pseudoinverse_guidance`); 0 is none.
+        pseudoinverse_guidance: Guidance weight towards the known region (`diffusion.pseudoinverse_guidance`); 0 is
+            none.
         eta: Share of DDPM's noise that each step adds (`diffusion.SamplingSchedule`). With few steps, noise removes
             small objects.
 
@@ -61,7 +62,7 @@ class RePaintConfig:
 
     @classmethod
     def guided(cls, num_inference_steps: int = 50) -> RePaintConfig:
-        """Guidance instead of resampling: fewer visible seams and more objects than the paper's options, 24 times as fast."""
+        """Guidance instead of resampling: fewer visible seams, more objects and 24 times the paper's speed."""
         return cls(num_inference_steps, resamplings=1, pseudoinverse_guidance=1.0, eta=0.3)
 
     def __post_init__(self) -> None:

@@ -5,9 +5,9 @@ The autoencoder is the object branch of the layout VAE made small, with one slot
 same numbers out, L1. Whatever the encoding, only the first and the last linear layer differ. The box is centred at
 zero and its centre is not predicted.
 
-Boxes that only yaw leave some numbers of every encoding still (2 of 6, 2 of 7, 9 of 15), and L1 pulls as hard at a number
-that is right but for rounding as at one that is wrong: they disturb what is to be learned. Either all are regressed,
-as in the paper, or only the moving ones.
+Boxes that only yaw leave some numbers of every encoding still (2 of 6, 2 of 7, 9 of 15), and L1 pulls as hard at a
+number that is right but for rounding as at one that is wrong: they disturb what is to be learned. Either all are
+regressed, as in the paper, or only the moving ones.
 
 The paper leaves open: the ranges of the sizes, the network, batch size and learning rate.
 """

@@ -27,9 +27,9 @@ SPARE = 16  # proposals per slot, where MAX_PER_CELL allows them: primitives cro
 class CellDecoder(nn.Module):
     """Object latent -> normalised features in [0, 1] and existence logits of `proposals[k]` primitives per category.
 
-    SPARE times as many proposals as slots where cells allow it, `min_proposals_per_cell` to MAX_PER_CELL per cell and category:
-    rare things, too, come in groups. Cells are read one by one, by the same small network: its neighbours know nothing
-    of a primitive that the cell does not.
+    SPARE times as many proposals as slots where cells allow it, `min_proposals_per_cell` to MAX_PER_CELL per cell and
+    category: rare things, too, come in groups. Cells are read one by one, by the same small network: its neighbours
+    know nothing of a primitive that the cell does not.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:

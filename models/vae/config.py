@@ -14,7 +14,8 @@ class GroundConfig:
     """Ground branch: a convolutional autoencoder of raster maps (models/vae/ground.py).
 
     Args:
-        channels: Width of each block; all blocks but the last halve the resolution. Four blocks give the paper's factor 8.
+        channels: Width of each block; all blocks but the last halve the resolution. Four blocks give the paper's
+            factor 8.
         norm_groups: Groups of each group normalisation.
         pixel_unshuffle: Side of the pixel blocks that become channels first; 1 in the paper, none.
         attention: Self-attention over all cells in the middle of both networks, as in the paper.
@@ -99,7 +100,8 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
         ValueError: An option of a branch is unknown.
     """
     options = nest_flat_options(config)
-    for name, kind in (("ground", GroundConfig), ("objects", ObjectConfig)):
+    kinds: dict[str, Any] = {"ground": GroundConfig, "objects": ObjectConfig}
+    for name, kind in kinds.items():
         if isinstance(entries := options.get(name), Mapping):
             try:
                 options[name] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})

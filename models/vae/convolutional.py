@@ -1,8 +1,8 @@
 """Convolutional encoder and decoder of image autoencoders (Rombach et al., 2022), for the ground branch.
 
-Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`, and outputs agree to the
-last bit (tests/unit/test_convolutional.py). They stand here because importing diffusers costs each process two to three
-seconds.
+Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`, and outputs agree to
+the last bit (tests/unit/test_convolutional.py). They stand here because importing diffusers costs each process two to
+three seconds.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ class ObjectEncoder(nn.Module):
             )
 
     def forward(
-        self, features: Float[Tensor, "batch n 9"], real: Bool[Tensor, "batch n"]
+        self, features: Float[Tensor, "batch n features"], real: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch moments h w"]:
         features, real, category = self.without_padding(features, real)
         batch = len(features)
@@ -205,7 +205,7 @@ class ObjectDecoder(nn.Module):
 
     def forward(
         self, latent: Float[Tensor, "batch c h w"]
-    ) -> tuple[Float[Tensor, "batch n 9"], Float[Tensor, "batch n"]]:
+    ) -> tuple[Float[Tensor, "batch n features"], Float[Tensor, "batch n"]]:
         memory = self.project_in(latent.flatten(2).transpose(1, 2))  # (b, hw, d)
         memory_key = memory + self.positions
         x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d), DETR's zero targets
@@ -219,7 +219,9 @@ class ObjectDecoder(nn.Module):
     def _list_heads(self) -> list[OutputHeads]:
         return [cast(OutputHeads, head) for head in self.heads]
 
-    def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
+    def init_from_data(
+        self, feature_logit: Float[Tensor, "categories features"], count: Float[Tensor, " categories"]
+    ) -> None:
         """Set the last biases: mean features per category, existence as often as `count` per scene."""
         for head, mean, expected, offered in zip(self._list_heads(), feature_logit, count, self.proposals, strict=True):
             cast(Tensor, head.features[-1].bias).copy_(mean)

@@ -118,7 +118,7 @@ class Edit(ABC):
 
     @abstractmethod
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        """The scene with its chosen (n,) primitives changed, and which primitive each of its own (m,) was before.
+        """Return the scene with its chosen (n,) primitives changed, and the previous number (m,) of each primitive.
 
         Raises ValueError for a broken result.
         """
@@ -362,9 +362,10 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
 
 
 def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[ObjectChange]]:
-    """The scene after all edits, and what each of them changed.
+    """Apply edits in order, and report the changes of each.
 
-    Numbers are those of the moment: after a removal the primitives behind it move up. Raises ValueError, naming the edit.
+    The numbers of primitives are those before each edit; after a removal the numbers of later primitives decrease.
+    Raises ValueError naming an edit that fails.
     """
     done = []
     for step, edit in enumerate(edits):

@@ -1,7 +1,7 @@
-"""Repair of a scene's faults by as little as it takes: onto the ground, apart, and only what neither helps is taken out.
+"""Repair a scene's faults with small changes: move objects to the ground, push them apart, remove the remaining ones.
 
-What a fault is says metrics/validity.py. A repair never makes another fault of the same kind worse: a push that would put
-a primitive into a third one is not made.
+metrics/validity.py defines the faults. A repair never makes another fault of the same kind worse: it skips a push that
+would move a primitive into a third one.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ class _Separation:
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
-        """For each pair up to CANDIDATES places (k, 2) where its boxes do not overlap, the shortest push first.
+        """Find up to CANDIDATES places (k, 2) for each pair where its boxes do not overlap, the shortest push first.
 
-        Two boxes that overlap at both ends of a straight way overlap all along it (Brunn-Minkowski: their common volume is
-        log-concave), so a direction whose longest push does not part them is given up at once.
+        Two boxes that overlap at both ends of a straight path overlap along all of it, because their common volume is
+        log-concave (Brunn-Minkowski). A direction is therefore skipped if its longest push does not separate them.
         """
         start = self.now.take(pairs)  # (p, 2, ...)
         share = self.select_primitives[pairs] * start.size_m.prod(axis=2)[:, ::-1]
@@ -127,7 +127,7 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: would one of the two boxes, in each of their places (k, 2), overlap a third too much and more than now?"""
+        """(k,) bool: whether a box of the pair, in places (k, 2), overlaps a third box too much and more than now."""
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
@@ -136,11 +136,11 @@ class _Separation:
         over = then > GOAL_IOU3D
         if over.any():
             over &= then > compute_iou3d_matrix(self.now.take(pair), around)
-        return over.any(axis=(1, 2))
+        return np.any(over, axis=(1, 2))
 
 
 def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:
-    """(n,) bool: as few chosen primitives as parting all overlaps takes; of two, the less certain, then the smaller."""
+    """(n,) bool: few chosen primitives whose removal ends all overlaps; of two, the less certain, then the smaller."""
     gone = np.zeros(len(scene), bool)
     pairs = find_overlapping_pairs(extract_boxes(scene), np.isin(scene.category, SOLID))
     while len(pairs := pairs[(chosen[pairs] & ~gone[pairs]).any(axis=1) & ~gone[pairs].any(axis=1)]):

@@ -1,5 +1,7 @@
-"""The paper's ablations as Ray graphs: encodings of a box (`rebuild_boxes`), what the loss of yaw costs (`yaw_losses`),
-and the tables and drawings of both and of the branches of the layout VAE. Nothing here reads a dataset.
+"""Run the paper's ablations as Ray graphs, and build their tables and charts. No function reads a dataset.
+
+`reconstruct_boxes` compares encodings of a box, `compute_yaw_losses` measures the cost of a lost yaw, and the variants
+compare branches of the layout VAE.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import ray.data
@@ -21,6 +24,7 @@ from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
 from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import map_dataset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
@@ -38,7 +42,7 @@ def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray
 
 @dataclass(frozen=True)
 class Trial:
-    """One autoencoder to train: which boxes, in which encoding, how many, which draw, `all` numbers or the `moving`."""
+    """One autoencoder to train: kind of boxes, encoding, training size, seed, and regressed numbers (all or moving)."""
 
     things: str
     encoding: str
@@ -52,7 +56,11 @@ class Trial:
 
 
 def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
-    """Every encoding at every training size, one seed after the other; the longest first. ValueError for none."""
+    """List trials of every encoding at every training size, seed by seed, the largest size first.
+
+    Raises:
+        ValueError: There is no training size of 2 or more, or no seed.
+    """
     if not counts or min(counts) < 2 or seeds < 1:
         raise ValueError(f"training sizes {list(counts)} and {seeds} seeds: expected sizes of 2 or more, and a seed")
     sizes = sorted(set(counts), reverse=True)
@@ -60,7 +68,7 @@ def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "
 
 
 def draw_training_boxes(trial: Trial) -> CenteredBoxes:
-    """The boxes that a trial trains on. The larger set of a seed begins with the smaller one."""
+    """Draw the training boxes of a trial. The larger set of a seed begins with the smaller one."""
     return draw_boxes(THINGS[trial.things], trial.count, TRAIN_KEY, trial.seed)
 
 
@@ -95,9 +103,15 @@ def reconstruct_boxes(
     parallel: int | None = None,
     on_trial: Callable[[], None] | None = None,
 ) -> list[dict]:
-    """Scores of all trials, each run once: what DIRECTORY has is read, the rest is trained, one CPU per trial.
+    """Return the scores of all trials. Scores in `directory` are read; the other trials are trained.
 
-    `parallel` bounds how many run at a time. Fan-out: one task per trial.
+    Args:
+        wanted: Trials.
+        directory: Directory with one JSON file of scores per trial.
+        settings: Options of the training.
+        test_count: Number of test boxes.
+        parallel: Maximum number of concurrent tasks (default: no limit). Each trial is one task on one CPU.
+        on_trial: Called after each trial.
     """
     paths = {trial: storage.join_uri(directory, f"{trial.name}.json") for trial in wanted}
     missing = [trial for trial in wanted if not storage.exists(paths[trial])]
@@ -105,7 +119,8 @@ def reconstruct_boxes(
         if on_trial and trial not in missing:
             on_trial()
     if missing:
-        graph = ray.data.from_items([asdict(trial) for trial in missing], override_num_blocks=len(missing)).map(
+        graph = map_dataset(
+            ray.data.from_items([asdict(trial) for trial in missing], override_num_blocks=len(missing)),
             run_trial,
             fn_kwargs={"directory": directory, "settings": settings, "test_count": test_count},
             num_cpus=1,
@@ -118,7 +133,7 @@ def reconstruct_boxes(
 
 
 def average_by_size(scores: Iterable[dict]) -> list[dict]:
-    """Mean IoU3D and its spread over seeds, per kind of boxes, numbers regressed, encoding and training size."""
+    """Return mean IoU3D and its spread over seeds, per kind of boxes, regressed numbers, encoding and training size."""
 
     def key(row: dict) -> tuple:
         return list(THINGS).index(row["things"]), row["numbers"], list(ENCODINGS).index(row["encoding"]), row["count"]
@@ -152,29 +167,29 @@ def average_by_size(scores: Iterable[dict]) -> list[dict]:
 
 NOISES = (0.001, 0.003, 0.01, 0.03)  # of each entry's range
 SHARES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
-LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # 0.7935: a square with itself, turned by any yaw; see below
+LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # 0.7935: mean IoU of a square with itself at a random yaw
 
 
 def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
-    """IoU of a square (or of an upright box on it) with itself turned by 0 <= turn <= pi/2: 1 / (sin + cos).
+    """Return the IoU of a square (or of an upright box on it) with itself turned by 0 <= turn <= pi/2: 1 / (sin + cos).
 
-    Its mean over all turns is LOST_YAW_IOU3D: what is left if the yaw of a square footprint is arbitrary.
+    Its mean over all turns is LOST_YAW_IOU3D, the IoU3D of a square footprint with an arbitrary yaw.
     """
     return 1 / (np.sin(turn_rad) + np.cos(turn_rad))
 
 
 @cache
 def find_ranges(encoding: str) -> np.ndarray:
-    """(entries,) by how much each number of an encoding changes over "any" boxes."""
+    """(entries,) range of each number of an encoding over "any" boxes."""
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(THINGS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
 def compute_yaw_loss(row: dict, count: int) -> dict:
-    """Row in: encoding, width_share, noise. Row out: with it what that noise costs `count` boxes of that footprint.
+    """Row in: encoding, width_share, noise. Row out: the same with the IoU3D that `count` such boxes lose.
 
-    Gaussian noise on the numbers of a box, in shares of each entry's range over "any" boxes; entries that never change
-    stay exact. `iou3d_lost_with_yaw` is IoU3D with the truth's axes (extents read off the decoded scatter matrix along
-    them) minus IoU3D as decoded: what the angle alone costs.
+    The noise is Gaussian, in shares of each entry's range over "any" boxes; constant entries remain exact.
+    `iou3d_lost_with_yaw` is IoU3D with the truth's axes minus IoU3D as decoded: the cost of the angle alone. The
+    extents along the truth's axes come from the decoded scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -200,10 +215,10 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
 
 
 def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
-    """`yaw_loss` of every encoding, footprint and noise. Fan-out: one task per encoding and footprint."""
+    """Return `compute_yaw_loss` of every encoding, footprint and noise; one task per encoding and footprint."""
     rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
     graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
-    found = list(graph.map(compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
+    found = list(map_dataset(graph, compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
     return sorted(found, key=lambda r: (list(ENCODINGS).index(r["encoding"]), r["width_share"], r["noise"]))
 
 
@@ -212,13 +227,13 @@ def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Seq
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs from the preset: entries of its architecture, options of its training (jobs/train_lvae.py).
+    """Differences from the preset: entries of its architecture, options of its training (jobs/train_lvae.py).
 
     Entries of a branch are nested, as in `LayoutVAEConfig`: {"ground": {"channels": (16,)}}.
     """
 
     architecture: Mapping[str, object] = field(default_factory=dict)
-    options: Mapping[str, object] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 BRANCHES = {
@@ -227,13 +242,13 @@ BRANCHES = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# The paper's decoder between the same branches and latents. It does not bear the cells' learning rate.
+# The paper's decoder between the same branches and latents. It diverges at the learning rate of the cells.
 DECODERS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Of the ground branch alone; town has (32,) after folding by 8. Linear start: models/vae/ground.py.
+# Variants of the ground branch alone; town has (32,) after pixel unshuffle by 8. Linear start: models/vae/ground.py.
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {
@@ -261,13 +276,13 @@ MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
 
 
 def average_measurements(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
-    """The scores of `rebuild.rebuild` that mean something for a variant; None for the branch that it lacks."""
+    """Return the scores of `evaluate_reconstruction` for a variant; None for a branch that it lacks."""
     kept = variant.architecture.get("branches", "both")
     return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
-    """Mean, lowest and highest of each measure over seeds, per variant."""
+    """Return mean, lowest and highest value of each measure over seeds, per variant."""
     rows, scores = [], list(scores)
     for variant in dict.fromkeys(row["variant"] for row in scores):
         found = [row for row in scores if row["variant"] == variant]
@@ -297,7 +312,7 @@ def build_encoding_table(rows: Sequence[dict]) -> Table:
 
 
 def build_share_table(rows: Sequence[dict]) -> Table | None:
-    """Mean IoU3D by width / length, of the kinds of boxes that have them all; None if none has."""
+    """Tabulate mean IoU3D by width / length, for kinds of boxes with a value in every bin; None if there is none."""
     kept = [row for row in rows if None not in row["iou3d_per_share"]]
     if not kept:
         return None
@@ -311,7 +326,7 @@ def build_share_table(rows: Sequence[dict]) -> Table | None:
 
 
 def build_yaw_table(rows: Sequence[dict]) -> Table:
-    """A row per encoding and footprint; per noise the IoU3D that is lost with the angle, and the error of the angle."""
+    """Tabulate, per encoding, footprint and noise, the IoU3D that is lost with the angle and the error of the angle."""
     noises = sorted({row["noise"] for row in rows})
     columns = ["encoding", "width / length"]
     columns += [f"lost, {100 * n:g} %" for n in noises] + [f"yaw°, {100 * n:g} %" for n in noises]
@@ -321,9 +336,9 @@ def build_yaw_table(rows: Sequence[dict]) -> Table:
         lost = [_round_values(row["iou3d_lost_with_yaw"]) for row in found]
         cells.append([encoding, share, *lost, *(round(row["yaw_error_deg"], 2) for row in found)])
     note = (
-        "Per noise (in shares of each number's range): IoU3D with the true axes minus IoU3D as decoded, and the mean error "
-        f"of the yaw in degrees. A square whose yaw is arbitrary keeps an IoU3D of {LOST_YAW_IOU3D:.4f} and loses "
-        f"{1 - LOST_YAW_IOU3D:.4f}."
+        "Per noise (in shares of each number's range): IoU3D with the true axes minus IoU3D as decoded, and the mean"
+        f" error of the yaw in degrees. A square whose yaw is arbitrary keeps an IoU3D of {LOST_YAW_IOU3D:.4f} and"
+        f" loses {1 - LOST_YAW_IOU3D:.4f}."
     )
     return Table("What the angle costs", columns, cells, note=note)
 
@@ -354,7 +369,7 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
 
 
 def draw_curve_chart(scores: Sequence[dict]) -> Chart:
-    """AP3D on the first held-out scenes while training, against minutes: a line per variant and seed."""
+    """Chart AP3D on the first held-out scenes during training, against minutes: a line per variant and seed."""
     series = {}
     for row in scores:
         per_step = row["training_seconds"] / 60 / row["steps"]
@@ -368,7 +383,7 @@ def _round_values(value: float | str | None) -> float | str | None:
 
 
 def draw_size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> Chart:
-    """The paper's figure: mean IoU3D against training size, a line per encoding with whiskers over seeds."""
+    """Chart mean IoU3D against training size (the paper's figure): a line per encoding with whiskers over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (things, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
@@ -381,12 +396,12 @@ def draw_size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> 
 
 
 def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
-    """Up to the highest, down to the lowest and back to the mean, where the line goes on."""
+    """Yield points up to the highest value, down to the lowest and back to the mean, where the line continues."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
 def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
-    middle = (SHARE_EDGES[1:] + SHARE_EDGES[:-1]) / 2
+    middle = ((SHARE_EDGES[1:] + SHARE_EDGES[:-1]) / 2).tolist()
     chosen = [row for row in rows if row["boxes"] == things and row["training_size"] == count]
     series = {row["encoding"]: (middle, [np.nan if v is None else v for v in row["iou3d_per_share"]]) for row in chosen}
     return Chart(
@@ -398,7 +413,7 @@ def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """IoU3D lost with the angle against width / length: Cholesky at each noise, the others at the largest."""
+    """Chart IoU3D lost with the angle against width / length: Cholesky at each noise, others at the largest noise."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"
@@ -414,7 +429,7 @@ def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
 def render_page(
     title: str, subtitle: str, tables: Sequence[Table], charts: Sequence[Chart], text: Sequence[str] = ()
 ) -> str:
-    """A self-contained page: charts, tables, and words on how it was made."""
+    """Render a self-contained page of charts, tables and a description of the method."""
     sections: list = (
         [DrawingsSection("Figures", [CaptionedSvg(draw_chart_svg(c), c.title) for c in charts], "pairs")]
         if charts

@@ -1,8 +1,8 @@
-"""Scores of any source against any other, from what `describe` says of each scene.
+"""Score any source against any other, from the features of each scene (features.py).
 
-Every score has a 95 % interval over scenes (metrics/intervals.py). Only distances and neighbourhoods of Inception's
-features bear the usual names (fid, sfid, kid, inception_score, precision, ...); those of other features say whose they
-are: `layout_`, of layout statistics, and `random_`, of an untrained network. Reconstruction is scored by rebuild.py.
+Every score has a 95 % interval over scenes (metrics/intervals.py). Only scores of Inception features have the usual
+names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have a prefix: `layout_` for layout
+statistics, `random_` for an untrained network. reconstruction.py scores reconstructions.
 """
 
 from __future__ import annotations
@@ -50,10 +50,17 @@ def compare_datasets(
     k: Sequence[int] = (3,),
     reference: ReferenceMoments | None = None,
 ) -> dict:
-    """Scores of `generated` against `real`, nested, Estimates at the leaves where an interval can be given.
+    """Score `generated` against `real`.
 
-    `reference` are moments of all real pictures where only some are at hand: fid and sfid are then taken to them, as
-    ADM's evaluator does.
+    Args:
+        real: Features of the real scenes, by name.
+        generated: Features of the generated scenes, by name.
+        ground_classes: Ground classes of the layout statistics.
+        k: Neighbourhood sizes of precision and recall.
+        reference: Moments of all real pictures; fid and sfid are then computed against them, as in ADM's evaluator.
+
+    Returns:
+        Nested scores; the leaves are Estimates where an interval exists.
     """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
     if "statistics" in real and "statistics" in generated:
@@ -92,7 +99,7 @@ def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
 
 
 def compute_frechet_to(reference: StoredGaussian, generated: np.ndarray) -> Estimate:
-    """Distance to moments that are given; only the generated samples vary."""
+    """Estimate the Frechet distance to fixed moments; only the generated samples vary."""
     b = compute_moments(generated)
     between = compute_transport(reference, b)
     influence = compute_frechet_influence(generated, b, reference.mean, compute_influence_maps(b, between)[1])
@@ -100,16 +107,23 @@ def compute_frechet_to(reference: StoredGaussian, generated: np.ndarray) -> Esti
 
 
 def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """frechet, mmd, and `neighbourhood_scores`. ValueError for features that are not finite, naming side and sample."""
+    """Compute frechet, mmd and `compute_neighbourhood_scores`.
+
+    Raises:
+        ValueError: Features are not finite; the message names side and sample.
+    """
     real, generated = require_comparable(real, generated, at_least=2)
     found = {"frechet": estimate_frechet(real, generated), "mmd": compute_kernel_distance(real, generated)}
     return found | compute_neighbourhood_scores(real, generated, k)
 
 
 def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """precision_k3, recall_k3, density_k3 and coverage_k3, for each k. ValueError if there are too few samples for it.
+    """Compute precision_k3, recall_k3, density_k3 and coverage_k3, for each k.
 
-    Intervals are over the judged samples; the balls are held fixed, as a sample drawn twice would be its own neighbour.
+    Intervals are over the judged samples. The balls are fixed, because a sample drawn twice would be its own neighbour.
+
+    Raises:
+        ValueError: There are too few samples for the largest k.
     """
     if max(k) >= min(len(real), len(generated)):
         raise ValueError(
@@ -126,17 +140,19 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
 
 
 def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
-    """`neighbours.neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each; features are shared, not copied."""
+    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each, which share one copy of the features."""
     sides = prepare_features(real, generated, k)
     shared = [ray.put(side) for side in sides]
     radii = [
         np.concatenate(ray.get([compute_radii_task.remote(part, rows, k) for rows in split_rows(len(side))]), axis=1)
         for part, side in zip(shared, sides, strict=True)
     ]
-    balls = [ray.put(part) for part in radii]
-    return judge_neighbours(
-        k, ray.get([find_within_task.remote(*shared, *balls, rows) for rows in split_rows(len(real))])
-    )
+    (real_side, generated_side), (real_balls, generated_balls) = shared, [ray.put(part) for part in radii]
+    tasks = [
+        find_within_task.remote(real_side, generated_side, real_balls, generated_balls, rows)
+        for rows in split_rows(len(real))
+    ]
+    return judge_neighbours(k, ray.get(tasks))
 
 
 def split_rows(count: int) -> list[range]:
@@ -149,15 +165,19 @@ def compute_radii_task(side: FeatureSet, rows: range, k: Sequence[int]) -> np.nd
 
 
 @ray.remote(num_cpus=1)
-def find_within_task(*arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return find_within(*arguments)
+def find_within_task(
+    real: FeatureSet, generated: FeatureSet, real_balls: np.ndarray, generated_balls: np.ndarray, rows: range
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return find_within(real, generated, real_balls, generated_balls, rows)
 
 
 def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
-    """Distances of generated samples to the nearest real ones, beside those of real samples to their nearest other.
+    """Compare distances from generated samples to real ones with those between real samples (paper, supplement).
 
-    `memorised`: share of generated samples nearer to a real one than all but 1 % of real samples are to another;
-    `nearest` (m, 3) real rows and `distance` (m, 3) of each generated sample, nearest first (paper, supplement).
+    Returns:
+        `generated` and `real`: statistics of the distance to the nearest (other) real sample. `memorised`: share of
+        generated samples that are nearer to a real one than all but 1 % of real samples are to another. `copies`:
+        share at distance 0. `nearest` (m, 3): real rows of each generated sample, nearest first. `distance` (m, 3).
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
@@ -181,13 +201,13 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
 
 
 def compute_layout_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict:
-    """Statistics and validity of both sides, their distances, and whether scenes are what was asked for."""
+    """Compute statistics and validity of both sides, their distances, and the fidelity to density labels."""
     names = statistics.list_statistic_names(ground_classes)
     sides = {"real": real, "generated": generated}
     means = {side: compute_scene_means(part["statistics"]) for side, part in sides.items()}
     rates = {side: compute_pair_ratios(part["validity"]) for side, part in sides.items()}
     categories = slice(0, len(CATEGORIES))
-    # What two halves of the real scenes differ by: no source can come nearer than about that.
+    # The distance between two halves of the real scenes: about the lowest value that a source can reach.
     halves = real["statistics"][::2], real["statistics"][1::2]
     floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
     distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
@@ -206,13 +226,13 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
 
 
 def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
-    """Column means over the scenes that have a value (NaN: it has none); None where no scene has."""
+    """Estimate column means over the scenes with a value (NaN: no value); None if no scene has one."""
     known = np.isfinite(values)
     return estimate_ratios(np.where(known, values, 0), known)
 
 
 def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
-    """Rates of measures from records (n, 2 measures): numerator and denominator in turn."""
+    """Estimate rates of measures from records (n, 2 measures) that alternate numerator and denominator."""
     return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 
@@ -220,7 +240,7 @@ def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
 
 
 def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
-    """Nested scores as one level, names joined by dots; None, arrays and what is not finite left out."""
+    """Flatten nested scores, with names joined by dots; leaves out None, arrays and numbers that are not finite."""
     flat: dict[str, Estimate | float] = {}
     for name, value in scores.items():
         if isinstance(value, Mapping):
@@ -233,7 +253,7 @@ def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | fl
 
 
 def convert_estimates(scores: Mapping) -> dict:
-    """Nested scores for JSON: an Estimate as value, low and high; arrays left out; what is not finite as null."""
+    """Convert nested scores to JSON: an Estimate to value, low and high, NaN and infinity to null; drop arrays."""
 
     def number(value: float) -> float | None:
         return value if np.isfinite(value) else None

@@ -1,8 +1,7 @@
-"""Scenes, or pictures of an .npz -> what scores are made of: a Ray Data graph with a Parquet file per part; finished
-parts are kept.
+"""Compute the features that scores need, of scenes or of pictures of an .npz, as a Ray Data graph.
 
-Files hold a row per scene (DESCRIBED names the columns), so that a long description goes on where it stopped and can be
-read by anyone.
+Each part becomes a Parquet file with a row per scene; FEATURE_TYPES names the columns. Finished parts are kept, so an
+interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from pipelines.schema.tables import Shard
 
 READER_CPUS = 0.5
 PICTURES_PER_PART = 512
-VERSION = 1  # of what a description holds; another one is made anew
+VERSION = 1  # of the features; files of another version are regenerated
 PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
 # The columns besides scene_id: rows of numbers, of these types.
 FEATURE_TYPES = {
@@ -46,7 +45,7 @@ FEATURE_TYPES = {
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """How pictures are made and seen: mean of supersample^2 points a pixel; Inception weights of this file, if any."""
+    """How pictures are rendered (mean of supersample^2 points per pixel), and the file of Inception weights, if any."""
 
     supersample: int = 1
     inception: str = ""
@@ -68,7 +67,7 @@ SceneSet = SceneSubset | ImageFile  # of a comparison
 
 
 def compute_features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
-    """Features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and with a network Inception's."""
+    """Compute features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and Inception's if given a network."""
     named = {"random": inception.compute_random_features(pictures)}
     if network is not None:
         named |= inception.compute_inception_features(network, pictures)._asdict()
@@ -76,7 +75,7 @@ def compute_features(pictures: np.ndarray, network: inception.Inception | None) 
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
-    """Statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes, over the dataset's ground classes."""
+    """Compute statistics, histograms, validity (n, 14) and label fidelity (n, 6), over the dataset's ground classes."""
     slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
     for scene in scenes:
@@ -91,7 +90,7 @@ def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.nd
 
 
 def compute_label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
-    """(3, 2) of `validity.label_fidelity`; zeros, nothing judged, for a scene without labels, or without a dataset."""
+    """(3, 2) label fidelity; zeros, which mean not judged, for a scene without labels or without a dataset."""
     if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
         return np.zeros((len(validity.LABEL_MEASURES), 2))
     return validity.compute_label_fidelity(scene, dataset.vegetation, dataset.vehicle)
@@ -100,7 +99,7 @@ def compute_label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
 def compute_part(
     number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: FeatureConfig, directory: str
 ) -> dict:
-    """Ray task. Number of a part, a shard with rows, in; the number of its scenes out. Writes the part's file."""
+    """Ray task: write the file of a part, a shard with rows; return the number of its scenes."""
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
@@ -113,7 +112,7 @@ def compute_part(
 
 
 def load_network(looks: FeatureConfig) -> inception.Inception | None:
-    """Loaded once a process, until the file changes."""
+    """Load the Inception network, if any; once per process until the file changes."""
     return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
 
 
@@ -125,7 +124,7 @@ def load_cached_inception(path: str, *_: str | int) -> inception.Inception:
 class ImageFeatureExtractor:
     """Actor. Row in: number of a part, a range of pictures of an .npz. Row out: their number. Writes the part's file.
 
-    The file is read forward, past what other actors describe; a part before the last one begins it anew.
+    An actor reads the file forward and skips the parts of other actors; an earlier part restarts from the beginning.
     """
 
     def __init__(self, path: str, parts: list[range], looks: FeatureConfig, directory: str) -> None:
@@ -178,20 +177,32 @@ def compute_scene_features(
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Per-scene arrays of a side, in the order of its shards or pictures; fidelity and validity flat, see DESCRIBED.
+    """Compute the features of each scene of a side, or read the parts that `directory` already holds.
 
-    Pictures have features only; so have scenes without a dataset, whose ground classes and label thresholds they are
-    judged by. Parts that DIRECTORY holds of the same side and looks are read, the rest is made. Row in: number of a part.
-    Row out: number of scenes. Fan-out: one task per shard, or per PICTURES_PER_PART.
+    One Ray task computes the part of a shard; one actor call computes a part of PICTURES_PER_PART pictures.
+
+    Args:
+        side: Scenes, or pictures of an .npz.
+        dataset: Dataset with the ground classes and label thresholds that scenes are judged by; without one, as for
+            pictures, there are features of pictures only.
+        looks: How pictures are rendered.
+        directory: Directory for a Parquet file per part. Files of another side or other options are deleted.
+        num_actors: Maximum number of concurrent tasks or actors.
+        on_scenes: Receives the number of scenes of each finished part.
+
+    Returns:
+        scene_id (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
     """
+    ranges: list[range] = []
+    shards: list[tuple[Shard, list[int]]] = []
     if isinstance(side, ImageFile):
-        parts = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
-        counts, files, judged_by = [len(part) for part in parts], [storage.fingerprint_file(side.path)], None
+        ranges = [range(at, min(at + PICTURES_PER_PART, side.limit)) for at in range(0, side.limit, PICTURES_PER_PART)]
+        counts, files, judged_by = [len(part) for part in ranges], [storage.fingerprint_file(side.path)], None
     else:
-        parts = side.shards()
-        counts = [len(rows) for _, rows in parts]
+        shards = side.shards()
+        counts = [len(rows) for _, rows in shards]
         tables = ("scenes", "primitives", "rasters")
-        files = [storage.fingerprint_file(shard.path(table)) for shard, _ in parts for table in tables]
+        files = [storage.fingerprint_file(shard.path(table)) for shard, _ in shards for table in tables]
         judged_by = dataset and [asdict(dataset.vegetation), asdict(dataset.vehicle), list(dataset.spec.ground_classes)]
     guard_options(
         storage.join_uri(directory, "described.json"),
@@ -200,15 +211,15 @@ def compute_scene_features(
         discard=lambda: storage.delete_directory(directory),
         describe=str,
     )
-    missing = [number for number in range(len(parts)) if not storage.exists(make_part_path(directory, number))]
+    missing = [number for number in range(len(counts)) if not storage.exists(make_part_path(directory, number))]
     if on_scenes:
         on_scenes(sum(counts) - sum(counts[number] for number in missing))
 
     def describe_scenes(row: dict) -> dict:
-        return compute_part(row["id"], parts, dataset, looks, directory)
+        return compute_part(row["id"], shards, dataset, looks, directory)
 
     if isinstance(side, ImageFile):
-        arguments = side.path, parts, looks, directory
+        arguments = side.path, ranges, looks, directory
         rows = map_actors(missing, ImageFeatureExtractor, arguments, num_actors, num_cpus=READER_CPUS)
     else:
         rows = (
@@ -219,11 +230,11 @@ def compute_scene_features(
     for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])
-    return read_parts(directory, len(parts))
+    return read_parts(directory, len(counts))
 
 
 def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
-    """Scenes by their number within the described selection, in the order asked for."""
+    """Load scenes by their numbers within the selection, in the order of `indices`."""
     counts = np.array([len(rows) for _, rows in parts])
     starts = np.cumsum(counts) - counts
     scenes = {}
@@ -236,7 +247,7 @@ def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> li
 
 
 def make_options_record(looks: FeatureConfig) -> dict:
-    """What tells one description from another; weights count by content, not by name."""
+    """Return the options that features depend on; weights are identified by their hash, not by name."""
     return asdict(looks) | {
         "version": VERSION,
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",

@@ -1,6 +1,6 @@
-"""Scenes through a layout VAE and back, scored: one Ray Data graph, models in actors, scores in tasks behind them.
+"""Evaluate layout-VAE reconstruction over Ray: actors encode and decode scenes, tasks score them.
 
-What comes out of the graph is one record per scene; records add up, and one function turns their sum into scores.
+The graph returns one record per scene. Records add up, and one function computes scores from their sum.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from pipelines.metrics.reconstruction import (
 from pipelines.metrics.validity import LABEL_MEASURES, compute_validity_rates
 from pipelines.rendering.render import render_3d, render_bev
 from pipelines.runtime import storage
-from pipelines.runtime.ray_tasks import count_gpus_per_actor
+from pipelines.runtime.ray_tasks import count_gpus_per_actor, flat_map_dataset, map_dataset
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
@@ -77,17 +77,17 @@ SCENE_SCORES = pa.schema(
 
 
 def make_voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
-    """The paper's 256 x 256 x 32 over the crop, whatever the rasters' resolution."""
+    """Make the paper's grid of 256 x 256 x 32 voxels over the crop, regardless of the rasters' resolution."""
     return VoxelGrid(spec.with_resolution(VOXEL_PX).grid, *range_m)
 
 
 def split_chunks(selection: SceneSubset, size: int) -> list[Chunk]:
-    """A selection in pieces of at most `size` scenes."""
+    """Split a selection into chunks of at most `size` scenes."""
     return [(shard, rows[k : k + size]) for shard, rows in selection.shards() for k in range(0, len(rows), size)]
 
 
 class Reconstructor:
-    """Actor. Row in: number of a chunk. Row out: the chunk's latent means and what they are decoded to, stacked."""
+    """Actor. Row in: number of a chunk. Row out: the chunk's latent means and decoded layouts, stacked."""
 
     def __init__(self, chunks: list[Chunk], lvae: str) -> None:
         self.chunks, self.model = chunks, load_lvae(lvae)
@@ -105,7 +105,7 @@ class Reconstructor:
 
 
 def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
-    """Row of the shard, true scene, decoded layout and latent, scene by scene, of what a Rebuilder put out."""
+    """Yield row of the shard, true scene, decoded layout and latent of each scene in a row from a Reconstructor."""
     shard, rows = chunks[row["id"]]
     for k, (number, scene) in enumerate(zip(rows, shard.scenes(rows), strict=True)):
         layout = DecodedLayout(**{name: row[name][k] for name in DecodedLayout.__dataclass_fields__})
@@ -114,7 +114,7 @@ def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """Everything that reconstruction scores are made of, of one scene."""
+    """The sums of one scene that reconstruction scores are computed from."""
 
     ground: GroundSums  # on the truth's pixels
     raster: GroundSums  # on the model's own, to which the truth is resampled
@@ -123,10 +123,10 @@ class SceneRecord:
     confusion: np.ndarray  # (classes, classes) voxels
     outside: OutsideCounts
     memory: np.ndarray  # bytes of each of MEMORY
-    labels: np.ndarray  # (measures, 2) label fidelity: is the reconstruction's own label the truth's? Zeros: not known
+    labels: np.ndarray  # (measures, 2) label fidelity: whether the reconstruction has the truth's label; zeros: unknown
 
     def to_row(self) -> dict:
-        """Flat arrays, for Arrow."""
+        """Return flat arrays, for Arrow."""
         out = {"confusion": self.confusion.ravel(), "memory": self.memory, "labels": self.labels.ravel()}
         for part in ("ground", "raster", "matches", "pairs", "outside"):
             value = getattr(self, part)
@@ -159,10 +159,10 @@ def make_scene_record(
     voxels: VoxelGrid,
     dataset: Dataset | None = None,
 ) -> SceneRecord:
-    """A scene against its reconstruction; the ground on the truth's pixels and on the model's.
+    """Compare a scene with its reconstruction; the ground on the truth's pixels and on the model's.
 
-    Every true primitive counts, those too that had no slot. AP3D ranks every proposal; pairs and voxels are those of
-    the scene that the decoder means, above the existence threshold.
+    Every true primitive counts, including those without a slot. AP3D ranks every proposal. Pairs and voxels come from
+    the decoded scene, which holds the proposals above the existence threshold.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     rebuilt = decode_layout(layout, spec, truth)
@@ -187,7 +187,7 @@ def make_scene_record(
 def score_chunk(
     row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
 ) -> list[dict]:
-    """Row in: what a Rebuilder put out. Rows out: one record per scene."""
+    """Row in: a row from a Reconstructor. Rows out: one record per scene."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
         | make_scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
@@ -196,7 +196,7 @@ def score_chunk(
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
-    """Row in: what a Rebuilder put out. Rows out: per scene its pictures, (H, W, 3) uint8, all of one size."""
+    """Row in: a row from a Reconstructor. Rows out: the pictures of each scene, (H, W, 3) uint8, all of one size."""
     out = []
     for _, scene, layout, _ in unstack_layouts(row, chunks):
         sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}
@@ -207,10 +207,11 @@ def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
 
 
 def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
-    """Graph: chunks through the LVAE, by one actor per GPU, or by actors that leave half of the CPUs to what follows."""
+    """Build the graph that reconstructs chunks: one actor per GPU, or CPU actors that take READER_CPUS each."""
     per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
     room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
-    return ray.data.range(len(chunks), override_num_blocks=len(chunks)).map(
+    return map_dataset(
+        ray.data.range(len(chunks), override_num_blocks=len(chunks)),
         Reconstructor,
         fn_constructor_args=(chunks, lvae),
         compute=ray.data.ActorPoolStrategy(size=min(num_actors, len(chunks), room)),
@@ -237,13 +238,21 @@ def evaluate_reconstruction(
     dataset: Dataset | None = None,
     on_scene: Callable[[], None] | None = None,
 ) -> Reconstruction:
-    """Reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
+    """Compute the reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
 
-    With a dataset, whose thresholds labels go by, also whether reconstructions keep their density labels.
+    Args:
+        selection: Scenes.
+        lvae: Directory of the layout VAE.
+        num_actors: Maximum number of actors, each with a model.
+        batch_size: Maximum number of scenes per forward pass.
+        voxel_range_m: Bottom and top of the voxel grid, in metres.
+        dataset: Dataset with the thresholds of density labels; without one, label fidelity is not scored.
+        on_scene: Called after each scene.
     """
     spec, chunks = load_lvae(lvae).spec, split_chunks(selection, batch_size)
     voxels = make_voxel_grid(spec, voxel_range_m)
-    graph = reconstruct_chunks(chunks, lvae, num_actors).flat_map(
+    graph = flat_map_dataset(
+        reconstruct_chunks(chunks, lvae, num_actors),
         score_chunk,
         fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset},
         num_cpus=READER_CPUS,
@@ -265,9 +274,12 @@ def evaluate_reconstruction(
 def draw_scenes(
     places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None
 ) -> list[dict]:
-    """Pictures of scenes and of their reconstructions, in order: truth and rebuilt, above and oblique."""
-    graph = reconstruct_chunks(places, lvae, num_actors).flat_map(
-        draw_chunk, fn_kwargs={"chunks": places, "spec": load_lvae(lvae).spec}, num_cpus=READER_CPUS
+    """Draw scenes and their reconstructions, in order: truth and rebuilt, each from above and from an oblique view."""
+    graph = flat_map_dataset(
+        reconstruct_chunks(places, lvae, num_actors),
+        draw_chunk,
+        fn_kwargs={"chunks": places, "spec": load_lvae(lvae).spec},
+        num_cpus=READER_CPUS,
     )
     drawn = {}
     for row in graph.iter_rows():
@@ -278,7 +290,7 @@ def draw_scenes(
 
 
 def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
-    """Scores of all scenes together, as nested plain numbers; per class or category under names that say so."""
+    """Compute the scores over all scenes, as nested plain numbers; scores per class or category have such names."""
     low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
     ground, raster = (
         compute_ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
@@ -338,7 +350,7 @@ def _sum(parts: Iterable):
 
 
 def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
-    """A row per scene; null where a score is undefined, as a height error without ground."""
+    """Return a row per scene; null where a score is undefined, such as a height error without ground."""
 
     def share(part: float, whole: float) -> float | None:
         return float(part / whole) if whole else None
@@ -369,7 +381,7 @@ def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa
 
 
 def measure_table_bytes(chunks: list[Chunk]) -> float:
-    """Mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
+    """Return the mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
     total, scenes = 0.0, 0
     for shard, rows in chunks:
         written = sum(storage.measure_file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))

@@ -1,15 +1,16 @@
-"""How good scenes are by sampler and number of steps: rows, table, charts and page of `jobs/sweep_samplers.py`."""
+"""Compare scores by sampler and number of steps: rows, table, charts and page of `jobs/sweep_samplers.py`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
-# Scores of `evaluate.compare` by their place in it, with their name in words, and which are better: low, high, or close to 1.
+# Scores of `compare_datasets`: their keys in it, their name in words, and which values are better (one: close to 1).
 MEASURES = {
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),
@@ -21,11 +22,11 @@ MEASURES = {
     "count_ratio": (("count_ratio",), "count of a category, furthest from the data's", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
-COMMON = 3.0  # a scene: the counts of rarer categories say little
+COMMON = 3.0  # objects per scene; the counts of rarer categories vary too much
 
 
 def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
-    """The common category whose mean count is furthest from the real one, and generated over real; None without one."""
+    """Return the common category whose mean count is furthest from the real one, and their ratio; None without one."""
     ratios = {}
     for name, sides in statistics.items():
         if name.startswith("num_") and sides["real"].value >= COMMON:
@@ -41,12 +42,12 @@ def compute_deviation(ratio: float) -> float:
 def make_sampler_row(
     sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
-    """One row: each measure with the ends of its interval, None where it has no value; an actor's seconds, None if none were seen."""
+    """Make one row: each measure with the ends of its interval, and an actor's seconds per scene; None if unknown."""
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
     for name, (place, *_) in MEASURES.items():
-        found: Mapping | Estimate | None = {**scores, "count_ratio": ratio}
+        found: Any = {**scores, "count_ratio": ratio}
         for part in place:
             found = found[part]
         value, low, high = found or (None, None, None)
@@ -55,7 +56,7 @@ def make_sampler_row(
 
 
 def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
-    """Is every measure better than the reference's or within its interval, where both have one?"""
+    """Return whether every measure that both have is better than the reference's or within its interval."""
 
     def good(name: str, better: str) -> bool:
         if row[name] is None or reference[name] is None:
@@ -69,40 +70,39 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
 
 
 def name_settings(row: Mapping) -> str:
-    """The sampler, and its noise scaling where that is not 1."""
+    """Return the sampler, and its noise scaling where that is not 1."""
     return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] != 1 else "")
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """The paper's sampler with the most steps there are of it; without it, the most steps of any."""
+    """Return the row of the paper's sampler with the most steps; without it, the row with the most steps."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 
 def build_sampler_table(rows: Sequence[Mapping]) -> Table:
     reference, cells = find_reference_row(rows), []
     for row in rows:
-        scores = (
+        scores = [
             None if row[name] is None else f"{row[name]:.3g} ({row[f'{name}_low']:.3g} to {row[f'{name}_high']:.3g})"
             for name in MEASURES
-        )
+        ]
         if row["count_category"]:
-            scores = [*scores]
-            scores[-1] += f" {row['count_category']}"
+            scores[-1] = f"{scores[-1]} {row['count_category']}"
         good = "–" if row is reference else "yes" if is_as_good_as(row, reference) else "no"
         seconds = "–" if row["seconds_per_scene"] is None else f"{row['seconds_per_scene']:.2f}"
         cells.append((name_settings(row), row["steps"], seconds, *scores, good))
     names = [words for _, words, _ in MEASURES.values()]
     alike = f"as good as {name_settings(reference)} of {reference['steps']}"
     note = (
-        "Sampler: / and a number where it divides the network's noise by that. In brackets: 95 % bootstrap intervals. Seconds: of one "
-        f"actor, weights loaded. Last column: is every score within the interval of {name_settings(reference)} of {reference['steps']} steps, "
-        "or better?"
+        "Sampler: / and a number where it divides the network's noise by that. In brackets: 95 % bootstrap intervals."
+        " Seconds: of one actor, weights loaded. Last column: is every score within the interval of"
+        f" {name_settings(reference)} of {reference['steps']} steps, or better?"
     )
     return Table("Scores by sampler and steps", ("sampler", "steps", "s per scene", *names, alike), cells, note=note)
 
 
 def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
-    """A chart per measure, a series per sampler, over the number of steps."""
+    """Make a chart per measure: a series per sampler, over the number of steps."""
     charts = []
     for name in CHARTED:
         series = {}
@@ -115,7 +115,7 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
 
 
 def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
-    """The page; `pictures` are the same scenes in every row, `columns` of them."""
+    """Render the page; each row of `pictures` shows the same scenes, `columns` of them."""
     note = "One row per sampler and number of steps; the same scene numbers and labels in each."
     sections = [
         build_sampler_table(rows),

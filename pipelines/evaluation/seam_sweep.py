@@ -26,7 +26,7 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 def make_seam_row(
     repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
 ) -> dict:
-    """One row: the setting, what a block costs, and each ratio with the ends of its interval; None where there is none."""
+    """Make one row: the setting, the cost of a block, and each ratio with the ends of its interval; None if unknown."""
     row = {
         "steps": repaint.num_inference_steps,
         "jump_length": repaint.jump_length,
@@ -61,12 +61,15 @@ def build_seam_table(rows: Sequence[Mapping]) -> Table:
         "seams",
         *(name.replace("_", " ") for name in MEASURES),
     )
-    note = "1: the line does not show. In brackets: 95 % bootstrap intervals over scenes. With guidance an evaluation costs about two. Objects: all but plants."
+    note = (
+        "1: the line does not show. In brackets: 95 % bootstrap intervals over scenes. With guidance an evaluation "
+        "costs about two. Objects: all but plants."
+    )
     return Table("Across seams over nearby lines", columns, cells, note=note)
 
 
 def render_seam_sweep_html(rows: Sequence[Mapping], pictures: Sequence[Picture], how: Sequence[str]) -> str:
-    """The page; `pictures` are the first scene of every row."""
+    """Render the page; `pictures` are the first scene of every row."""
     meanings = [f"{name.replace('_', ' ').capitalize()}: {words}." for name, words in MEANINGS.items()]
     sections = [build_seam_table(rows), Pictures("Scenes", pictures, columns=3), Text("How", [*how, *meanings])]
     return render_report_html("Seams by effort", sections)

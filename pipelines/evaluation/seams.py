@@ -1,4 +1,4 @@
-"""Seams of a source's scenes, measured over Ray, and the page that shows them."""
+"""Measure the seams of a source's scenes over Ray, and render the page that shows them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, estimate_seam_ratio
 from pipelines.rendering.render import MARK_COLOR, render_bev
 from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
+from pipelines.runtime.ray_tasks import flat_map_dataset
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
@@ -29,13 +30,13 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class SeamLines:
-    """Seams in metres from a scene's far edge (rows) and left edge (cols); where neither is given, those of its middle."""
+    """Seams in metres from a scene's far edge (rows) and left edge (cols); by default the edges of its middle block."""
 
     rows_m: tuple[float, ...] = ()
     cols_m: tuple[float, ...] = ()
 
     def pixels(self, grid: Grid) -> tuple[list[int], list[int]]:
-        """The pixel rows and columns that they lie before. Raises ValueError for a scene with no room for any."""
+        """Return the pixel rows and columns after the seams. Raises ValueError for a scene too small for any seam."""
         sides = [(self.rows_m, grid.rows), (self.cols_m, grid.cols)]
         if not (self.rows_m or self.cols_m):
             sides = [(find_middle_m(count * grid.resolution_m), count) for _, count in sides]
@@ -54,7 +55,7 @@ def find_middle_m(extent_m: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class SeamMeasurement:
-    """Records (n, 4, 2, 2) of scenes, their ids, and how many seams each has."""
+    """Records (n, 4, 2, 2) of scenes, their ids, and the number of seams of each."""
 
     scene_ids: list[str]
     records: np.ndarray
@@ -75,9 +76,17 @@ def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLi
 def measure_seams(
     selection: SceneSubset, lines: SeamLines, num_tasks: int, on_scene: Callable[[], None] = lambda: None
 ) -> SeamMeasurement:
-    """Fan-out: one task per shard."""
+    """Measure the seams of a selection with one task per shard.
+
+    Args:
+        selection: Scenes.
+        lines: Their seams.
+        num_tasks: Maximum number of concurrent tasks.
+        on_scene: Called after each scene.
+    """
     parts = selection.shards()
-    graph = ray.data.range(len(parts), override_num_blocks=len(parts)).flat_map(
+    graph = flat_map_dataset(
+        ray.data.range(len(parts), override_num_blocks=len(parts)),
         measure_shard,
         fn_kwargs={"parts": parts, "lines": lines},
         num_cpus=READER_CPUS,
@@ -96,7 +105,7 @@ def measure_seams(
 
 
 def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
-    """By measure the ratios of each side, and how many scenes and seams they come from."""
+    """Return the ratios of each side per measure, and the numbers of scenes and seams behind them."""
     ratios = {side: estimate_seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
     return {
         "scenes": {side: len(found.scene_ids) for side, found in measured.items()},
@@ -106,7 +115,7 @@ def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
 
 
 def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
-    """A row per scene: side, scene_id, seams, and of each measure numerators and denominators."""
+    """Return a row per scene: side, scene_id, seams, and numerators and denominators of each measure."""
     rows = []
     for side, found in measured.items():
         for scene_id, seams, record in zip(found.scene_ids, found.seams.tolist(), found.records.tolist(), strict=True):
@@ -119,7 +128,7 @@ def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
 
 
 def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
-    """Of each measure its name and the ratios of both sides in words."""
+    """Return each measure's name and the formatted ratios of both sides."""
     return [
         (name.replace("_", " "), *(format_value(sides[side]) or "–" for side in ("generated", "real")))
         for name, sides in scores["ratios"].items()
@@ -127,7 +136,7 @@ def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
 
 
 def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray:
-    """The scene from above with ticks at the ends of its seams: (H, W, 3) uint8."""
+    """Render the scene from above with ticks at the ends of its seams: (H, W, 3) uint8."""
     picture = render_bev(scene, size_px, supersample=2).copy()
     scale = picture.shape[0] / scene.grid.rows
     tick = size_px // 24
@@ -140,7 +149,7 @@ def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray
 
 
 def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines, count: int) -> str:
-    """The page: ratios with their meaning, and some scenes with their seams marked at the edges."""
+    """Render the page: ratios with their meaning, and some scenes with their seams marked at the edges."""
     parts = selection.shards()
     total = sum(len(rows) for _, rows in parts)
     scenes = load_scenes(parts, select_evenly(total, min(count, total)))

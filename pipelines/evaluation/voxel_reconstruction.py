@@ -1,7 +1,7 @@
-"""Any method's reconstructed voxels against the truth, on the full grid (paper, Sec. 4.1, Tab. 1): one Ray Data graph.
+"""Score any method's reconstructed voxels against the truth on the full grid (paper, Sec. 4.1, Tab. 1) over Ray.
 
-The truth is voxel files or a dataset's own scenes, voxelised here. One confusion matrix is summed over all scenes before
-anything is divided; every voxel of every scene counts.
+The truth is voxel files, or scenes of a dataset, which this module voxelises. Scores come from one confusion matrix,
+summed over all voxels of all scenes.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pipelines.io.voxel_import import read_voxels
 from pipelines.metrics.reconstruction import compute_voxel_confusion, compute_voxel_scores
 from pipelines.preprocess.import_external import find_files, make_scene_id
 from pipelines.runtime import storage
+from pipelines.runtime.ray_tasks import flat_map_dataset
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.palette import EMPTY
 from pipelines.schema.tables import Shard, find_shards
@@ -37,7 +38,7 @@ SCENE_SCORES = pa.schema(
 
 @dataclass(frozen=True)
 class GroundTruthVoxels:
-    """Where the true voxels of a scene are: in a file, or in a row of a shard."""
+    """Location of a scene's true voxels: a file, or a row of a shard."""
 
     uri: str = ""
     shard: Shard | None = None
@@ -55,7 +56,7 @@ class VoxelPair:
 
 
 def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]:
-    """Name -> place, of a dataset directory's scenes (of one split, or all) or of the .npz files in a directory."""
+    """Locate the scenes of a dataset directory (one split, or all), or the .npz files of a directory, by name."""
     if storage.list_files(storage.join_uri(root, "scenes"), ".parquet"):
         shards = find_shards(root, split=split or None)
         ids = [shard.read("scenes", ["scene_id"])["scene_id"].to_pylist() for shard in shards]
@@ -70,7 +71,7 @@ def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]
 
 
 def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
-    """Scene name -> URI of the files that a directory or a pattern names."""
+    """Return scene name -> URI of the files in a directory or of a pattern."""
     base, files = find_files(pattern, suffix)
     return {make_scene_id(file): storage.join_uri(base, file) for file in files}
 
@@ -78,9 +79,16 @@ def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
 def pair_files(
     truth: dict[str, GroundTruthVoxels], rebuilt: dict[str, str], stored: dict[str, str] | None, partial: bool
 ) -> list[VoxelPair]:
-    """The scenes that all sides have, by name. Unless `partial`, each side must have them all.
+    """Pair the scenes that all sides have, by name.
 
-    Raises ValueError that lists what has no counterpart, or if nothing has.
+    Args:
+        truth: True voxels by scene name.
+        rebuilt: Files of the reconstructions by scene name.
+        stored: Files of the method's stored representation by scene name, if any.
+        partial: Whether scenes may be missing on some sides.
+
+    Raises:
+        ValueError: No scene is common, or some are missing and `partial` is false; the message lists them.
     """
     sides = {"truth": truth, "reconstructions": rebuilt} | ({} if stored is None else {"stored files": stored})
     every, common = set().union(*sides.values()), set(truth).intersection(*sides.values())
@@ -95,7 +103,7 @@ def pair_files(
 
 
 def split_chunks(pairs: list[VoxelPair]) -> list[list[VoxelPair]]:
-    """Pairs in chunks of at most CHUNK_SCENES whose truths lie in one shard."""
+    """Split pairs into chunks of at most CHUNK_SCENES whose truths lie in one shard."""
     by_shard: dict[Shard | None, list[VoxelPair]] = {}
     for pair in pairs:
         by_shard.setdefault(pair.truth.shard, []).append(pair)
@@ -131,10 +139,13 @@ def score_voxels(
     truth_axes: Axes,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[dict, pa.Table]:
-    """Scores of all scenes together, as nested plain numbers, and a row per scene, by name."""
+    """Return the scores over all scenes, as nested plain numbers, and a table with a row per scene, by name."""
     chunks = split_chunks(pairs)
-    graph = ray.data.range(len(chunks), override_num_blocks=len(chunks)).flat_map(
-        score_chunk, fn_args=(chunks, grid, axes, truth_axes), num_cpus=1
+    graph = flat_map_dataset(
+        ray.data.range(len(chunks), override_num_blocks=len(chunks)),
+        score_chunk,
+        fn_args=(chunks, grid, axes, truth_axes),
+        num_cpus=1,
     )
     rows = []
     for row in graph.iter_rows():
@@ -168,5 +179,5 @@ def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
 
 
 def spread_evenly(sizes: list[int]) -> dict[str, float]:
-    """Mean, standard deviation, least and most of sizes in bytes."""
+    """Return mean, standard deviation, minimum and maximum of sizes in bytes."""
     return {name: float(getattr(np, name)(sizes)) for name in ("mean", "std", "min", "max")}

@@ -1,4 +1,4 @@
-"""A list of edits over a whole table: one Ray Data graph, one task per shard; and a page of before and after."""
+"""Apply a list of edits to a whole table, one Ray task per shard, and render a page of scenes before and after."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from itertools import islice
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import ray.data
 
 from models.composition.inpaint import select_around_objects
@@ -40,11 +39,11 @@ class EditRequest:
         return f"edited-{self.run}"
 
     def shard(self, number: int, given: Shard) -> Shard:
-        """Where the scenes of the given shard go; they are the run's number-th."""
+        """Return the run's shard of that number, for the edited scenes of the given shard."""
         return Shard(self.output, self.source, given.split, number)
 
     def claim(self, selection: SceneSubset) -> None:
-        """Keep the source for these edits of these scenes (claims.py)."""
+        """Bind the source to these edits of these scenes (run_guard.py)."""
         chosen = {
             "input": selection.root,
             "source": selection.source,
@@ -55,7 +54,7 @@ class EditRequest:
 
 
 def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table]]:
-    """The scene after the request's edits, and its rows of the edits table. Raises ValueError, naming the edit."""
+    """Return the edited scene and its rows of the edits table. Raises ValueError naming an edit that fails."""
     after, done = replay_edits(scene, request.edits)
     rows = []
     for step, (edit, changes) in enumerate(zip(request.edits, done, strict=True)):
@@ -66,7 +65,7 @@ def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table
 
 
 def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[int]]]) -> dict:
-    """Row in: number of a shard. Row out: how many scenes, and how many of them are rejected. Writes its tables."""
+    """Row in: number of a shard. Row out: numbers of scenes and of rejected scenes. Writes the shard's tables."""
     given, rows = parts[row["shard"]]
     shard = request.shard(row["shard"], given)
     if not storage.exists(shard.path("edits")):
@@ -90,7 +89,7 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
 
 @dataclass(frozen=True)
 class EditResult:
-    """What a run did: scenes written and rejected, and what each step of the list changed."""
+    """Result of a run: numbers of scenes written and rejected, and the changes of each step of the list."""
 
     scenes: int
     rejects: int
@@ -101,10 +100,16 @@ class EditResult:
 def edit_scenes(
     request: EditRequest, selection: SceneSubset, pictures: int = 8, on_shard: Callable[[int], None] | None = None
 ) -> EditResult:
-    """Write the edited tables, the edits table and a page. Goes on where it stopped.
+    """Write the edited tables, the edits table and a page. Another call resumes an interrupted one.
 
-    Raises ValueError if the output holds a run of other edits, for a list that no scene can take, or one that changes
-    nothing anywhere.
+    Args:
+        request: Edits, and where the edited scenes go.
+        selection: Scenes to edit.
+        pictures: Number of changed scenes on the page.
+        on_shard: Receives the number of scenes of each finished shard.
+
+    Raises:
+        ValueError: The output holds a run with other edits, every scene rejects the edits, or they change nothing.
     """
     if not request.edits:
         raise ValueError("the list of edits is empty")
@@ -141,15 +146,16 @@ def edit_scenes(
 
 
 def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
-    """A row per edit and kind of change: scenes, primitives, and how much they were changed."""
+    """Tabulate scenes, primitives and sizes of the changes, per edit and kind of change."""
     rows = []
     for step, edit in enumerate(edits):
-        of_step = changes.filter(pc.equal(changes["step"], step))
-        for change in pc.unique(of_step["change"]).to_pylist() or [None]:
-            part = of_step.filter(pc.equal(of_step["change"], change)) if change else of_step
-            moved_m, turned_rad, resized = (pc.max(part[name]).as_py() for name in ("moved_m", "turned_rad", "resized"))
+        of_step = changes.filter(pa.array(changes["step"].to_numpy() == step))
+        for change in of_step["change"].unique().to_pylist() or [None]:
+            here = [value == change for value in of_step["change"].to_pylist()]
+            part = of_step.filter(pa.array(here)) if change else of_step
+            moved_m, turned_rad, resized = (_find_maximum(part[n]) for n in ("moved_m", "turned_rad", "resized"))
             turned_deg = None if turned_rad is None else float(np.degrees(turned_rad))
-            scenes = pc.count_distinct(part["scene_id"]).as_py()
+            scenes = len(part["scene_id"].unique())
             rows.append((step, edit.name, change, scenes, len(part), moved_m, turned_deg, resized))
     columns = (
         "step",
@@ -164,8 +170,12 @@ def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
     return Table("Edits", columns, rows)
 
 
+def _find_maximum(column: pa.ChunkedArray) -> float | None:
+    return max((value for value in column.to_pylist() if value is not None), default=None)
+
+
 def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
-    """The first scenes that an edit changed, each as given and as edited; what was changed first is outlined."""
+    """Show the first changed scenes before and after; the objects of the first edit are outlined."""
     shown: list[Picture] = []
     for scene, after, changes in islice(_list_changed(request, parts), count):
         region = select_around_objects(scene, changes.primitive, OUTLINE_M)
@@ -178,7 +188,7 @@ def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[i
 def _list_changed(
     request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]
 ) -> Iterator[tuple[Scene, Scene, ObjectChange]]:
-    """Scenes that the edits change, before and after, and what the first edit did; one at a time."""
+    """Yield the scenes that the edits change, before and after, and the changes of the first edit."""
     for given, rows in parts:
         for scene in given.scenes(rows):
             with suppress(ValueError):  # a scene that is rejected

@@ -1,4 +1,4 @@
-"""Scenes made anew inside a region: one Ray Data graph, a pipeline per actor, all results of a scene per task."""
+"""Regenerate scenes inside a region: one Ray Data graph, a pipeline per actor, all variants of a scene per task."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from pipelines.schema.tables import Shard
 
 @dataclass(frozen=True)
 class RegionConfig:
-    """The region: all that is named, together, or with `outside` all but that."""
+    """The region: the union of the given parts, or with `outside` its complement."""
 
     polygon_m: tuple[float, ...] = ()  # x, y, x, y, ...
     half_plane: tuple[float, ...] = ()  # direction x, y, and the metres along it where it begins
@@ -40,7 +40,7 @@ class RegionConfig:
     outside: bool = False
 
     def region(self, scene: Scene) -> np.ndarray:
-        """(rows, cols) pixels of a scene, True = make anew. Raises ValueError for a region that is none."""
+        """(rows, cols) bool pixels of a scene, True: regenerate. Raises ValueError for an invalid region."""
         found = np.zeros((scene.grid.rows, scene.grid.cols), bool)
         if self.polygon_m:
             if len(self.polygon_m) % 2:
@@ -62,7 +62,7 @@ class RegionConfig:
 
 @dataclass(frozen=True)
 class InpaintRequest(Request):
-    """What to make anew in scenes, `variants` times each; `label` None means each scene's own."""
+    """Options of inpainting: region and contents, `variants` per scene; `label` None keeps each scene's label."""
 
     where: RegionConfig
     contents: Contents
@@ -74,7 +74,7 @@ class InpaintRequest(Request):
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
-    """How far a raw decode is off outside the region, as sums: pixels and squared metres, primitives and their IoU3D."""
+    """Sum the errors of a raw decode outside the region: pixels, squared metres, primitives and their IoU3D."""
     given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied
     sums = sum_pairs(given, made)
@@ -89,7 +89,7 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
 
 
 def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Of all sums together: ground IoU, height RMSE, share of the objects found again, their mean IoU3D; None for 0 / 0."""
+    """Compute ground IoU, height RMSE, share of objects found and their mean IoU3D from all sums; None for 0 / 0."""
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 
     def share(above: str, below: str) -> float | None:
@@ -107,7 +107,7 @@ def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float
 def inpaint_one(
     pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
 ) -> tuple[list[Scene], list[dict[str, float]]]:
-    """All variants of scene `number` of a run, and the drift of each raw decode of a block."""
+    """Generate all variants of scene `number` of a run, and the drift of each raw decode of a block."""
     scene, count = resample_to_model_resolution(scene, pipeline.spec), request.variants
     drifts: list[dict[str, float]] = []
     for step in inpaint_blocks(
@@ -138,7 +138,7 @@ def inpaint_one(
 
 
 def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: RegionConfig) -> np.ndarray:
-    """(rows, cols) pixels of a scene's region, grown to whole cells."""
+    """(rows, cols) pixels of a scene's region, extended to whole latent cells."""
     region = where.region(scene)
     for window, part in split_region(pipeline, scene, region):
         region[scene.grid.intersect(window)[0]] |= part
@@ -146,7 +146,7 @@ def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: Regio
 
 
 class Inpainter:
-    """Actor. Row in: number of a scene. Row out: its drift. Makes its variants, writes their shard and GLB files."""
+    """Actor. Row in: number of a scene. Row out: its drift. Generates its variants; writes shard and GLB files."""
 
     def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen

@@ -1,10 +1,11 @@
-"""Scenes -> larger scenes: blocks as Ray tasks, each as soon as the blocks that it depends on are done."""
+"""Extend scenes by blocks over Ray: an actor generates a block as soon as the blocks that it depends on are done."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import pyarrow as pa
 import ray
@@ -23,7 +24,7 @@ from models.composition.outpaint import (
     rank_outward,
 )
 from models.sampling.repaint import RePaintConfig
-from models.scene import Scene
+from models.scene import UNSET, Scene
 from models.tensors import make_empty_scene
 from pipelines.generation.sample import (
     Request,
@@ -46,7 +47,7 @@ MAX_RETRIES = 3  # of a block whose process died
 
 @dataclass(frozen=True)
 class OutpaintRequest(Request):
-    """How to extend scenes; `label` None means each scene's own. `num_blocks`: ahead, behind, left, right."""
+    """Options of outpainting. `label` None keeps each scene's label; `num_blocks` are ahead, behind, left, right."""
 
     label: str | None
     seed: int
@@ -62,11 +63,11 @@ class OutpaintRequest(Request):
         return f"{self.source}-{self.seed}-{number:07d}"
 
     def blocks_directory(self, number: int) -> str:
-        """Directory of a scene's blocks, until they are stitched together."""
+        """Return the directory of a scene's blocks; it is deleted once they are stitched together."""
         return storage.join_uri(self.output, "blocks", self.run, f"{number:07d}")
 
     def make_block_grid(self, size: int) -> BlockGrid:
-        """Blocks of `size` latent cells."""
+        """Return the grid of blocks of `size` latent cells."""
         return BlockGrid.from_overlap(size, self.overlap, rank=RANKS[self.order], num_blocks=self.num_blocks)
 
 
@@ -108,7 +109,7 @@ def write_block(block: SceneBlock, path: str) -> None:
 
 
 def read_block(path: str, empty: Scene) -> SceneBlock:
-    """Raises ValueError naming a file that is missing or damaged."""
+    """Read a block. Raises ValueError naming a file that is missing or damaged."""
     try:
         arrays = load(storage.read_bytes(path))
     except SafetensorError as error:
@@ -116,16 +117,16 @@ def read_block(path: str, empty: Scene) -> SceneBlock:
     latent, (datum_m, known_ground) = arrays.pop("latent"), arrays.pop("of_block").tolist()
     scene = replace(
         empty,
-        heading_rad=None,
-        instance_id=None,
-        label=None,
+        heading_rad=UNSET,
+        instance_id=UNSET,
+        label=UNSET,
         **{name: value.numpy() for name, value in arrays.items()},
     )
     return SceneBlock(scene, latent, datum_m, known_ground)
 
 
 class Outpainter:
-    """Actor with a pipeline: generates blocks and stitches a scene's blocks together."""
+    """Actor with a pipeline that generates blocks and stitches a scene's blocks together."""
 
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
@@ -136,14 +137,14 @@ class Outpainter:
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
     def load_scene(self, number: int) -> Scene:
-        """The given scene on the model's grid."""
+        """Return the given scene on the model's grid."""
         shard, row = self.chosen[number]
         return resample_to_model_grid(shard.scenes([row])[0], self.pipeline.spec)
 
     def load_blocks(
         self, number: int, indices: Sequence[BlockIndex]
     ) -> tuple[BlockComposer, Scene, dict[BlockIndex, SceneBlock]]:
-        """A scene's composer, the given scene, and its generated blocks `indices` together with the given one."""
+        """Return a scene's composer, the given scene, and its generated blocks `indices` with the given block."""
         given = self.load_scene(number)
         empty = make_empty_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
         directory = self.request.blocks_directory(number)
@@ -260,7 +261,7 @@ def run_batches(
     )
     room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
     count = min(num_actors, max(len(waiting), len(done)), max(1, room))  # one without room would take a killed one's
-    workers = [actor.remote(request, chosen) for _ in range(count)]
+    workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
     finally:  # an error's traceback would keep them, and their CPUs, alive

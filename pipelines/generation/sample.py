@@ -1,4 +1,4 @@
-"""Labels and seeds -> scenes: one Ray Data graph, a pipeline per actor, one output shard per task."""
+"""Generate scenes from labels and seeds: one Ray Data graph, a pipeline per actor, one output shard per task."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from pipelines.training.latents import digest_weights
 
 @dataclass(frozen=True)
 class Request:
-    """A run of a pipeline: where its scenes go, as source generated-<run>."""
+    """A run of a pipeline; its scenes become source generated-<run> of a dataset directory."""
 
     model: str  # directory of a PrITTIPipeline
     output: str
@@ -42,7 +43,7 @@ class Request:
 
 @dataclass(frozen=True)
 class SampleRequest(Request):
-    """What to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+    """Scenes to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
 
     num_scenes: int
     labels: tuple[str, ...]
@@ -64,7 +65,7 @@ class SampleRequest(Request):
 
 
 def load_pipeline(directory: str) -> PrITTIPipeline:
-    """Raises ValueError if the directory holds no complete pipeline."""
+    """Load a pipeline. Raises ValueError if the directory holds no complete one."""
     try:
         pipeline = PrITTIPipeline.from_pretrained(directory)
     except (OSError, ValueError, TypeError, AttributeError) as error:
@@ -74,8 +75,9 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
-    """Keep source generated-<run> of a directory for one request, and only with the model that began it (claims.py)."""
-    options = asdict(request) | also | {"weights": f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"}
+    """Bind source generated-<run> of a directory to one request and to the weights of its model (run_guard.py)."""
+    options: dict[str, Any] = asdict(request) | also
+    options["weights"] = f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"
     del options["model"]  # the same weights in another directory are the same model
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
     if not options.get("repair"):  # absent in the records of earlier versions
@@ -86,16 +88,16 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
 
 
 def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
-    """The scene with the model's ground classes, on the model's grid or another that covers the same ground."""
+    """Resample a scene to the model's ground classes and grid, or to another grid of the same area."""
     grid = grid or spec.grid
     height, occupied = resample_scene_ground(scene, spec.ground_classes, grid)
     return replace(scene, ground_classes=spec.ground_classes, grid=grid, height_m=height, occupied=occupied)
 
 
 def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
-    """The scene with the model's ground classes and resolution, over all the ground that it covers.
+    """Resample a scene to the model's ground classes and resolution, over its whole area.
 
-    Raises ValueError for a resolution that does not divide by the model's, nor the other way about.
+    Raises ValueError if neither of the two resolutions is a multiple of the other.
     """
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
@@ -103,9 +105,9 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
 
 
 def find_scene_label(scene: Scene, kind: str) -> str:
-    """A scene's label for a model conditioned on `kind`. Raises ValueError if the scene has none."""
+    """Return a scene's label for a model conditioned on `kind`. Raises ValueError if the scene has none."""
     label = compose_label(kind, scene.vegetation_density, scene.vehicle_density)
-    if label not in LABELS[kind]:
+    if label is None or label not in LABELS[kind]:
         raise ValueError(
             f"scene {scene.scene_id} has no {kind} label; give one with --label ({', '.join(LABELS[kind])})"
         )
@@ -113,7 +115,7 @@ def find_scene_label(scene: Scene, kind: str) -> str:
 
 
 class Sampler:
-    """Actor. Row in: number of a shard. Row out: that, its size and time. Generates and writes the shard's scenes."""
+    """Actor. Row in: number of a shard. Row out: number, scenes, seconds. Generates and writes the shard's scenes."""
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
         self.request, self.batch_size = request, batch_size
@@ -147,9 +149,19 @@ class Sampler:
 def sample_scenes(
     request: SampleRequest, num_actors: int = 1, batch_size: int = 8, on_shard: Callable[[dict], None] | None = None
 ) -> int:
-    """Write the requested scenes as tables; how many there are. Goes on where it stopped.
+    """Generate the requested scenes and write them as tables. Another call resumes an interrupted one.
 
-    Raises ValueError for labels the model does not know, or if the output holds a run made with other options.
+    Args:
+        request: Scenes to generate, and where they go.
+        num_actors: Maximum number of actors, each with a pipeline.
+        batch_size: Scenes per batch.
+        on_shard: Receives the row of each finished shard.
+
+    Returns:
+        Number of scenes.
+
+    Raises:
+        ValueError: The model does not know a label, or the output holds a run with other options.
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)

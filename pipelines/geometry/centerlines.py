@@ -1,8 +1,8 @@
-"""The roads of a Scene as lines: centrelines with height and width, joined at nodes, from the road mask alone.
+"""Extract the roads of a Scene as lines from the road mask: centrelines with height and width, joined at nodes.
 
-The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks; spurs that only come from the outline are
-pruned, and forks closer together than the road is wide become one node. Beyond the scene's border the mask goes on as it
-is there, so that a road leaves the scene straight.
+The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks. Spurs caused by the outline are pruned.
+Forks closer together than the road is wide become one node. The mask is extended beyond the scene's border by its edge
+values, so that a road leaves the scene straight.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from scipy import ndimage
 from skimage.morphology import skeletonize
 
 from models.scene import ROAD_CLASSES, Scene
+from pipelines.geometry.masks import find_nearest_true, label_parts, measure_depth
 
 CELL_M = 0.5  # of the mask that is thinned
-HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands left out
-MARGIN_M = 16.0  # how far the mask goes on beyond the border
-SPUR = 1.6  # a dead end shorter than this many half widths of its fork is no road
-ONE_NODE = 1.0  # forks closer than this many half widths are one
+HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands removed
+MARGIN_M = 16.0  # width of the mask's extension beyond the border
+SPUR = 1.6  # a dead end shorter than this multiple of the half width at its fork is not a road
+ONE_NODE = 1.0  # forks closer than this multiple of the sum of their half widths become one node
 SMOOTH_M = 3.0  # standard deviation of the Gaussian along a line
-LEAST_M = 4.0  # a shorter line is no road
+LEAST_M = 4.0  # a shorter line is not a road
 AROUND = np.ones((3, 3), int)  # eight neighbours
 
 
@@ -41,7 +42,8 @@ class Road:
     def length_m(self) -> float:
         return float(np.linalg.norm(np.diff(self.xyz_m[:, :2], axis=0), axis=1).sum())
 
-    def reversed(self) -> Road:
+    def reverse(self) -> Road:
+        """Return the same road in the other direction."""
         return Road(self.xyz_m[::-1], self.width_m[::-1], self.end, self.start, self.number)
 
 
@@ -53,16 +55,16 @@ class RoadNetwork:
     nodes_m: np.ndarray  # (n, 3)
 
     def leaving(self, node: int) -> list[Road]:
-        """The roads at a node, each leading away from it."""
-        return [r for road in self.roads for r in (road, road.reversed()) if r.start == node]
+        """Return the roads at a node, each directed away from it."""
+        return [r for road in self.roads for r in (road, road.reverse()) if r.start == node]
 
 
 def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
-    """The centrelines of a scene's roads, points about spacing_m apart; no roads where there is no road class."""
+    """Extract the centrelines of a scene's roads, with points about spacing_m apart; no roads without a road class."""
     mask = _make_road_mask(scene)
     margin = round(MARGIN_M / CELL_M)
     wide = np.pad(mask, margin, mode="edge")
-    half_m = ndimage.distance_transform_edt(wide) * CELL_M
+    half_m = measure_depth(wide) * CELL_M
     graph = _trace_graph(skeletonize(wide))
     _prune(graph, half_m, margin)
     _unite_close_nodes(graph, half_m)
@@ -92,9 +94,9 @@ def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
 
 
 def _make_road_mask(scene: Scene) -> np.ndarray:
-    """(h, w) bool: where the road is, in cells of CELL_M, without small holes and islands."""
+    """(h, w) bool mask of the road, in cells of CELL_M, without small holes and islands."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
-    road = scene.occupied[index].any(axis=0)
+    road = np.any(scene.occupied[index], axis=0)
     factor = max(1, round(CELL_M / scene.grid.resolution_m))
     rows, cols = (n // factor for n in road.shape)
     cells = road[: rows * factor, : cols * factor].reshape(rows, factor, cols, factor).mean(axis=(1, 3)) >= 0.5
@@ -103,8 +105,8 @@ def _make_road_mask(scene: Scene) -> np.ndarray:
 
 
 def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
-    """The 4-connected parts of a mask that are large enough, or, if so asked, touch its border."""
-    parts, count = ndimage.label(mask)
+    """Return the 4-connected parts of a mask that are large enough, and with `border` those that touch its border."""
+    parts, count = label_parts(mask)
     keep = np.bincount(parts.ravel(), minlength=count + 1) * CELL_M**2 >= area_m2
     if border:
         keep[np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])] = True
@@ -113,13 +115,17 @@ def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) ->
 
 
 def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
-    """Forks and ends as nodes (`place` (2,), row and column), the lines between them as edges (`path` (k, 2) from u to v, u < v)."""
+    """Trace a skeleton to a graph.
+
+    Forks and ends become nodes with `place` (2,), row and column. The lines between them become edges with `path`
+    (k, 2) from u to v, u < v.
+    """
     neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1
-    forks, count = ndimage.label(skeleton & (neighbours > 2), AROUND)
+    forks, count = label_parts(skeleton & (neighbours > 2), AROUND)
     graph = nx.MultiGraph()
     for fork in range(1, count + 1):
         graph.add_node(fork, place=np.argwhere(forks == fork).mean(axis=0))
-    lines, number = ndimage.label(skeleton & (forks == 0), AROUND)
+    lines, number = label_parts(skeleton & (forks == 0), AROUND)
     touching = ndimage.maximum_filter(forks, size=3)
     for where, line in zip(ndimage.find_objects(lines, number), range(1, number + 1), strict=True):
         path = _order_pixels(np.argwhere(lines[where] == line)) + [s.start for s in where]
@@ -133,18 +139,18 @@ def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
                 fork = graph.number_of_nodes() + count + 1
                 graph.add_node(fork, place=path[end].astype(float))
             ends.append(fork)
-        _join(graph, *ends, path.astype(float))
+        _join(graph, ends[0], ends[1], path.astype(float))
     return graph
 
 
 def _join(graph: nx.MultiGraph, u: int, v: int, path: np.ndarray) -> None:
-    """An edge whose path (k, 2) leads from u to v, their places added at its ends."""
+    """Add an edge whose path (k, 2) leads from u to v, with their places added at its ends."""
     path = np.concatenate([[graph.nodes[u]["place"]], path, [graph.nodes[v]["place"]]])
     graph.add_edge(min(u, v), max(u, v), path=path if u <= v else path[::-1])
 
 
 def _order_pixels(pixels: np.ndarray) -> np.ndarray:
-    """The pixels (k, 2) of an 8-connected line without forks, from one end to the other."""
+    """Sort the pixels (k, 2) of an 8-connected line without forks from one end to the other."""
     left = {tuple(p) for p in pixels.tolist()}
 
     def beside(p: tuple[int, int]) -> Iterator[tuple[int, int]]:
@@ -169,7 +175,7 @@ def _measure_half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> 
 
 
 def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
-    """Takes out spurs, the shortest first, and joins what is left at nodes that are no forks any more."""
+    """Remove spurs, the shortest first, and join the two remaining lines at nodes that are no longer forks."""
     while True:
         spurs = []
         for u, v, key, path in graph.edges(keys=True, data="path"):
@@ -187,7 +193,7 @@ def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
 
 
 def _straighten(graph: nx.MultiGraph) -> None:
-    """Joins the two lines at every node where only two meet."""
+    """Join the two lines at every node where only two meet."""
     for node in [n for n, degree in graph.degree() if degree == 2]:
         edges = list(graph.edges(node, keys=True, data="path"))
         if len(edges) == 2:  # else one line from the node to itself
@@ -201,7 +207,7 @@ def _straighten(graph: nx.MultiGraph) -> None:
 
 
 def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
-    """Makes one node of two forks whose line is shorter than the road is wide, the closest first."""
+    """Merge two forks whose line is shorter than the road is wide into one node, the closest first."""
     while True:
         close = []
         for u, v, path in graph.edges(data="path"):
@@ -212,19 +218,21 @@ def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
         if not close:
             return
         _, u, v = min(close)
-        graph.remove_edges_from([(u, v, key) for key in list(graph[u][v])])
+        for key in list(graph[u][v]):
+            graph.remove_edge(u, v, key)
         graph.nodes[u]["place"] = (graph.nodes[u]["place"] + graph.nodes[v]["place"]) / 2
         ways = [edge for node in (u, v) for edge in graph.edges(node, keys=True, data="path")]
         for a, b, key, path in ways:
-            graph.remove_edge(a, b, key) if graph.has_edge(a, b, key) else None
-            ends = [u if node in (u, v) else node for node in sorted((a, b))]
-            _join(graph, *ends, path[1:-1])
+            if graph.has_edge(a, b, key):
+                graph.remove_edge(a, b, key)
+            start, end = (u if node in (u, v) else node for node in sorted((a, b)))
+            _join(graph, start, end, path[1:-1])
         graph.remove_node(v)
         _straighten(graph)
 
 
 def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
-    """A line (k,) or (k, 2), smoothed along k with its ends held."""
+    """Smooth a line (k,) or (k, 2) along k with fixed ends."""
     reach = min(len(line) - 1, int(4 * sigma))
     if reach < 1:
         return line
@@ -234,7 +242,7 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
-    """The runs of a line (k, 2) inside the scene, and whether each holds the line's first and last point."""
+    """Yield the runs of a line (k, 2) inside the scene, and whether each holds the line's first and last point."""
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for start, stop in border.tolist():
@@ -242,9 +250,9 @@ def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.
 
 
 def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
-    """A line (k, 2) whose last point is at the scene's border: near it straight on from before.
+    """Replace the end of a line (k, 2) at the scene's border by a straight continuation.
 
-    Within half a width of the border the line turns towards where the mask was made to go on.
+    Within half a width of the border the line would bend towards the extension of the mask.
     """
     half = half_m[tuple(np.round(line[-1] + margin).astype(int))] / CELL_M
     left = len(line) - int(2 * half)
@@ -258,34 +266,42 @@ def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.nd
 
 
 def _resample_line(line: np.ndarray, spacing: float) -> np.ndarray:
-    """(n, 2) points of a line, evenly spaced along it, both ends among them."""
+    """(n, 2) points of a line, evenly spaced along it, including both ends."""
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
     wanted = np.linspace(0, along[-1], max(2, round(along[-1] / spacing) + 1))
     return np.stack([np.interp(wanted, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
-    """(h, w) height of the road in cells of CELL_M; beyond it the nearest road's."""
+    """(h, w) height of the road in cells of CELL_M; outside the road, the height of the nearest road."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
-    known = scene.occupied[index].any(axis=0)
+    known = np.any(scene.occupied[index], axis=0)
     height_m = np.where(scene.occupied[index], scene.height_m[index], -np.inf).max(axis=0, initial=-np.inf)
     if not known.any():
         return np.zeros(shape)
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest = find_nearest_true(known)
     factor = max(1, round(CELL_M / scene.grid.resolution_m))
     middle = np.s_[factor // 2 :: factor]
-    return height_m[tuple(nearest)][middle, middle][: shape[0], : shape[1]]
+    return height_m[nearest][middle, middle][: shape[0], : shape[1]]
 
 
 def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
-    """(k, 3) a way along the roads, points as far apart as theirs, on the ground, smooth; (0, 3) where no road is.
+    """Plan a smooth path on the ground along the roads.
 
-    It begins at the end of a road nearest to start_m, and at each node goes on along the road that turns least and has not
-    been driven. `right` is how far right of the centreline, as a share of the road's width: 0.25 is the middle of the right
-    half.
+    The path begins at the end of a road nearest to start_m. At each node it continues along the road that turns least,
+    among those not driven yet.
+
+    Args:
+        network: Roads.
+        start_m: Position (x, y) in the scene frame.
+        right: Offset to the right of the centreline, as a share of the road's width; 0.25 is the middle of the right
+            half.
+
+    Returns:
+        (k, 3) points in metres, spaced like those of the roads; (0, 3) without roads.
     """
-    starts = [r for road in network.roads for r in (road, road.reversed()) if r.start == -1]
-    starts = starts or [r for road in network.roads for r in (road, road.reversed())]
+    starts = [r for road in network.roads for r in (road, road.reverse()) if r.start == -1]
+    starts = starts or [r for road in network.roads for r in (road, road.reverse())]
     if not starts:
         return np.zeros((0, 3))
     here = min(starts, key=lambda r: float(np.hypot(*(r.xyz_m[0, :2] - start_m))))
@@ -295,7 +311,7 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
         if not onward:
             break
         here = max(
-            onward, key=lambda road, last=here: float(_compute_direction(last.reversed()) @ -_compute_direction(road))
+            onward, key=lambda road, last=here: float(_compute_direction(last.reverse()) @ -_compute_direction(road))
         )
         ways.append(here)
         driven.add(here.number)
@@ -312,6 +328,6 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
 
 
 def _compute_direction(road: Road) -> np.ndarray:
-    """(2,) of a road's first metres, away from its start."""
+    """(2,) direction of a road's first metres, away from its start."""
     way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
     return way / np.linalg.norm(way)

@@ -1,4 +1,4 @@
-"""Boxes and ellipsoids from the vertices of their meshes."""
+"""Fit boxes and ellipsoids to the vertices of their meshes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,20 @@ Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]  # center_m (n, 3), rotation 
 
 
 def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rotation (n, 3, 3) and size_m (n, 3) of boxes whose edge vectors are the columns of edges_m (n, 3, 3).
+    """Fit boxes to edge vectors.
 
-    Long edges decide first: rounding turns a short edge most, and would move the far corners of a long box. Raises
-    ValueError if edges are so far from square that a corner moves by more than FIT_M, or if a size is beyond LIMITS_M.
+    The longest edge of a box determines its first axis, because rounding turns a short edge most and would move the far
+    corners of a long box.
+
+    Args:
+        edges_m: (n, 3, 3); columns are the edge vectors of a box.
+        center_m: (n, 3) centres, for error messages.
+
+    Returns:
+        rotation (n, 3, 3) and size_m (n, 3).
+
+    Raises:
+        ValueError: Edges are so far from square that a corner moves by more than FIT_M, or a size is beyond LIMITS_M.
     """
     order = np.argsort(-np.linalg.norm(edges_m, axis=1), axis=1, kind="stable")[:, None, :]
     first, second, third = np.moveaxis(np.take_along_axis(edges_m, order, axis=2), 2, 0)
@@ -35,10 +45,10 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
 
 
 def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
-    """Boxes from their eight corners each, (n, 8, 3), in any order.
+    """Fit boxes to their eight corners, (n, 8, 3), in any order.
 
-    Of what leads from one corner to the others, the two shortest are edges; the third edge is what they leave of the
-    way to the opposite corner. Raises ValueError where the eight are not the corners of a box.
+    The two shortest vectors from one corner to the others are edges. The third edge is the vector to the opposite
+    corner minus these two. Raises ValueError if eight points are not the corners of a box.
     """
     center_m, start_m = corners_m.mean(axis=1), corners_m[:, 0]
     ways_m = corners_m[:, 1:] - start_m[:, None]
@@ -54,7 +64,7 @@ def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
 
 
 def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
-    """Ellipsoids through the points of each cloud (k, 3), k >= 9. Raises ValueError where there is none."""
+    """Fit an ellipsoid to the points of each cloud (k, 3), k >= 9. Raises ValueError if no ellipsoid fits."""
     fits = [_fit_ellipsoid(points) for points in clouds]
     center_m, rotation, size_m = (
         np.array([fit[k] for fit in fits]).reshape(shape) for k, shape in enumerate([(-1, 3), (-1, 3, 3), (-1, 3)])
@@ -64,11 +74,11 @@ def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
 
 
 def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
-    """The one quadric x^T M x + 2 b^T x = 1 through the points, found where they look most like a ball."""
+    """Fit the quadric x^T M x + 2 b^T x = 1 to the points, in coordinates in which they resemble a ball."""
     mean_m = points_m.mean(axis=0)
     _, spread, axes = np.linalg.svd(points_m - mean_m, full_matrices=False)
     if not spread[-1] > 1e-9 * spread[0]:
-        _refuse(np.array([True]), mean_m[None], "is flat: no ellipsoid")
+        raise _make_refusal(mean_m, "is flat: no ellipsoid")
     world_from_local = axes.T * (spread / np.sqrt(len(points_m) / 3))
     local = np.linalg.solve(world_from_local, (points_m - mean_m).T).T
     x, y, z = local.T
@@ -83,18 +93,23 @@ def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
         square_m2, rotation = np.linalg.eigh(scatter_m2)
         if np.abs(beyond).max() * np.sqrt(square_m2.mean()) <= FIT_M:
             return mean_m + world_from_local @ center, rotation, 2 * np.sqrt(square_m2)
-    _refuse(np.array([True]), mean_m[None], f"has {len(points_m)} vertices that lie neither on a box nor an ellipsoid")
+    raise _make_refusal(mean_m, f"has {len(points_m)} vertices that lie neither on a box nor an ellipsoid")
 
 
 def _refuse_sizes(size_m: np.ndarray, center_m: np.ndarray) -> None:
-    beyond = ~((size_m >= LIMITS_M[0]) & (size_m <= LIMITS_M[1])).all(axis=1)
+    beyond = ~np.all((size_m >= LIMITS_M[0]) & (size_m <= LIMITS_M[1]), axis=1)
     _refuse(beyond, center_m, "is thinner than 1 mm or longer than 1 km")
 
 
 def _refuse(bad: np.ndarray, center_m: np.ndarray, what: str) -> None:
     if bad.any():
-        x, y, z = center_m[bad][0]
-        raise ValueError(
-            f"the piece at x {x:.2f}, y {y:.2f}, z {z:.2f} m {what} ({bad.sum()} such pieces); export primitives as"
-            " separate boxes and spheres"
-        )
+        raise _make_refusal(center_m[bad][0], what, int(bad.sum()))
+
+
+def _make_refusal(center_m: np.ndarray, what: str, count: int = 1) -> ValueError:
+    """The error for the piece at center_m (3,), one of `count` with the same defect."""
+    x, y, z = center_m
+    return ValueError(
+        f"the piece at x {x:.2f}, y {y:.2f}, z {z:.2f} m {what} ({count} such pieces); export primitives as"
+        " separate boxes and spheres"
+    )

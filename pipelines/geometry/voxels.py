@@ -112,7 +112,7 @@ def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | in
     """Give the voxels of `column` (columns,), empty so far, their class id: one for all, or one per column."""
     for bit, plane in enumerate(planes):
         has_bit = (class_id >> bit) & 1
-        if np.ndim(has_bit):
+        if isinstance(has_bit, np.ndarray):
             plane |= column * has_bit.astype(np.uint64)
         elif has_bit:
             plane |= column
@@ -177,8 +177,8 @@ def _list_pixels(
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
     beyond = (np.floor(at - (low_m - EDGE_M) / step_m) + 1).clip(0, count).astype(np.int64)
-    count = (beyond - first).clip(0)
-    return concatenate_ranges(first, count), np.repeat(np.arange(len(count)), count)
+    lengths = (beyond - first).clip(0)
+    return concatenate_ranges(first, lengths), np.repeat(np.arange(len(lengths)), lengths)
 
 
 def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
@@ -256,7 +256,7 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     return _Runs(row * np.int32(grid.cols) + col, chosen[one], middle_m - reach_m, middle_m + reach_m)
 
 
-# --------------------------------------------------------------------------------------------- what the range leaves out
+# ------------------------------------------------------------------------------------- primitives outside of the range
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Scenes as files for other programs: GLB, PLY, voxels, OpenDRIVE; one Ray task per shard."""
+"""Export scenes to files for other programs: GLB, PLY, voxels, OpenDRIVE; one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -29,11 +29,21 @@ def export_scenes(
     output: str,
     overwrite: bool = False,
     on_scene: Callable[[int], None] | None = None,
-) -> tuple[dict[str, int], dict[str, str]]:
-    """Write output/<format>/<scene_id>.<format>; files per format, and why which were not written.
+) -> tuple[dict[Format, int], dict[str, str]]:
+    """Write output/<format>/<scene_id>.<format>.
 
-    Files that are there stay as they are unless `overwrite`. A scene that a format cannot hold, such as one without roads,
-    is listed in `rejects` of the output; the others go on.
+    A scene that a format cannot hold, such as one without roads, is listed in `rejects` of the output; the export
+    continues with the other scenes.
+
+    Args:
+        selection: Scenes.
+        formats: Formats of the files.
+        output: Directory.
+        overwrite: Whether to replace files that exist.
+        on_scene: Receives the number of scenes of each finished shard.
+
+    Returns:
+        Number of files per format, and the reasons per scene that was not written.
     """
     parts = selection.shards()
 
@@ -56,7 +66,8 @@ def export_scenes(
             storage.write_parquet(make_rejects_table(rejects), target.path("rejects"))
         return {"scenes": len(rows), "written": written, "rejects": [(r["scene_id"], r["reason"]) for r in rejects]}
 
-    counts, refused = dict.fromkeys(formats, 0), {}
+    counts: dict[Format, int] = dict.fromkeys(formats, 0)
+    refused: dict[str, str] = {}
     for row in map_rows(make_numbered_rows(range(len(parts))), write).iter_rows():
         for kind in row["written"]:
             counts[kind] += 1

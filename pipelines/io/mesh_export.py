@@ -16,6 +16,9 @@ from uuid import uuid4
 
 import numpy as np
 import trimesh
+import trimesh.exchange.gltf
+import trimesh.exchange.ply
+import trimesh.visual
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
@@ -110,13 +113,13 @@ def _add_instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, tr
 
 
 def export_glb(scene: Scene) -> bytes:
-    """The scene as a binary glTF 2.0 file, y up, metres.
+    """Export the scene to a binary glTF 2.0 file, y up, metres.
 
-    Node `scene` carries the turn from z up to y up, so that its children are in the scene frame: `ground`
-    (vertex colours; absent where nothing is occupied) and one node per primitive, `<category>_<index>`, with
-    category, class id, colour, label, instance id and the exact parameters in its extras. The extras of the whole say
-    what ABOUT names and the grid: `mesh_import.scene_from_glb` makes the same scene of it, less all but the fused ground.
-    Colours are stored in linear light, as glTF demands: a viewer shows the palette's sRGB values.
+    Node `scene` holds the rotation from z up to y up, so that its children are in the scene frame: `ground` (vertex
+    colours; absent without occupied pixels) and one node per primitive, `<category>_<index>`, with category, class id,
+    colour, label, instance id and the exact parameters in its extras. The extras of the file hold the grid and the
+    fields of ABOUT. mesh_import.py reads the same scene from it, except that only the fused ground remains. Colours are
+    in linear light, as glTF demands, so a viewer shows the palette's sRGB values.
     """
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
     world = trimesh.Scene(metadata=about)
@@ -147,9 +150,9 @@ def _set_buffer_targets(tree: dict) -> None:
 
 
 def export_ply(scene: Scene) -> bytes:
-    """The scene as one binary PLY mesh in the scene frame, z up, metres.
+    """Export the scene to one binary PLY mesh in the scene frame, z up, metres.
 
-    Vertices carry palette colours (sRGB), `class_id` and `primitive` (its number, GROUND for the ground).
+    Vertices have palette colours (sRGB), `class_id` and `primitive` (its number, GROUND for the ground).
     """
     ground_m, triangles, class_id = build_ground_mesh(scene)
     vertices, faces, classes, primitives = [ground_m], [triangles], [class_id], [np.full(len(ground_m), GROUND)]
@@ -170,7 +173,7 @@ def export_ply(scene: Scene) -> bytes:
 
 
 def write_glb(scene: Scene, path: str | Path) -> None:
-    """Writes `scene_glb` to a temporary name beside `path` and moves it into place."""
+    """Write `export_glb` to a temporary file next to `path` and move it into place."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     temporary.write_bytes(export_glb(scene))

@@ -1,28 +1,29 @@
-"""Binary glTF meshes -> Scenes: our own export, and meshes in class colours as the paper's authors publish theirs.
+"""Import binary glTF meshes as Scenes: our export, and meshes in class colours like those of the paper's authors.
 
-Our own export (`mesh.scene_glb`) says itself what it is. Its nodes are the primitives: transforms give centre,
-rotation and size, extras the rest, so that a scene moved about in a mesh editor comes back as it was left.
+The extras of our export (`mesh_export.export_glb`) identify it. Its nodes are the primitives: transforms give centre,
+rotation and size, and extras the rest. A scene that was edited in a mesh editor is therefore read with its changes.
 
-Any other mesh is taken for the authors' form (FORMATS.md, section 4). What is assumed:
+Any other mesh is read in the authors' form (FORMATS.md, section 4), with these assumptions:
 
-* x forward, y right, z down, metres (`axes` says otherwise). The frame is taken as it is, pitch and roll of the
-  authors' IMU included.
-* A class is a colour of palette.py within COLOR_TOLERANCE (mesh_pieces.py), of vertices or of materials. Whether a file stores sRGB or,
-  as glTF asks, linear light is read off its colours, all together. Textures are not read.
-* Ground: one vertex per occupied pixel, with or without triangles. Pixel (i, j) has its vertex at its corner
-  x = 64 - .25 i, y = -32 + .25 j (y right), the authors' grid, or at its centre, ours. Where face colours were averaged
-  on the border of two classes, a vertex has the class of the nearest vertex that has one.
-* Primitives: connected pieces of one class, any number per mesh; pieces that repeat vertices along edges are sewn
-  together first. Eight vertices are a box, found from its edges; more lie on an ellipsoid, found as the one quadric
-  through them, whatever the sphere was cut into. Boxes of vegetation are vegetation_cuboid.
+* x is forward, y right, z down, in metres, unless `axes` gives other directions. The frame includes pitch and roll of
+  the authors' IMU.
+* A class is a colour of palette.py within COLOR_TOLERANCE (mesh_segmentation.py), of vertices or of materials. The
+  colours of a file decide whether it stores sRGB or, as glTF demands, linear light. Textures are not read.
+* Ground has one vertex per occupied pixel, with or without triangles. Pixel (i, j) has its vertex at its corner
+  x = 64 - .25 i, y = -32 + .25 j (y right), as in the authors' grid, or at its centre, as in ours. A vertex with an
+  averaged colour on the border of two classes gets the class of the nearest vertex that has one.
+* Primitives are connected pieces of one class, any number per mesh; pieces that repeat vertices along edges are joined
+  first. Eight vertices are a box, fitted to its edges. More vertices are an ellipsoid, fitted as a quadric, regardless
+  of the sphere's triangulation. Boxes of vegetation are vegetation_cuboid.
 
-A box comes back with its corners; an ellipsoid with its shape, not with a yaw that its shape does not show. Pieces
-that fit neither within FIT_M (shapes.py) are refused.
+An imported box has the corners of the mesh. An imported ellipsoid has its shape, but no yaw that the shape does not
+determine. Pieces that fit neither within FIT_M (shape_fitting.py) are refused.
 """
 
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 
@@ -116,8 +117,10 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     if (off > COLOR_TOLERANCE).any():
         raise ValueError(f"{(off > COLOR_TOLERANCE).sum()} ground vertices have the colour of none of its classes")
     height_m, occupied = rasterize_ground(vertices_m, class_id, about["ground_classes"], about["grid"])
+    if scene_id:
+        about["scene_id"] = scene_id
     return Scene(
-        **about | ({"scene_id": scene_id} if scene_id else {}),
+        **about,
         category=category,
         center_m=center_m.astype(np.float32),
         rotation=rotation.astype(np.float32),
@@ -131,11 +134,11 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     )
 
 
-def _read_metadata(extras: dict) -> dict:
-    """What a Scene says of itself as a whole, checked. Raises LookupError, TypeError or ValueError."""
+def _read_metadata(extras: dict) -> dict[str, Any]:
+    """Read and check the fields of a Scene as a whole. Raises LookupError, TypeError or ValueError."""
     said, classes = extras["grid"], tuple(extras["ground_classes"])
-    lengths = [float(said[name]) for name in ("front_m", "left_m", "resolution_m")]
-    grid = Grid(*lengths, int(said["rows"]), int(said["cols"]))
+    lengths = front_m, left_m, resolution_m = tuple(float(said[name]) for name in ("front_m", "left_m", "resolution_m"))
+    grid = Grid(front_m, left_m, resolution_m, int(said["rows"]), int(said["cols"]))
     sound = np.isfinite(lengths).all() and grid.resolution_m > 0 < min(grid.rows, grid.cols)
     if not sound or grid.rows * grid.cols > MAX_PIXELS:
         raise ValueError(f"its grid is {said}; export it again")

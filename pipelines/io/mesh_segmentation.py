@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from models.scene import ELLIPSOID, Grid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY, GROUND_CLASS_ID
@@ -33,7 +33,7 @@ def convert_to_stored_linear(color: np.ndarray) -> bool:
 def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The class id of nearest colour for each of (v, 3) in [0, 1], and how far off its worst channel is, of 255."""
     levels = np.round(color * 65535).astype(np.int64).clip(0, 65535)
-    code, place = np.unique(levels @ [2**32, 2**16, 1], return_inverse=True)
+    code, place = np.unique(levels @ np.array([2**32, 2**16, 1], np.int64), return_inverse=True)
     value = np.stack([code >> 32, code >> 16 & 65535, code & 65535], axis=1) / 65535
     if linear:
         value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
@@ -66,7 +66,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
     votes = np.zeros((piece.max(initial=-1) + 1, len(CLASS_COLORS)), np.int64)
     np.add.at(votes, (piece, class_id), 1)
     votes[:, EMPTY] = 0
-    unknown = ~votes.any(axis=1)[piece]
+    unknown = ~np.any(votes, axis=1)[piece]
     if len(triangles):
         unknown[np.setdiff1d(np.arange(len(unknown)), triangles)] = False  # unused, and of no colour: not there
     if unknown.any():

@@ -1,8 +1,8 @@
-"""The roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes, junctions.
+"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes, junctions.
 
-Each line of roads.py is a road of cubics through points of its centreline, with one driving lane or more on either side;
-where lines meet, each road stops short of the node and a connecting road leads from it to every other one. OpenDRIVE's
-inertial frame is the scene frame; the header's offset says where that lies in the world. Right-hand traffic.
+Each line of centerlines.py becomes a road of cubics through points of its centreline, with one or more driving lanes on
+either side. Where lines meet, each road ends before the node, and a connecting road leads from it to every other road.
+OpenDRIVE's inertial frame is the scene frame; the header's offset is its position in the world. Right-hand traffic.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -18,7 +19,7 @@ from models.scene import Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
 KNOT_M = 5.0  # between points of a reference line
-LANE_M = 3.5  # a road's half of about so many metres is one lane
+LANE_M = 3.5  # half a road of about this width is one lane
 LEAST_ROAD_M = 2.0  # what is left of a road between its junctions
 CLEAR = 1.3  # half widths of the widest road that every road stops short of a node
 SAMPLES = 64  # of a cubic, for its length
@@ -37,7 +38,7 @@ class ReferenceLine:
     def through(xyz_m: np.ndarray, width_m: np.ndarray, tangents: np.ndarray | None = None) -> ReferenceLine:
         """Through points (k, 3); `tangents` (2, 2): the directions at both ends seen from above, if they are given."""
         breaks = np.append(0, np.cumsum(np.linalg.norm(np.diff(xyz_m[:, :2], axis=0), axis=1)))
-        ends = "natural" if len(xyz_m) > 2 else "not-a-knot"
+        ends: Any = "natural" if len(xyz_m) > 2 else "not-a-knot"  # scipy annotates a string; tuples are documented
         if tangents is not None:
             slope = (xyz_m[-1, 2] - xyz_m[0, 2]) / breaks[-1]
             ends = tuple((1, np.append(tangent, slope)) for tangent in tangents)
@@ -177,7 +178,9 @@ def _make_road_body(
     road.append(profile)
     section = ET.SubElement(ET.SubElement(road, "lanes"), "laneSection", s="0")
     for side, sign, count in (("left", 1, left), ("center", 0, 1), ("right", -1, right)):
-        group = ET.SubElement(section, side) if count else None
+        if not count:
+            continue
+        group = ET.SubElement(section, side)
         for k in range(count, 0, -1) if sign > 0 else range(1, count + 1):
             lane = ET.SubElement(group, "lane", id=str(sign * k), type="driving" if sign else "none", level="false")
             if sign and links:
@@ -218,7 +221,7 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         points = ["end" if come_end else "start", "end" if go_end else "start"]
         for name, other, point in zip(("predecessor", "successor"), (come, go), points, strict=True):
             ET.SubElement(link, name, elementType="road", elementId=str(other), contactPoint=point)
-        # Traffic keeps right: on a road that is left at its end it is on the negative lanes, at its start on the positive.
+        # Traffic keeps right. It leaves a road's end on the negative lanes, and a road's start on the positive lanes.
         signs = (-1 if come_end else 1), (1 if go_end else -1)
         _make_road_body(road, line, left=0, right=lanes, links=signs)
         about = {"incomingRoad": str(come), "connectingRoad": str(number), "contactPoint": "start"}

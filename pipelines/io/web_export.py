@@ -11,6 +11,7 @@ from PIL import Image
 from scipy import ndimage
 
 from models.scene import CATEGORIES, ELLIPSOID, Scene
+from pipelines.geometry.masks import find_nearest_true
 from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
 NODES = 65  # of the ground's heights along the longer side, 1 m apart in a crop
@@ -28,11 +29,7 @@ def export_web_scene(scene: Scene) -> dict:
 
 def _export_ground(scene: Scene) -> dict:
     height_m, winner = scene.surface()
-    if (winner < 0).all():
-        filled_m = height_m
-    else:
-        nearest = ndimage.distance_transform_edt(winner < 0, return_distances=False, return_indices=True)
-        filled_m = height_m[tuple(nearest)]
+    filled_m = height_m if (winner < 0).all() else height_m[find_nearest_true(winner >= 0)]
     step = max(winner.shape) / (NODES - 1)
     rows, cols = (max(2, round(n / step) + 1) for n in winner.shape)
     at = [np.linspace(-0.5, n - 0.5, count) for n, count in zip(winner.shape, (rows, cols), strict=True)]

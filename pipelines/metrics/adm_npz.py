@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,7 @@ PICTURES = "arr_0"
 
 
 class StoredGaussian(NamedTuple):
-    """What `frechet.frechet_distance` needs of a set of features."""
+    """Mean and covariance of a set of features, for `frechet.compute_frechet_distance`."""
 
     mean: np.ndarray  # (d,) float64
     covariance: np.ndarray  # (d, d) float64
@@ -41,7 +41,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """The archive. ValueError naming the file for a missing, truncated or damaged one, whenever that shows."""
+    """Open the archive. Raises ValueError naming a missing, truncated or damaged file, also during reading."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
@@ -54,7 +54,7 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Stream at the first number, shape and type of a C-ordered array; ValueError if it is anything else."""
+    """Open a C-ordered array: stream at its first number, shape and type. Raises ValueError for any other array."""
     if f"{name}.npy" not in archive.namelist():
         raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
     with archive.open(f"{name}.npy") as stream:
@@ -71,7 +71,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tupl
         needed, held = math.prod(shape) * dtype.itemsize, archive.getinfo(f"{name}.npy").file_size - stream.tell()
         if held != needed:
             raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write it again")
-        yield stream, shape, dtype
+        yield cast(zipfile.ZipExtFile, stream), shape, dtype
 
 
 def read_picture_shape(path: str) -> tuple[int, int, int, int]:
@@ -85,10 +85,18 @@ def read_picture_shape(path: str) -> tuple[int, int, int, int]:
 
 
 def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
-    """uint8 arrays (batch, height, width, 3), the last one shorter, in the order of the file; one in memory at a time.
+    """Read pictures in batches, in the order of the file, with one batch in memory at a time.
 
-    path is local or a URI; the archive may be compressed. Raises ValueError, naming the file, at once if it is
-    missing, truncated, of another type or pickled, and while reading if its checksum does not fit.
+    Args:
+        path: Local path or URI of the archive, which may be compressed.
+        batch: Pictures per batch.
+
+    Returns:
+        Iterator of uint8 arrays (batch, height, width, 3); the last one may be shorter.
+
+    Raises:
+        ValueError: The file is missing, truncated, of another type or pickled (raised immediately), or its checksum is
+            wrong (raised while reading). The message names the file.
     """
     if batch < 1:
         raise ValueError(f"a batch holds at least 1 picture, got {batch}")
@@ -99,7 +107,7 @@ def _iterate_batches(path: str, shape: tuple[int, int, int, int], batch: int) ->
     with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (stream, _, _):
         for start in range(0, shape[0], batch):
             pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
-            if (read := stream.readinto(pictures)) != pictures.nbytes:
+            if (read := stream.readinto(pictures.data)) != pictures.nbytes:
                 raise ValueError(f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write it again")
             yield pictures
 

@@ -1,8 +1,8 @@
-"""How layouts are made, as histograms per scene, and how far two sources differ in them; no pictures, no weights.
+"""Describe layouts by histograms per scene, and measure how far two sources differ; without pictures or weights.
 
 A scene gives a vector of counts over fixed bins. Vectors add up to the histogram of a source, and resampled scenes to
-its draws. Sources differ by the Wasserstein distance in the histogram's own unit, or where bins have no order by the
-Jensen-Shannon divergence in bits. Bins bound how fine a difference can be seen; they are narrow where objects are small.
+its draws. Sources differ by the Wasserstein distance in the histogram's unit, or by the Jensen-Shannon divergence in
+bits if bins have no order. The bin width limits the resolution; bins are narrow where objects are small.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from models.scene import CATEGORIES, GROUND_CLASSES, Scene
+from pipelines.geometry.masks import measure_depth
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 EXTENT_EDGES_M = np.geomspace(0.1, 60, 49)
@@ -90,20 +91,23 @@ def compute_pair_distances(xy_m: np.ndarray) -> np.ndarray:
 
 
 def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
-    """Widths of the road (p,) in metres along its middle, and each pixel's distance from road (H, W), None without road.
+    """Measure the widths of the road along its middle.
 
-    The middle is where the distance from the border is greatest nearby; the width is twice that distance, to a pixel.
-    The scene's edge is no border.
+    The middle is the local maxima of the distance from the road's border, and the width is twice that distance. The
+    scene's edge is not a border.
+
+    Returns:
+        (p,) widths in metres, and (H, W) distance of each pixel from the road in metres; None without a road.
     """
     road = np.zeros(scene.occupied.shape[1:], bool)
     if "road" in scene.ground_classes:
         road = scene.occupied[scene.ground_classes.index("road")]
     if not road.any():
         return np.zeros(0), None
-    to_road_m = ndimage.distance_transform_edt(~road) * scene.grid.resolution_m
+    to_road_m = measure_depth(~road) * scene.grid.resolution_m
     if road.all():
         return np.zeros(0), to_road_m
-    depth_px = ndimage.distance_transform_edt(road)
+    depth_px = measure_depth(road)
     middle = road & (depth_px == ndimage.maximum_filter(depth_px, 3))
     width_m = (2 * depth_px[middle] - 1) * scene.grid.resolution_m
     return width_m[width_m >= MIN_ROAD_WIDTH_M], to_road_m

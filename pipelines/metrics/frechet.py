@@ -8,6 +8,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass
 from functools import reduce
+from typing import Protocol
 
 import numpy as np
 
@@ -27,6 +28,16 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
     if len(bad):
         raise ValueError(f"{name} features hold NaN or infinite numbers in {len(bad)} samples, first {bad[0]}")
     return features
+
+
+class Gaussian(Protocol):
+    """Mean (d,) and covariance (d, d) of features: Moments, or stored ones (adm_npz.py)."""
+
+    @property
+    def mean(self) -> np.ndarray: ...
+
+    @property
+    def covariance(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -69,17 +80,17 @@ def compute_block_moments(features: np.ndarray) -> Moments:
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """What the distance of two Gaussians of covariances A and B is made of.
+    """The decomposition behind the distance of two Gaussians of covariances A and B.
 
-    With A = F F^T, AB has the eigenvalues s^2 of the symmetric F^T B F = U s^2 U^T: two symmetric eigenproblems instead
-    of a general sqrtm, and nothing complex to throw away. Rank-deficient covariances are fine.
+    With A = F F^T, AB has the eigenvalues s^2 of the symmetric F^T B F = U s^2 U^T. Two symmetric eigenproblems replace
+    a general sqrtm, whose result may be complex. Rank-deficient covariances are allowed.
     """
 
     roots: np.ndarray  # (d,) s
     factor: np.ndarray  # (d, d) F U
 
 
-def compute_transport(a: Moments, b: Moments) -> Transport:
+def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
     """Raises ValueError for unequal dimensions and for fewer than 2 samples."""
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
@@ -90,7 +101,7 @@ def compute_transport(a: Moments, b: Moments) -> Transport:
     return Transport(np.sqrt(np.maximum(squares, 0)), factor @ rotation)
 
 
-def compute_frechet_distance(a: Moments, b: Moments, between: Transport | None = None) -> float:
+def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None = None) -> float:
     """Squared Frechet distance of the two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (AB)^1/2)."""
     between = between or compute_transport(a, b)
     traces = np.trace(a.covariance) + np.trace(b.covariance)
@@ -100,8 +111,8 @@ def compute_frechet_distance(a: Moments, b: Moments, between: Transport | None =
 def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
     """W (d, r) of either side, with the distance's derivative by its covariance I - W W^T.
 
-    With M = F^T B F = U s^2 U^T, W W^T is (B F U) s^-3 (B F U)^T by A, and (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2
-    A^1/2 by B.
+    With M = F^T B F = U s^2 U^T, W W^T is (B F U) s^-3 (B F U)^T by A,
+    and (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2 by B.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]
@@ -111,10 +122,10 @@ def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, 
 def compute_frechet_influence(
     features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray
 ) -> np.ndarray:
-    """(n,) what each sample of a side adds to the distance, to first order, with mean zero; `through` is its W.
+    """(n,) first-order influence of each sample of a side on the distance, with mean zero; `through` is its W.
 
-    Their mean over a resample says how far the distance moves. A resampled distance itself would be biased upwards, as
-    every Frechet distance of few samples is; this is not.
+    The mean influence over a resample is the change of the distance. It is unbiased, whereas the Frechet distance of a
+    resample is biased upwards, like every Frechet distance of few samples.
     """
     values = np.empty(len(features))
     for start in range(0, len(features), BLOCK_ROWS):

@@ -27,7 +27,7 @@ KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's rele
 KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"  # pytorch-fid's file is the same
 
 # A branch is a chain of convolutions (output channels, kernel height x width); SPLIT ends it with a 1x3 and a 3x1
-# side by side. One-step chains bear the branch's name, others name_1, name_2, ...
+# side by side. A chain of one step has the branch's name; the steps of others have name_1, name_2, ...
 SPLIT = "split"
 Chain = tuple[tuple[int, int, int] | str, ...]
 
@@ -97,7 +97,7 @@ class Mixed(nn.Module):
             steps, channels = [], inputs
             for i, step in enumerate(chain):
                 name = branch if len(chain) == 1 else f"{branch}_{i + 1}"
-                if step == SPLIT:
+                if isinstance(step, str):  # SPLIT
                     self.add_module(name + "a", Conv(channels, 384, 1, 3))
                     self.add_module(name + "b", Conv(channels, 384, 3, 1))
                     steps.append([name + "a", name + "b"])
@@ -109,9 +109,9 @@ class Mixed(nn.Module):
                     channels = step[0]
             self.chains.append(steps)
             self.outputs += channels
-        if not self.reduce:
+        if pool_channels is not None:
             self.branch_pool = Conv(inputs, pool_channels, 1, 1)
-        self.outputs += inputs if self.reduce else pool_channels
+        self.outputs += inputs if pool_channels is None else pool_channels
 
     def forward(self, x: Tensor) -> Tensor:
         branches = []

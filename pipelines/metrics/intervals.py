@@ -1,8 +1,8 @@
-"""95 % confidence intervals by the bootstrap: scenes are drawn anew, with replacement, and the score taken again.
+"""Compute 95 % confidence intervals by the bootstrap: resample scenes with replacement and recompute the score.
 
-A draw says how often each scene was drawn, so scores that are made of sums over scenes are one matrix product for all
-draws. Row 0 is the sample as it is: its score is the
-value, the others give the interval. The same number of scenes gives the same draws.
+A draw counts how often each scene is sampled, so a score that is a sum over scenes is one matrix product for all draws.
+Row 0 is the original sample. Its score is the value; the other rows give the interval. The same number of scenes gives
+the same draws.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Estimate(NamedTuple):
 
 
 def draw_resamples(count: int, key: int = 0) -> np.ndarray:
-    """(1 + DRAWS, count) how often each scene is taken: every one once, then the draws. float64, but whole numbers.
+    """(1 + DRAWS, count) float64 counts of each scene: ones in row 0, then the draws.
 
-    `key` tells the draws of one side from those of another.
+    Each side of a comparison has its `key`, so that the draws of both sides are independent.
     """
     random = np.random.default_rng([count, key])
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
@@ -37,24 +37,24 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
 
 
 def compute_weights(count: int, key: int = 0) -> np.ndarray:
-    """`draws` in rows of sum 1."""
+    """Return `draw_resamples` in rows of sum 1."""
     return draw_resamples(count, key) / count
 
 
 def make_estimate(scores: np.ndarray) -> Estimate:
-    """From the scores (1 + DRAWS,) under `weights`. Draws that have none, NaN, do not count."""
+    """Make an estimate from the scores (1 + DRAWS,) of all rows of draws. Draws whose score is NaN do not count."""
     value, drawn = float(scores[0]), scores[1:]
     low, high = np.quantile(drawn[np.isfinite(drawn)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Estimate(value, float(low), float(high))
 
 
 def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
-    """Mean of values (n,), a value per scene."""
+    """Estimate the mean of values (n,), one per scene."""
     return make_estimate(draw_resamples(len(values), key) @ np.asarray(values, np.float64) / len(values))
 
 
 def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
-    """Sum over sum for each column of (n, m) and (n, m), a row per scene; None where nothing is to be judged.
+    """Estimate the ratio of sums of each column of (n, m) and (n, m), with a row per scene; None if the latter is 0.
 
     Covers shares of objects (bad ones over all) and means over the scenes that have a value (values over ones).
     """
@@ -65,6 +65,6 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
 
 
 def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> Estimate:
-    """A score that moves, to first order, by the mean of what each side's samples (n,) add to it."""
+    """Estimate a score whose first-order change is the mean influence (n,) of each side's samples."""
     shifts = sum(compute_weights(len(part), key) @ part for key, part in enumerate(influences))
-    return make_estimate(value + shifts)
+    return make_estimate(np.asarray(value + shifts))

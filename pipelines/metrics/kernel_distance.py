@@ -14,16 +14,17 @@ GROUP_SAMPLES = 1000  # the usual size of subsets
 
 
 def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    """Mean over groups of about 1000 samples of a side, all samples in one group each; k(x, y) = (x . y / d + 1)^3.
+    """Estimate the mean over groups of about 1000 samples of each side, with k(x, y) = (x . y / d + 1)^3.
 
-    The common estimate takes 50 or 100 random subsets of 1000; its expectation is the same, whatever the groups. Draws
-    are made within groups; a sample drawn twice is no pair, or its own kernel would come in.
+    Every sample is in one group. The common estimate takes 50 or 100 random subsets of 1000; its expectation is the
+    same for any groups. Bootstrap draws stay within groups. Two draws of the same sample are not a pair, because the
+    kernel of a sample with itself would bias the estimate.
     """
     real, generated = require_comparable(real, generated, at_least=2)
     groups = max(1, min(len(real), len(generated)) // GROUP_SAMPLES)
     scores = []
     for group in range(groups):
-        # Every so many: neighbouring samples of a drive fall into different groups.
+        # A stride of `groups` puts neighbouring samples of a drive into different groups.
         x, y = (side[group::groups].astype(np.float64) for side in (real, generated))
         drawn = [compute_weights(len(z), key=2 * group + k) for k, z in enumerate((x, y))]
         within = [sum_pairs(w, compute_kernel(z, z)) for w, z in zip(drawn, (x, y), strict=True)]

@@ -1,9 +1,9 @@
-"""Precision, recall, density and coverage from nearest neighbours of features, exactly, without all exact distances.
+"""Compute precision, recall, density and coverage from nearest neighbours of features, exactly and fast.
 
-Filter and verify. Features are turned into their first principal coordinates, with the length of what is left over as
-one more. Distances of these short vectors never exceed the true ones, and come from a float32 matrix product. A true
-distance is computed, in float64 by differences, only where a bound does not decide. So results are those of the full
-float64 distance matrix, ties included, in a fraction of its time and without ever holding it.
+The method filters and verifies. A short vector holds the first principal coordinates of features and the length of the
+residual. Distances of short vectors never exceed the true ones, and come from a float32 matrix product. A true distance
+is computed, in float64 by differences, only where the bounds do not decide. The results are those of the full float64
+distance matrix, including ties, in a fraction of its time and memory.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch import Tensor
 
 from pipelines.metrics.frechet import check_features
 
-BLOCK_ROWS = 1024  # rows of a distance matrix held at once: 4 kB x number of columns
+BLOCK_ROWS = 1024  # rows of a block of the distance matrix: 4 kB x number of columns
 SPARE_NEIGHBOURS = 8  # candidates beyond the k-th whose upper bounds bound its distance
-PAIRS_PER_BLOCK = 128  # of plainly computed distances: 2 MB at 2048-d, what a cache holds
-BASIS_SAMPLES = 512  # that the principal axes are taken from
-KEPT_VARIANCE = 0.997  # of them; more axes cost time in the filter, fewer leave more to verify
-MOST_LEFT_OVER = 0.02  # of the variance of all; beyond it too much is to verify, and the filter takes whole features
+PAIRS_PER_BLOCK = 128  # pairs per block of exact distances: 2 MB at 2048-d, which fits a cache
+BASIS_SAMPLES = 512  # samples that the principal axes are computed from
+KEPT_VARIANCE = 0.997  # share of their variance; more axes slow the filter, fewer leave more pairs to verify
+MOST_LEFT_OVER = 0.02  # share of the total variance in the residual; above it the filter uses whole features
 FLOAT32_ROUNDING = 2.0**-24
 
 
@@ -40,7 +40,7 @@ class NeighbourhoodScores:
 
     @property
     def precision(self) -> float:
-        """Share of generated samples in some real ball."""
+        """Return the share of generated samples in some real ball."""
         return float((self.in_real > 0).mean())
 
     @property
@@ -49,7 +49,7 @@ class NeighbourhoodScores:
 
     @property
     def density(self) -> float:
-        """Real balls that a generated sample lies in, on average, over k. Not bounded by 1."""
+        """Return the mean number of real balls that a generated sample lies in, over k. It may exceed 1."""
         return float(self.in_real.mean() / self.k)
 
     @property
@@ -89,7 +89,7 @@ class FeatureSet:
 
 
 def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[FeatureSet, FeatureSet]:
-    """Both sides in the filter's form.
+    """Convert both sides to the filter's form.
 
     Raises ValueError for features that are not finite, of unequal width, or of max(k) samples or fewer.
     """
@@ -107,34 +107,35 @@ def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) 
 def compute_neighbourhoods(
     real: np.ndarray, generated: np.ndarray, k: Sequence[int] = (3,)
 ) -> list[NeighbourhoodScores]:
-    """A Neighbourhood for each k, from features (n, d) and (m, d) (paper, supplement, Evaluation).
+    """Compute NeighbourhoodScores for each k, from features (n, d) and (m, d) (paper, supplement, Evaluation).
 
     Memory: BLOCK_ROWS x max(n, m) float32, besides the features. The paper's protocol takes n = m; other sizes work.
     Raises ValueError as `prepare` does.
     """
     sides = prepare_features(real, generated, k)
     radii = [compute_ball_radii(side, range(len(side)), k) for side in sides]
-    return judge_neighbours(k, [find_within(*sides, *radii, range(len(real)))])
+    return judge_neighbours(k, [find_within(sides[0], sides[1], radii[0], radii[1], range(len(real)))])
 
 
 def judge_neighbours(
     k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> list[NeighbourhoodScores]:
-    """A Neighbourhood for each k from what `within` gave for all parts of the real samples, in order."""
-    in_real, in_generated, covered = zip(*parts, strict=True)
-    found = sum(in_real), np.concatenate(in_generated, axis=1), np.concatenate(covered, axis=1)
-    return [NeighbourhoodScores(size, *(part[index] for part in found)) for index, size in enumerate(k)]
+    """Compute NeighbourhoodScores for each k from the `find_within` of all parts of the real samples, in order."""
+    parts_in_real, parts_in_generated, parts_covered = zip(*parts, strict=True)
+    in_real = np.asarray(sum(parts_in_real))
+    in_generated, covered = (np.concatenate(part, axis=1) for part in (parts_in_generated, parts_covered))
+    return [NeighbourhoodScores(size, in_real[i], in_generated[i], covered[i]) for i, size in enumerate(k)]
 
 
 def check_k(k: Sequence[int]) -> int:
-    """The largest of the neighbourhood sizes; ValueError if there is none or one is below 1."""
+    """Return the largest of the neighbourhood sizes. Raises ValueError if there is none or one is below 1."""
     if not k or min(k) < 1:
         raise ValueError(f"k must name neighbourhood sizes of at least 1, got {list(k)}")
     return max(k)
 
 
 def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Both sides, checked. Raises ValueError as `checked_features` does, and for unequal dimensions."""
+    """Check and return both sides. Raises ValueError as `check_features` does, and for unequal dimensions."""
     real, generated = check_features(real, "real", at_least), check_features(generated, "generated", at_least)
     if real.shape[1] != generated.shape[1]:
         raise ValueError(f"real features have {real.shape[1]} dimensions, generated {generated.shape[1]}")
@@ -145,7 +146,7 @@ def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -
 
 
 def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> PrincipalBasis:
-    """As many principal axes as hold KEPT_VARIANCE of some samples of both sides, evenly taken."""
+    """Compute the principal axes that hold KEPT_VARIANCE of evenly spaced samples of both sides."""
     count = min(BASIS_SAMPLES // 2, len(real), len(generated))
     some = np.concatenate([side[np.arange(count) * len(side) // count] for side in (real, generated)])
     some = some.astype(np.float64)
@@ -159,7 +160,7 @@ def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> Principal
 
 
 def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
-    """The filter's form of features (n, d).
+    """Convert features (n, d) to the filter's form.
 
     For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2, and |r - r'| lies between the difference and the
     sum of |r| and |r'|. With v = (c, |r|), (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2 in one product.
@@ -221,10 +222,18 @@ def find_nearest(
 def find_within(
     real: FeatureSet, generated: FeatureSet, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the balls of both sides hold, for the real samples of `rows`; radii squared, (len(k), n) and (len(k), m).
+    """Find the samples within the balls of both sides, for the real samples of `rows`.
 
-    Returns in_real (len(k), m), balls of `rows` that hold each generated sample: add them over parts; in_generated and
-    covered (len(k), len(rows)).
+    Args:
+        real: Real samples.
+        generated: Generated samples.
+        real_radii: (len(k), n) squared radii.
+        generated_radii: (len(k), m) squared radii.
+        rows: Real samples to judge.
+
+    Returns:
+        in_real (len(k), m): number of balls of `rows` that hold each generated sample, to be summed over parts;
+        in_generated and covered (len(k), len(rows)).
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))
@@ -251,7 +260,7 @@ def find_within(
 
 
 def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """(p,) squared distances of a[i] and b[j] in float64, by differences: the same bits whichever side comes first."""
+    """(p,) squared distances of a[i] and b[j] in float64, by differences; bit-identical if the sides are swapped."""
     squared = np.empty(len(i))
     for start in range(0, len(i), PAIRS_PER_BLOCK):
         block = slice(start, start + PAIRS_PER_BLOCK)
@@ -261,11 +270,11 @@ def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np
 
 
 def round_up_float32(values: np.ndarray) -> Tensor:
-    """As float32, not smaller."""
+    """Round values up to float32."""
     rounded = values.astype(np.float32)
     return torch.from_numpy(np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded))
 
 
 def iterate_blocks(rows: range) -> list[range]:
-    """Parts of BLOCK_ROWS rows."""
+    """Split rows into blocks of BLOCK_ROWS."""
     return [range(start, min(start + BLOCK_ROWS, rows.stop)) for start in range(rows.start, rows.stop, BLOCK_ROWS)]

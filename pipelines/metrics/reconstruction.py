@@ -1,7 +1,7 @@
-"""Reconstruction scores: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1 Metrics, Tab. 1, 2).
+"""Score reconstructions: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1, Tab. 1, 2).
 
-One record per scene, cheap to make anywhere and to add up in any grouping; one function per table turns the sum into
-numbers. Everything is accumulated over the whole dataset before it is divided.
+Each scene gives one record; records can be added in any grouping. One function per table computes scores from the sum,
+so that every ratio is one of sums over the whole dataset.
 """
 
 from __future__ import annotations
@@ -195,10 +195,15 @@ class DetectionScores:
 def compute_detection_scores(
     matches: Matches, max_detections: int | None = None, min_score: float = -np.inf
 ) -> DetectionScores:
-    """AP3D and AP3D@50 as in Omni3D (paper, Sec. 4.1), over all scenes at once.
+    """Compute AP3D and AP3D@50 as in Omni3D (paper, Sec. 4.1), over all scenes together.
 
-    max_detections keeps the best so many per scene and category (Omni3D: 100; None: all); only detections with a
-    score above min_score count. Raises ValueError if no category has a truth.
+    Args:
+        matches: Matches of all scenes.
+        max_detections: Number of best detections kept per scene and category (Omni3D: 100; default: all).
+        min_score: Only detections with a higher score count.
+
+    Raises:
+        ValueError: No category has a true primitive.
     """
     keep = matches.score > min_score
     if max_detections is not None:
@@ -257,11 +262,11 @@ class PairSums:
 
 
 def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
-    """Sums of one scene. Primitives are matched one to one within their category such that the sum of their IoU3D is
-    greatest; two that do not overlap are no pair.
+    """Match the primitives of one scene with their predictions and sum the pairs.
 
-    Boxes exactly, ellipsoids as ellipsoids by sampling (iou3d.py). Pass the predictions that are meant to be kept:
-    every one counts, whatever its existence.
+    Matching is one to one within each category and maximises the sum of IoU3D; two primitives that do not overlap are
+    not a pair. IoU3D of boxes is exact, that of ellipsoids is sampled (iou3d.py). Every prediction counts, regardless
+    of its existence, so pass only those to keep.
     """
     sums = PairSums(truth.counts(), prediction.counts(), *np.zeros((2, len(CATEGORIES))))
     for c in np.flatnonzero((sums.truths > 0) & (sums.predictions > 0)):

@@ -1,9 +1,10 @@
-"""Seams: does a line between pasted and generated parts of a scene show? Rates across it over rates across lines nearby.
+"""Measure the visibility of seams between given and generated parts of a scene, relative to nearby lines.
 
-1 means that it does not show. A line runs between two rows, or two columns, of pixels. Its neighbours are the parallel
-lines NEAR_M to FAR_M away from it and at least NEAR_M away from every seam: far enough to be free of it, near enough that
-what streets are like there is alike. One record per scene: (measures, 2, 2) float64, numerator and denominator across
-seams, then across their neighbours. Records add up; a stack of them can be resampled for intervals.
+A score is the rate across seams over the rate across nearby lines; 1 means that seams are invisible. A line runs
+between two rows, or two columns, of pixels. Its neighbours are the parallel lines NEAR_M to FAR_M away from it and at
+least NEAR_M away from every seam: far enough to be independent of it, and near enough that streets are similar. Each
+scene gives a record, (measures, 2, 2) float64: numerator and denominator across seams, then across their neighbours.
+Records add up, and a stack of records can be resampled for intervals.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Layout statistics: one vector of named numbers per scene. Sources compare as sets of such vectors, without pictures."""
+"""Compute layout statistics: one vector of named numbers per scene. Sources compare as sets of these vectors."""
 
 from __future__ import annotations
 
@@ -33,11 +33,13 @@ def compute_layout_statistics(scene: Scene) -> np.ndarray:
 
 
 def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Layout statistics (n, s) and (m, s) as features: shifted and scaled by the reference's mean and deviation.
+    """Shift and scale layout statistics (n, s) and (m, s) by the reference's mean and standard deviation.
 
-    So distances have no unit, and each column about the same weight (a constant column is only shifted: its unit is 1).
-    A NaN, an absent category's size, says nothing and counts as the reference's mean. Raises ValueError for fewer than
-    2 scenes or unequal columns.
+    Distances then have no unit, and columns have about the same weight; a constant column is only shifted. NaN, the
+    size of an absent category, becomes the reference's mean.
+
+    Raises:
+        ValueError: There are fewer than 2 scenes, or the columns differ.
     """
     reference, other = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if reference.ndim != 2 or other.ndim != 2 or reference.shape[1] != other.shape[1]:
@@ -49,4 +51,5 @@ def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np
     mean = np.where(known, reference, 0).sum(axis=0) / number
     deviation = np.sqrt(np.where(known, np.square(reference - mean), 0).sum(axis=0) / number)
     scale = np.where(deviation > 1e-9 * np.maximum(np.abs(mean), 1), deviation, 1.0)
-    return tuple(np.where(np.isnan(part), 0.0, (part - mean) / scale) for part in (reference, other))
+    features, other_features = (np.where(np.isnan(part), 0.0, (part - mean) / scale) for part in (reference, other))
+    return features, other_features

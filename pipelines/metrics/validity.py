@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy import ndimage
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORIES, CATEGORY_INDEX, DRIVABLE_CLASSES, ROAD_CLASSES, VEGETATION, VEHICLES, Scene
+from pipelines.geometry.masks import label_parts
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
@@ -41,7 +41,7 @@ BUILDING = CATEGORY_INDEX["construction_big"]
 
 
 def find_slab_offset_m(surface: str) -> float:
-    """How far a dataset's ground heights lie above what objects stand on, by its LayoutSpec's `surface`."""
+    """Return the height of a dataset's ground above the objects' surface, by `surface` of its LayoutSpec; metres."""
     return SLAB_OFFSET_M if surface == "top" else 0.0
 
 
@@ -76,15 +76,15 @@ def find_faults(
 
 
 def compute_scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
-    """(7, 2) numerators and denominators of MEASURES for one scene; slab_offset_m as for `faults`."""
+    """(7, 2) numerators and denominators of MEASURES for one scene; slab_offset_m as for `find_faults`."""
     shares = [(int(bad.sum()), int(among.sum())) for bad, among in find_faults(scene, slab_offset_m).values()]
     return np.array([*shares, _find_largest_component(_make_mask(scene, ROAD_CLASSES))], np.float64)
 
 
 def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
-    """(3, 2) of LABEL_MEASURES: is the scene's own density label the one it bears (the one asked for)?
+    """(3, 2) LABEL_MEASURES: whether the density computed from the scene equals its label, the requested one.
 
-    A label that was not asked for counts nowhere. Raises ValueError for a scene that bears no label at all.
+    A missing label is not judged. Raises ValueError for a scene without any label.
     """
     if scene.vegetation_density is None and scene.vehicle_density is None:
         raise ValueError(f"scene {scene.scene_id} bears no density label; label fidelity needs the one asked for")
@@ -101,14 +101,14 @@ def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle:
 
 
 def compute_validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
-    """Share per measure over all scenes, from records (scenes, measures, 2); None where nothing could be judged."""
+    """Compute the share per measure over all scenes, from records (scenes, measures, 2); None if nothing was judged."""
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T
     return {n: float(a / b) if b > 0 else None for n, a, b in zip(names, numerator, denominator, strict=True)}
 
 
 def _find_overlapping(scene: Scene) -> np.ndarray:
-    """(n,) bool: a solid primitive that overlaps another solid one by more than OVERLAP_IOU3D."""
+    """(n,) bool: whether a solid primitive overlaps another solid one by more than OVERLAP_IOU3D."""
     solid = np.flatnonzero(np.isin(scene.category, SOLID))
     boxes = extract_boxes(scene).take(solid)
     iou = compute_iou3d_matrix(boxes, boxes)
@@ -119,13 +119,13 @@ def _find_overlapping(scene: Scene) -> np.ndarray:
 
 
 def _make_mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
-    """(H, W) bool: any of the classes occupies the pixel (classes may overlap)."""
+    """(H, W) bool: whether any of the classes occupies the pixel (classes may overlap)."""
     index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
-    return scene.occupied[index].any(axis=0)
+    return np.any(scene.occupied[index], axis=0)
 
 
 def _find_largest_component(mask: np.ndarray) -> tuple[float, int]:
     """Share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
-    components, _ = ndimage.label(mask)
+    components, _ = label_parts(mask)
     sizes = np.bincount(components.ravel())[1:]
     return (float(sizes.max() / sizes.sum()), 1) if len(sizes) else (0.0, 0)

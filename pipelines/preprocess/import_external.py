@@ -93,7 +93,7 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
 
 
 def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, str], object]) -> tuple[list[str], list]:
-    """Scene ids of a shard's files and what `read(index, scene id, uri)` makes of them; writes its rejects, if any."""
+    """Return the scene ids of a shard's files and the results of `read(index, scene id, uri)`; write its rejects."""
     names, contents, rejects = [], [], []
     for index, name, uri in request.files_of(shard):
         try:
@@ -129,7 +129,7 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
 
 
 def write_pictures(row: dict, request: ImportRequest) -> dict:
-    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures beside the final file."""
+    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures next to the final file."""
     shard = request.shards()[row["shard"]]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
@@ -152,10 +152,17 @@ def make_pictures_shard(path: str) -> np.ndarray:
 
 
 def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
-    """Import everything: ids of the scenes, in order, and how many files were rejected, as in imported-<name>.json.
+    """Import all files of a request. Another call resumes an interrupted one, and reads shards with rejects again.
 
-    Goes on where it stopped; shards with rejects are read again, for files get repaired. Raises ValueError if the output
-    holds an import of other files under this name, or if no file could be read.
+    Args:
+        request: Files, and the name and directory of the import.
+        on_shard: Receives the number of files of each finished shard.
+
+    Returns:
+        Content of imported-<name>.json: ids of the scenes, in order, and number of rejected files.
+
+    Raises:
+        ValueError: The output holds an import of other files under this name, or no file can be read.
     """
     record = storage.join_uri(request.output, f"imported-{request.name}.json")
     options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}
@@ -164,8 +171,8 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
         made = storage.read_json(record)
         if differing := [name for name in options if made.get(name) != options[name]]:
             raise ValueError(
-                f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose another"
-                " --name or --output"
+                f"{request.output} holds an import {request.name!r} with other {' and '.join(differing)}; choose"
+                " another --name or --output"
             )
         there = storage.exists(request.target) if request.kind == "npz" else all(shard.is_written() for shard in shards)
         if made.get("rejects") == 0 and there:

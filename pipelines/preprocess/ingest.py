@@ -42,7 +42,7 @@ def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
 
 
 def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[dict]:
-    """Manifests as they are done, in any order; one Ray task per shard, one more per drive that has several."""
+    """Yield manifests in order of completion; one Ray task per shard, and one more per drive with several shards."""
     finished = set(storage.list_files(storage.join_uri(staging, "manifest"), ".json"))
     todo = [task for task in tasks if make_manifest_path(staging, task) not in finished]
     shards_of = Counter((task.source, part.key) for task in todo for part in task.parts)
@@ -113,11 +113,10 @@ def ingest_drives(
     skip_unreadable: bool = False,
     on_shard: Callable[[dict], None] | None = None,
 ) -> IngestResult:
-    """Write the dataset directory `root`. The same call again goes on where it stopped.
+    """Write the dataset directory `root`. Another call resumes an interrupted one.
 
-    `options` is what the user asked for; it is kept in dataset.json, and a directory made with other options is
-    refused. A drive that cannot be read stops the run after everything else is staged (ValueError), unless
-    `skip_unreadable`.
+    dataset.json records `options`, the user's options; a directory with other options is refused. An unreadable drive
+    stops the run with a ValueError after all other drives are staged, unless `skip_unreadable` is set.
     """
     started = time.perf_counter()
     grid = grid or Grid()

@@ -1,6 +1,6 @@
-"""One shard: read its drives, cut its scenes, write its tables and a manifest of what was done.
+"""Write one shard: read its drives, cut its scenes, write its tables and a manifest.
 
-A worker holds a few scenes at a time, whatever the length of the drive.
+A worker holds a few scenes at a time, regardless of the length of the drive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ReadDrive = Callable[[str, tuple], tuple[Drive, dict]]
 
 
 def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
-    """A drive and what its reader dropped. Raises ValueError, naming the file, if it cannot be read."""
+    """Read a drive, and report what its reader dropped. Raises ValueError naming a file that cannot be read."""
     if source == "town":
         seed, num_scenes = key
         drive = generator.generate_town(seed)
@@ -43,11 +43,11 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
 
 
 class Rejected(ValueError):
-    """A scene that is left out, and why."""
+    """The reason why a scene is left out."""
 
 
 def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
-    """The scene ahead of a pose. Raises Rejected."""
+    """Cut the scene ahead of a pose. Raises Rejected."""
     try:
         scene = drive.scene(pose, split, grid)
     except ValueError as error:
@@ -61,28 +61,28 @@ def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
     return scene
 
 
-def _plan_scenes(drive: Drive, part: ShardPart) -> Drive:
-    """The drive, if it still has the poses that were planned. Raises ValueError."""
-    if drive.frame.take(part.poses, mode="clip").tolist() != list(part.frames):
+def _check_poses(drive: Drive, part: ShardPart, poses: tuple[int, ...]) -> Drive:
+    """Return the drive. Raises ValueError unless it has the planned poses of the part."""
+    if drive.frame.take(poses, mode="clip").tolist() != list(part.frames or ()):
         raise ValueError(f"{part.sequence}: its poses changed after this run began; run the same command again")
     return drive
 
 
 class ShardCut:
-    """Cuts the scenes of a task, one after another; what went wrong is listed beside."""
+    """Cuts the scenes of a task, one after another, and lists rejected scenes and unreadable drives."""
 
     def __init__(self, task: ShardTask, grid: Grid, read: ReadDrive = read_drive) -> None:
         self.task, self.grid, self.read = task, grid, read
         self.rejects: list[dict] = []
         self.unreadable: list[str] = []  # reasons, one per drive
-        self.reports: dict[str, dict] = {}  # sequence -> what its reader dropped
+        self.reports: dict[str, dict] = {}  # sequence -> report of what its reader dropped
 
     def __iter__(self) -> Iterator[Scene]:
         for part in self.task.parts:
             try:
                 drive, self.reports[part.sequence] = self.read(self.task.source, part.key)
                 if part.poses is not None:
-                    drive = _plan_scenes(drive, part).at(np.array(part.poses), self.grid)
+                    drive = _check_poses(drive, part, part.poses).at(np.array(part.poses), self.grid)
             except ValueError as error:
                 self.unreadable.append(str(error))
                 for frame in part.frames or [None]:

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ShardPart:
-    """Some poses of one drive. `key` is what its source needs to read it (`pipelines.preprocess.shard_writer.read_drive`)."""
+    """Some poses of one drive. `key` holds the arguments that its source's reader needs (shard_writer.read_drive)."""
 
     key: tuple
     sequence: str
@@ -31,7 +31,7 @@ class ShardPart:
 
 @dataclass(frozen=True)
 class ShardTask:
-    """One shard to write: its source, split and number, and the parts it is cut from."""
+    """One shard to write: its source, split, number and parts."""
 
     source: str
     split: str
@@ -43,7 +43,7 @@ class ShardTask:
 
 
 def plan_town(num_train: int, num_test: int, seed: int) -> list[ShardTask]:
-    """A task per town."""
+    """Plan one task per town."""
     plan = [
         (split, ShardPart((town_seed, count), f"{town_seed:05d}"))
         for town_seed, split, count in generator.plan_town_parts(num_train, num_test, seed)
@@ -99,7 +99,7 @@ Poses = tuple[np.ndarray, np.ndarray]  # frame (p,), world_from_imu (p, 3, 4)
 def _read_poses(
     names: list[str], read: Callable[[str], Poses], skip_unreadable: bool
 ) -> tuple[dict[str, Poses], list[str]]:
-    """Poses of the drives that have them, and the names of those that have not."""
+    """Return the poses of the drives that have them, and the names of the other drives."""
     poses, unreadable = {}, []
     for name in names:
         try:
@@ -115,9 +115,9 @@ def _read_poses(
 def _plan_drives(
     source: str, keys: dict[str, tuple], frames: dict[str, np.ndarray], labels: dict[str, np.ndarray]
 ) -> list[ShardTask]:
-    """Tasks drive after drive, so that neighbours in the plan share what they read.
+    """Make tasks drive after drive, so that consecutive tasks share the drive that they read.
 
-    A drive without frames could not be read: reading it fails again and gives its one reject.
+    A drive without frames is unreadable: its task fails to read it and writes one reject.
     """
     plan = [(UNUSED, (ShardPart(key, name),)) for name, key in keys.items() if name not in frames]
     for name, frame in frames.items():
@@ -131,8 +131,9 @@ def _plan_drives(
 
 
 def _number_tasks(source: str, plan: list[tuple[str, tuple[ShardPart, ...]]]) -> list[ShardTask]:
-    """Tasks from (split, parts): shards are counted within their split."""
-    tasks, numbers = [], dict.fromkeys((TRAIN, TEST, UNUSED), 0)
+    """Make tasks from (split, parts), with shards numbered within their split."""
+    tasks: list[ShardTask] = []
+    numbers: dict[str, int] = dict.fromkeys((TRAIN, TEST, UNUSED), 0)
     for split, parts in plan:
         tasks.append(ShardTask(source, split, numbers[split], parts))
         numbers[split] += 1

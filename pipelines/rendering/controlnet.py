@@ -1,10 +1,11 @@
-"""Street views painted as photographs: a ControlNet on semantic images, from weights on this disk (diffusers)."""
+"""Paint street views as photographs with a ControlNet on semantic images, from local weights (diffusers)."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,13 +18,13 @@ from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 from pipelines.schema.run_guard import find_changed_option
 
-SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view has nothing
-MULTIPLE_PX = 8  # of the sides of pictures that the network takes
+SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view is empty
+MULTIPLE_PX = 8  # the sides of the network's pictures are multiples of this
 
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """How to paint. `diffusion` and `controlnet` are local directories in diffusers' layout, safetensors only."""
+    """Options of painting. `diffusion` and `controlnet` are local directories of diffusers models, as safetensors."""
 
     diffusion: str
     controlnet: str
@@ -36,7 +37,7 @@ class PhotoRequest:
 
 
 def make_control_image(class_id: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 in the KITTI-360 palette, sky where nothing is; class_id (H, W)."""
+    """(H, W, 3) uint8 in the KITTI-360 palette, SKY where class_id (H, W) is EMPTY."""
     return np.where((class_id == EMPTY)[..., None], np.array(SKY, np.uint8), CLASS_COLORS[class_id])
 
 
@@ -44,8 +45,11 @@ class Painter:
     """Stable Diffusion under a ControlNet."""
 
     def __init__(self, request: PhotoRequest) -> None:
-        """Raises ValueError if a directory holds no such model."""
-        from diffusers import ControlNetModel, StableDiffusionControlNetPipeline
+        """Load the models. Raises ValueError if a directory does not hold one."""
+        from diffusers import (
+            ControlNetModel,  # pyright: ignore[reportPrivateImportUsage]
+            StableDiffusionControlNetPipeline,  # pyright: ignore[reportPrivateImportUsage]
+        )
         from diffusers.utils.logging import disable_progress_bar
 
         disable_progress_bar()
@@ -57,20 +61,20 @@ class Painter:
             )
         except (OSError, ValueError, ImportError) as error:
             raise ValueError(
-                f"{request.diffusion} and {request.controlnet}: no Stable Diffusion and ControlNet weights in diffusers' "
-                f"layout, as safetensors ({error})"
+                f"{request.diffusion} and {request.controlnet}: no Stable Diffusion and ControlNet weights in"
+                f" diffusers' layout, as safetensors ({error})"
             ) from error
         self.pipeline.set_progress_bar_config(disable=True)
         self.pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
         self.request = request
 
     def paint(self, class_id: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 from class ids (H, W). The same for the same request and image."""
+        """Paint class ids (H, W): (H, W, 3) uint8, the same for the same request and image."""
         rows, cols = class_id.shape
         size = [-(-n // MULTIPLE_PX) * MULTIPLE_PX for n in (rows, cols)]
         control = Image.fromarray(make_control_image(class_id)).resize(size[::-1], Image.Resampling.NEAREST)
         request = self.request
-        painted = self.pipeline(
+        output: Any = self.pipeline(
             request.prompt,
             image=control,
             height=size[0],
@@ -80,18 +84,19 @@ class Painter:
             controlnet_conditioning_scale=request.control_scale,
             negative_prompt=request.negative_prompt or None,
             generator=torch.Generator().manual_seed(request.seed),
-        ).images[0]
+        )
+        painted = output.images[0]
         return np.asarray(painted.resize((cols, rows), Image.Resampling.LANCZOS))
 
 
 class StreetPainter:
-    """Actor. Row in: number of a drive. Row out: its number of frames. Paints what is not painted yet."""
+    """Actor. Row in: number of a drive. Row out: its number of frames. Paints the frames that are not painted yet."""
 
     def __init__(self, request: PhotoRequest, directories: Sequence[str]) -> None:
         self.painter, self.directories = Painter(request), directories
 
     def __call__(self, row: dict) -> dict:
-        directory, frames = self.directories[row["id"]], []
+        directory, frames = self.directories[int(row["id"])], []
         for name in list_frame_names(directory):
             path = storage.join_uri(directory, "photo", name)
             if not storage.exists(path):
@@ -117,7 +122,7 @@ def list_frame_names(directory: str) -> list[str]:
 
 
 def list_drives(streets: str) -> list[str]:
-    """The directories of all drives with frames under streets/<run>. Raises ValueError if there is none."""
+    """Return the directories of all drives with frames under streets/<run>. Raises ValueError if there is none."""
     found = sorted({path.rsplit("/", 2)[0] for path in storage.list_files(streets, ".png") if "/class_id/" in path})
     if not found:
         raise ValueError(f"{streets}: no street views here; run jobs/render_streets.py first")
@@ -127,14 +132,23 @@ def list_drives(streets: str) -> list[str]:
 def paint_streets(
     request: PhotoRequest, directories: Sequence[str], actors: int = 1, on_drive: Callable[[], None] | None = None
 ) -> int:
-    """Paint every frame of some drives; how many frames. Goes on where it stopped.
+    """Paint every frame of some drives, and return the number of frames. Another call resumes an interrupted one.
 
-    Raises ValueError if a drive was painted with other options.
+    Args:
+        request: Options of painting.
+        directories: Directories of the drives.
+        actors: Maximum number of actors.
+        on_drive: Called after each drive.
+
+    Raises:
+        ValueError: A drive was painted with other options.
     """
     for directory in directories:
         record = storage.join_uri(directory, "photos.json")
         if said := find_changed_option(record, asdict(request)):
-            raise ValueError(f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it anew")
+            raise ValueError(
+                f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it again"
+            )
         storage.write_json(asdict(request), record)
     total = 0
     for row in map_actors(range(len(directories)), StreetPainter, (request, directories), actors):

@@ -1,8 +1,9 @@
-"""What a pinhole camera in a Scene sees: classes, instances, depth. Exact, without a GPU, the same on every call.
+"""Render a Scene for a pinhole camera: classes, instances and depth, exact and deterministic, on the CPU.
 
-In the image plane 1 / depth is linear over a flat triangle, so the kernel that casts vertical rays (rasters.py) casts
-these too, on 1 / depth instead of height. Ellipsoids are met exactly, by the quadratic of each ray. Camera frame as in
-KITTI-360: x right, y down, z ahead; metres. Pixel centres lie at whole numbers (u to the right, v down).
+In the image plane 1 / depth is linear over a flat triangle. The kernel that casts vertical rays (rasterize.py) can
+therefore cast camera rays, on 1 / depth instead of height. The intersection of each ray with an ellipsoid is exact, by
+a quadratic equation. The camera frame is KITTI-360's: x right, y down, z ahead; metres. Pixel centres lie at whole
+numbers (u to the right, v down).
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, fin
 from pipelines.io.mesh_export import GROUND, Triangles, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY
 
-NEAR_M = 0.1  # nothing nearer is seen
+NEAR_M = 0.1  # nearer surfaces are invisible
 CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # of a camera looking along x
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels. The default is KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
+    """Intrinsics in pixels. Default: KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
 
     width: int = 1408
     height: int = 376
@@ -34,7 +35,7 @@ class Lens:
     cy: float = 238.769549
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same view on another number of pixels."""
+        """Return the lens of the same view with another number of pixels."""
         x, y = width / self.width, height / self.height
         centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
         return Lens(width, height, self.fx * x, self.fy * y, *centre)
@@ -50,7 +51,7 @@ class StreetCamera:
 
     @staticmethod
     def at(position_m: np.ndarray, yaw_rad: float, pitch_rad: float = 0.0, lens: Lens | None = None) -> StreetCamera:
-        """Level, turned left by yaw from the scene's x axis, then looking up by pitch."""
+        """Make a level camera, turned left by yaw from the scene's x axis, then up by pitch."""
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         level_from_scene = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
         cos, sin = np.cos(pitch_rad), np.sin(pitch_rad)
@@ -59,30 +60,30 @@ class StreetCamera:
         return StreetCamera(lens or Lens().resized(704, 188), np.asarray(position_m, float), rotation)
 
     def local(self, points_m: np.ndarray) -> np.ndarray:
-        """Scene points (..., 3) in the camera frame."""
+        """Transform scene points (..., 3) to the camera frame."""
         return (points_m - self.position_m) @ self.camera_from_scene.T
 
 
 class StreetView(NamedTuple):
     """(H, W) each."""
 
-    class_id: np.ndarray  # uint8, see palette; EMPTY where nothing is
-    primitive: np.ndarray  # int32, index into the scene; GROUND for ground and for nothing
-    depth_m: np.ndarray  # float32, z in the camera frame; inf where nothing is
-    normal: np.ndarray  # (H, W, 3) float32, outward, scene frame; 0 where nothing is
+    class_id: np.ndarray  # uint8, see palette; EMPTY for sky
+    primitive: np.ndarray  # int32, index into the scene; GROUND for ground and sky
+    depth_m: np.ndarray  # float32, z in the camera frame; inf for sky
+    normal: np.ndarray  # (H, W, 3) float32, outward, scene frame; 0 for sky
 
     @property
     def semantic(self) -> np.ndarray:
-        """(H, W, 3) uint8: palette colours, white where nothing is."""
+        """(H, W, 3) uint8: palette colours, white for sky."""
         return CLASS_COLORS[self.class_id]
 
     def instance(self) -> np.ndarray:
-        """(H, W) uint16: 0 for ground and nothing, else the primitive's number + 1."""
+        """(H, W) uint16: 0 for ground and sky, else the primitive's number + 1."""
         return (self.primitive + 1).astype(np.uint16)
 
 
 class StreetRenderer:
-    """Looks at one scene from many places: what does not depend on the camera is made once."""
+    """Renders one scene for many cameras; arrays that do not depend on the camera are computed once."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -97,7 +98,7 @@ class StreetRenderer:
         return (normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)).astype(np.float32)
 
     def view(self, camera: StreetCamera) -> StreetView:
-        """What the camera sees."""
+        """Render the scene for a camera."""
         shape = camera.lens.height, camera.lens.width
         nearness, triangle = np.zeros(shape), np.full(shape, -1, np.int64)
         index, corners = _clip_in_front(camera.local(self.soup.corners_m), camera.lens)
@@ -130,7 +131,7 @@ class StreetRenderer:
 
 
 def _list_pixels(lens: Lens) -> Grid:
-    """The image as a grid of rasters.py: x = -v - 1/2, y = -u - 1/2."""
+    """Return the image as a Grid (rasterize.py): x = -v - 1/2, y = -u - 1/2."""
     return Grid(0.0, 0.0, 1.0, lens.height, lens.width)
 
 
@@ -147,7 +148,7 @@ def _project_to_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (t, 3, 3) in the camera frame that may be seen, cut at NEAR_M: their index (k,) and corners (k, 3, 3)."""
+    """Cut the visible triangles (t, 3, 3) in the camera frame at NEAR_M: their index (k,) and corners (k, 3, 3)."""
     x, y, z = np.moveaxis(corners, -1, 0)
     left, right = (0 - 0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx
     top, bottom = (0 - 0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy
@@ -164,7 +165,7 @@ def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndar
 
 
 def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What lies at z >= NEAR_M of the triangles that have 1 or 2 corners nearer: one or two triangles each."""
+    """Cut triangles with 1 or 2 corners nearer than NEAR_M: one or two triangles at z >= NEAR_M each."""
     found_index, found = [], []
     for count in (1, 2):
         some = np.flatnonzero(behind == count)
@@ -193,7 +194,7 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
 
     A ray t d (d with z = 1) meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0, A = |M d|^2, B = d.M^T M p,
     C = |M p|^2 - 1. It does where B^2 - A C = d^T K d >= 0: along a row of pixels between the roots of a quadratic.
-    Ellipsoids around the camera or beside it, not wholly ahead, are left out.
+    Ellipsoids that are not entirely ahead of the camera are left out.
     """
     lens = camera.lens
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
@@ -220,8 +221,8 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     half = k[ball, 0, 1] * row + k[ball, 0, 2]
     rest = k[ball, 1, 1] * row**2 + 2 * k[ball, 1, 2] * row + k[ball, 2, 2]
     root = np.sqrt(np.maximum(half**2 - k[ball, 0, 0] * rest, 0))
-    ends = np.sort([(-half + root) / k[ball, 0, 0], (-half - root) / k[ball, 0, 0]], axis=0)
-    first, count = list_integers_between(*ends, lens.width)
+    low, high = np.sort([(-half + root) / k[ball, 0, 0], (-half - root) / k[ball, 0, 0]], axis=0)
+    first, count = list_integers_between(low, high, lens.width)
     col, row, ball = concatenate_ranges(first, count), np.repeat(row, count), np.repeat(ball, count)
     d = _make_rays(lens, row, col)
     of_d = np.einsum("ki,ki->k", b[ball], d)

@@ -1,4 +1,4 @@
-"""Pictures of a Scene: from above in flat class colours, oblique in soft light, and sheets of pictures."""
+"""Render pictures of a Scene, from above in flat class colours or oblique in soft light, and sheets of pictures."""
 
 from __future__ import annotations
 
@@ -25,11 +25,18 @@ MARK_COLOR = (230, 0, 0)  # sRGB, of lines drawn over a picture
 
 
 def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
-    """The scene from above, unlit, white where there is nothing: (H, W, 3) uint8 sRGB.
+    """Render the scene from above in class colours, white where it is empty.
 
-    Orthographic, up = +x (forward), left = +y; the grid exactly fills the picture and its longer side has
-    size_px pixels. With supersample > 1 each pixel is the mean of that many squared. This is the picture of
-    the metrics: the same to the last bit on every call.
+    Orthographic, up = +x (forward), left = +y; the grid fills the picture. Metrics use this picture; it is
+    bit-identical on every call.
+
+    Args:
+        scene: Scene.
+        size_px: Pixels of the longer side.
+        supersample: Each pixel is the mean of supersample^2 points.
+
+    Returns:
+        (H, W, 3) uint8 sRGB.
     """
     view = _make_oblique_view(scene.grid, size_px * supersample)
     ground_m, ground = scene.surface()
@@ -50,10 +57,11 @@ def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nda
 
 
 def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """The smooth picture from above with the border of a region (rows, cols), True = inside: (H, W, 3) uint8."""
+    """Render the scene from above with the border of a region (rows, cols), True inside: (H, W, 3) uint8."""
     picture = render_bev(scene, size_px, supersample=2).copy()
     view = _make_oblique_view(scene.grid, size_px)
-    inside = region[scene.grid.pixel(view.x_m(), 0.0)[0]][:, scene.grid.pixel(0.0, view.y_m())[1]]
+    origin = np.zeros(1)
+    inside = region[scene.grid.pixel(view.x_m(), origin)[0]][:, scene.grid.pixel(origin, view.y_m())[1]]
     border = np.zeros_like(inside)
     border[1:] |= inside[1:] != inside[:-1]
     border[:, 1:] |= inside[:, 1:] != inside[:, :-1]
@@ -63,20 +71,20 @@ def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) ->
 
 @cache
 def _list_color_pairs() -> np.ndarray:
-    """(18 x 256, 6): the colours of two neighbouring pixels, by the class id of the first plus 256 that of the second."""
+    """(18 x 256, 6) colours of two neighbouring pixels, by the first's class id plus 256 times the second's."""
     first, second = np.zeros((2, len(CLASS_COLORS), 256, 3), np.uint8)
     first[:, : len(CLASS_COLORS)], second[:] = CLASS_COLORS, CLASS_COLORS[:, None]
     return np.concatenate([first, second], axis=2).reshape(-1, 6)
 
 
 def _paint_pixels(class_id: np.ndarray) -> np.ndarray:
-    """(H, W, 3): CLASS_COLORS[class_id (H, W) uint8]; two pixels at a time, since six bytes are copied as fast as three."""
+    """(H, W, 3) CLASS_COLORS[class_id (H, W) uint8], two pixels at a time: copying six bytes is as fast as three."""
     pair = np.resize(class_id, class_id.size + class_id.size % 2).view("<u2")
     return _list_color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
 
 
 def _make_oblique_view(grid: Grid, size_px: int) -> Grid:
-    """The same rectangle with size_px pixels along its longer side."""
+    """Return a grid of the same rectangle with size_px pixels along its longer side."""
     resolution_m = max(grid.rows, grid.cols) * grid.resolution_m / size_px
     rows, cols = (max(1, round(n * grid.resolution_m / resolution_m)) for n in (grid.rows, grid.cols))
     return Grid(grid.front_m, grid.left_m, resolution_m, rows, cols)
@@ -90,11 +98,11 @@ def render_3d(
     elevation_deg: float = 38.0,
     supersample: int = 2,
 ) -> np.ndarray:
-    """The scene as a model on a table, in soft light: (height, width, 3) uint8 sRGB.
+    """Render the scene as a model on a table, in soft light, orthographic: (height, width, 3) uint8 sRGB.
 
-    Orthographic. The camera looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg;
-    it depends on the scene's grid only, so that scenes of one size compare. Where the ground is unknown the
-    light plate under the scene shows.
+    The camera looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg. It depends on the
+    scene's grid only, so pictures of scenes of one size are comparable. The light plate under the scene is visible
+    where the ground is unknown.
     """
     camera = make_oblique_camera(scene.grid, width * supersample, height * supersample, azimuth_deg, elevation_deg)
     linear = average_blocks(render_lit(scene, camera), supersample)
@@ -102,14 +110,14 @@ def render_3d(
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """(H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
+    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "PNG")  # `optimize` makes it a tenth smaller in five times the time
     return file.getvalue()
 
 
 def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
-    """(H, W, C) with each factor x factor block replaced by its mean, float32."""
+    """Replace each factor x factor block of (H, W, C) by its mean, float32."""
     rows, cols = picture.shape[0] // factor, picture.shape[1] // factor
     total = np.zeros((rows, cols, picture.shape[2]), np.float32)
     for i in range(factor):
@@ -121,17 +129,17 @@ def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
 def arrange_contact_sheet(
     pictures: Sequence[np.ndarray], columns: int, captions: Sequence[str] | None = None, gap_px: int = 12
 ) -> np.ndarray:
-    """Pictures (h, w, 3) uint8 in rows of `columns` on white, each centred over its caption: (H, W, 3) uint8.
+    """Arrange pictures (h, w, 3) uint8 in rows of `columns` on white, each over its caption: (H, W, 3) uint8.
 
-    Cells are as large as the largest picture. Raises ValueError if there is no picture or a caption is
-    missing.
+    Cells have the size of the largest picture. Raises ValueError if there is no picture or a caption is missing.
     """
     captions = [""] * len(pictures) if captions is None else captions
     if len(pictures) == 0 or len(captions) != len(pictures):
         raise ValueError(f"{len(pictures)} pictures and {len(captions)} captions: need one or more, one each")
     cell_h, cell_w = max(p.shape[0] for p in pictures), max(p.shape[1] for p in pictures)
-    font = ImageFont.load_default(size=max(11, cell_w // 26))
-    text_h = int(1.6 * font.size) if any(captions) else 0
+    text_size = max(11, cell_w // 26)
+    font = ImageFont.load_default(size=text_size)
+    text_h = int(1.6 * text_size) if any(captions) else 0
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
     step_x, step_y = cell_w + gap_px, cell_h + text_h + gap_px

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from models.scene import ELLIPSOID, Grid, Scene
+from pipelines.geometry.masks import find_nearest_true
 from pipelines.geometry.orthographic import (
     Camera,
     cast_ellipsoids,
@@ -115,9 +116,9 @@ def _make_sheet(scene: Scene) -> np.ndarray:
     height, winner = scene.surface()
     if (winner < 0).all():
         return np.zeros((2, 2))
-    row, col = ndimage.distance_transform_edt(winner < 0, return_distances=False, return_indices=True)
+    nearest = find_nearest_true(winner >= 0)
     step = max(1, round(1 / scene.grid.resolution_m))
-    below = ndimage.minimum_filter(height[row, col], 2 * step + 1) - 0.08
+    below = ndimage.minimum_filter(height[nearest], 2 * step + 1) - 0.08
     nodes = [np.linspace(0, n - 1, max(2, n // step + 1)).round().astype(int) for n in height.shape]
     return below[np.ix_(*nodes)]
 

@@ -1,4 +1,4 @@
-"""Street views along the roads of scenes: one Ray task per scene; images, cameras, a contact sheet and a moving picture."""
+"""Render street views along the roads of scenes, one Ray task per scene: images, cameras, contact sheet, animation."""
 
 from __future__ import annotations
 
@@ -111,9 +111,18 @@ def write_street(scene: Scene, request: StreetRequest) -> int:
 def render_streets(
     request: StreetRequest, selection: SceneSubset, on_scene: Callable[[], None] | None = None
 ) -> dict[str, int]:
-    """Street views of the selected scenes; frames by scene id, 0 for a scene without a road. Goes on where it stopped.
+    """Render street views of the selected scenes. Another call resumes an interrupted one.
 
-    Raises ValueError if the output holds a run with other cameras, or if no scene has a road.
+    Args:
+        request: Cameras and output.
+        selection: Scenes.
+        on_scene: Called after each scene.
+
+    Returns:
+        Number of frames by scene id; 0 for a scene without a road.
+
+    Raises:
+        ValueError: The output holds a run with other cameras, or no scene has a road.
     """
     record = storage.join_uri(request.output, "streets", f"{request.run}.json")
     if said := find_changed_option(record, asdict(request)):

@@ -20,8 +20,11 @@ NUM_COLORS = 6  # the style's classes series-0 ..
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Named series of (x, y), equally long each. Values that are not finite, or not positive on a logarithmic
-    axis, are left out. A series of 200 points or more is drawn faintly under its running mean."""
+    """Named series of (x, y), with as many x as y.
+
+    Values that are not finite, or not positive on a logarithmic axis, are left out. A series of 200 points or more is
+    drawn faintly under its running mean.
+    """
 
     title: str
     series: Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -31,7 +34,7 @@ class Chart:
 
 
 def draw_chart_svg(chart: Chart) -> str:
-    """The chart as an <svg> element. Raises ValueError if a series has not as many x as y."""
+    """Draw the chart as an <svg> element. Raises ValueError if a series has not as many x as y."""
     series = {name: _find_drawable(x, y, chart.log_y) for name, (x, y) in chart.series.items()}
     points = [np.stack(pair) for pair in series.values() if len(pair[0])]
     head = f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">'
@@ -51,7 +54,7 @@ def draw_chart_svg(chart: Chart) -> str:
 
 
 def make_standalone_svg(chart: Chart) -> str:
-    """The chart as a file of its own: with its name space and the page's style."""
+    """Make a separate SVG file of the chart, with its XML namespace and the page's style."""
     face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
     head, rest = draw_chart_svg(chart).split(">", 1)
     space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
@@ -59,7 +62,7 @@ def make_standalone_svg(chart: Chart) -> str:
 
 
 def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Round numbers (1, 2 or 5 times a power of ten) from at most `low` to at least `high`."""
+    """Choose round numbers (1, 2 or 5 times a power of ten) from at most `low` to at least `high`."""
     if high <= low:
         high = low + max(abs(low), 1.0)
     raw = (high - low) / about
@@ -70,7 +73,7 @@ def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Powers of ten around [low, high], with 2s and 5s where they span less than two decades."""
+    """Choose powers of ten around [low, high], with 2s and 5s if they span two decades or less."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
     factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)
@@ -98,13 +101,13 @@ class _Axis:
 
 
 def _find_drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    if x.shape != y.shape:
-        raise ValueError(f"a series has {x.size} x values and {y.size} y values")
-    keep = np.isfinite(x) & np.isfinite(y)
+    xs, ys = np.asarray(x, float), np.asarray(y, float)
+    if xs.shape != ys.shape:
+        raise ValueError(f"a series has {xs.size} x values and {ys.size} y values")
+    keep = np.isfinite(xs) & np.isfinite(ys)
     if log_y:
-        keep &= y > 0
-    return x[keep], y[keep]
+        keep &= ys > 0
+    return xs[keep], ys[keep]
 
 
 def _draw_grid(x_axis: _Axis, y_axis: _Axis, x_ticks: list[float], y_ticks: list[float]) -> list[str]:
@@ -159,8 +162,7 @@ def _draw_legend(names: list[str]) -> str:
 
 
 def format_number(value: float) -> str:
-    """A number as people write it: at most four digits that matter, thousands apart, powers of ten far
-    out."""
+    """Format a number: at most four significant digits, thousands separators, powers of ten for extreme values."""
     if not math.isfinite(value):
         return "–"
     size = abs(value)

@@ -6,9 +6,9 @@ Works on any dataset directory, real or generated. Only `paint` uses Ray.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -64,12 +64,13 @@ def paint_scene(
     """Pictures of the scenes at `indices`: per scene one per view. Drawn by Ray, a task per few scenes of a shard."""
     import ray.data
 
+    from pipelines.runtime.ray_tasks import flat_map_dataset
+
     tasks = [
         {**asdict(shard), "rows": rows, "places": places} for shard, rows, places in catalogue.chunks(indices, CHUNK)
     ]
-    graph = ray.data.from_items(tasks, override_num_blocks=len(tasks)).flat_map(
-        paint_scenes, fn_kwargs={"views": views}
-    )
+    rows = ray.data.from_items(tasks, override_num_blocks=len(tasks))
+    graph = flat_map_dataset(rows, paint_scenes, fn_kwargs={"views": views})
     pictures: list[list] = [[None] * len(views) for _ in indices]
     for row in graph.iter_rows():
         picture = np.frombuffer(row["picture"], np.uint8).reshape(row["shape"])
@@ -84,7 +85,7 @@ def paint_scene(
 
 def load_font(size: int) -> ImageFont.FreeTypeFont:
     """Pillow's own face: no font file is looked for, every machine draws the same."""
-    return ImageFont.load_default(size=size)
+    return cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))  # with a size it is never a bitmap font
 
 
 def fit_text(text: str, size: int, width_px: float) -> str:
@@ -171,7 +172,7 @@ def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndar
     image = Image.new("RGB", shape, "white")
     draw = ImageDraw.Draw(image, "RGBA")
 
-    def pixels(point_m: np.ndarray) -> list[tuple[float, float]]:
+    def pixels(point_m: Iterable[np.ndarray]) -> list[tuple[float, float]]:
         return [(scale * (grid.left_m - y), scale * (grid.front_m - x)) for x, y in point_m]
 
     outlines, center = compute_footprints_m(scene), scene.center_m[:, :2]
@@ -226,7 +227,13 @@ def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
             f"From above, {extent} m, forward is up",
         ),
         "3d": (render_3d(scene, WIDE, LARGE), MARGIN + LARGE + GAP, TOP_ROW, LARGE, "From behind"),
-        "ground": (render_bev(scene.select([]), SMALL, supersample=2), GROUND_X, BOTTOM_ROW, SMALL, "Ground classes"),
+        "ground": (
+            render_bev(scene.select(np.zeros(0, int)), SMALL, supersample=2),
+            GROUND_X,
+            BOTTOM_ROW,
+            SMALL,
+            "Ground classes",
+        ),
         "heights": (heights, HEIGHTS_X, BOTTOM_ROW, SMALL, "Ground height, m"),
         "primitives": (draw_footprints(bare, SMALL), PRIMITIVES_X, BOTTOM_ROW, SMALL, "Primitives, seen through"),
     }
@@ -376,8 +383,8 @@ def make_captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[
     out = []
     for k in indices:
         remark = f"{totals[k]} primitives"
-        if values is not None:
-            remark += f"  ·  {_format_quantity(column, values[k])}"
+        if column is not None and values is not None:
+            remark += f"  ·  {_format_quantity(column, float(values[k]))}"
         out.append((names[k], remark))
     return out
 

@@ -252,7 +252,8 @@ def _draw_frame(sequence: str, scenes: int, corner_px: np.ndarray, cell_px: np.n
     """A sequence's frame, and its name below if there is room."""
     x, y = corner_px - PADDING_PX
     outline = 'rx="6" fill="none" stroke="var(--line)"'
-    parts = [_draw_rect(x, y, *(cell_px + 2 * PADDING_PX), outline, f"{sequence}: {scenes} scenes")]
+    width, height = cell_px + 2 * PADDING_PX
+    parts = [_draw_rect(x, y, width, height, outline, f"{sequence}: {scenes} scenes")]
     if shelf is NAMED:
         name = sequence if len(sequence) <= 9 else f"{sequence[:8]}…"
         parts.append(_draw_text(x, y + cell_px[1] + 2 * PADDING_PX + 15, name))

@@ -1,7 +1,7 @@
-"""A dataset directory as one page: what is in it, how much, how large, where, under which labels, and what was left out.
+"""Render a dataset directory as one page: numbers, sizes, places and labels of its scenes, and rejected scenes.
 
-Everything is computed from the tables with numpy; what only dataset.json knows (slots, thresholds, what the readers
-dropped) is shown where there is one, so that generated directories have a page too.
+All figures come from the tables. Slots, thresholds and the readers' reports come from dataset.json and are optional, so
+that directories of generated scenes have a page as well.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -275,7 +276,10 @@ def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
             chosen = {label: (labels == label) & np.isfinite(share) for label in (*DENSITIES, None)}
             shares[name] = {label or "no label": share[rows].mean() for label, rows in chosen.items() if rows.any()}
         drawings.append(CaptionedSvg(draw_share_bars(f"by {group} density", {n: by for n, by in shares.items() if by})))
-    note = "Mean share of a scene's area that each ground class covers. Classes may overlap, and some of the area has none."
+    note = (
+        "Mean share of a scene's area that each ground class covers. Classes may overlap, and some of the area has "
+        "none."
+    )
     return DrawingsSection("Ground", drawings, "pairs", note)
 
 
@@ -290,7 +294,10 @@ def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
         drawings.append(
             CaptionedSvg(draw_label_matrix(f"{part}, {format_number(total)} scenes", counts, *_name_rows(names)))
         )
-    note = "Scenes per pair of labels. low: count and volume both below their p25; high: both above their p75; else medium."
+    note = (
+        "Scenes per pair of labels. low: count and volume both below their p25; high: both above their p75; else "
+        "medium."
+    )
     if not facts.description:
         return [DrawingsSection("Labels", drawings, "small", "Scenes per pair of labels: what was asked for.")]
     found = {group: facts.description[f"{group}_thresholds"] for group in ("vegetation", "vehicle")}
@@ -331,7 +338,7 @@ def make_reader_sections(facts: DatasetFacts) -> list[Section]:
         return []
     names = list(dict.fromkeys(name for report in reports.values() for name in report))
 
-    def amount(value: object) -> int | None:
+    def amount(value: Any) -> int | None:
         if isinstance(value, Mapping):
             return sum(value.values())
         return len(value) if isinstance(value, list) else value

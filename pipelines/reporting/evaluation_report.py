@@ -1,4 +1,4 @@
-"""Generated scenes against real ones on one page: scores with their intervals, what they mean, and pictures to look at."""
+"""Render the comparison of generated with real scenes as one page: scores, intervals, meanings and pictures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from pipelines.reporting.report import (
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
 MEANINGS = {
-    "fid": "Frechet distance of Inception's pool3 features; 0 is equal. Falls with the number of samples: compare at equal numbers only",
+    "fid": "Frechet distance of Inception's pool3 features; 0 is equal. Falls with the number of samples: compare at "
+           "equal numbers only",
     "sfid": "the same of its spatial features, which see where things lie",
     "kid": "kernel distance of the pool3 features, cubic kernel; 0 is equal, without bias from the number of samples",
     "inception_score": "how sure Inception is of each picture, and how varied it finds them; made for photographs",
@@ -57,7 +58,7 @@ VALIDITY = {
 
 @dataclass(frozen=True, eq=False)
 class ExamplePictures:
-    """Pictures (H, W, 3) uint8 for the page: some of either side, and generated ones, each with its nearest real ones."""
+    """Pictures (H, W, 3) uint8 for the page: examples of both sides, and generated ones with the nearest real ones."""
 
     real: Sequence[np.ndarray]
     generated: Sequence[np.ndarray]
@@ -68,7 +69,7 @@ class ExamplePictures:
 def render_evaluation_html(
     scores: Mapping, counts: Mapping[str, np.ndarray], shown: ExamplePictures, protocol: Sequence[str]
 ) -> str:
-    """The whole page from scores as `evaluate.plain` gives them; counts (n, 11) of either side by name, if known."""
+    """Render the page from the scores of `convert_estimates` and the counts (n, 11) of both sides, if known."""
     sections: list[Section] = [
         make_summary(scores),
         Pictures("Real", [Picture("", image, "real") for image in shown.real], columns=6),
@@ -93,7 +94,8 @@ def render_evaluation_html(
 
 INTERVALS = (
     "In brackets: 95 % bootstrap intervals over scenes. Those of precision, recall, density and coverage hold the "
-    "neighbourhoods fixed; those of Frechet distances are of first order and say nothing of their bias at small numbers."
+    "neighbourhoods fixed; those of Frechet distances are of first order and say nothing of their bias at small "
+    "numbers."
 )
 
 
@@ -186,7 +188,8 @@ def build_distance_table(scores: Mapping) -> Table:
         for name, (found, unit) in sorted(named.items())
     ]
     note = (
-        "Wasserstein distances of distributions in the unit given, in bits Jensen-Shannon divergences. The last column is "
+        "Wasserstein distances of distributions in the unit given, in bits Jensen-Shannon divergences. The last "
+        "column is "
         "the distance of two halves of the real scenes: nothing comes nearer than about that."
     )
     return Table("How distributions differ", ("of", "unit", "real to generated", "within real"), rows, note=note)
@@ -220,7 +223,8 @@ def build_memorisation_table(found: Mapping) -> Table:
         for name, words in (("mean", "mean"), ("median", "median"), ("minimum", "smallest"), ("maximum", "greatest"))
     ]
     note = (
-        f"In {found['features']} features. {format_value(found['memorised'])} of the generated scenes are nearer to a real "
+        f"In {found['features']} features. {format_value(found['memorised'])} of the generated scenes are nearer to "
+        "a real "
         "one than all but 1 % of the real ones are to another; "
         f"{format_value(found['copies'])} equal a real one."
     )

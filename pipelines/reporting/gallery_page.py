@@ -33,7 +33,7 @@ CAPTIONS = ("vegetation_density", "vehicle_density", "num_primitives")
 
 
 def pack_scenes(row: dict) -> list[dict]:
-    """Row in: a shard, rows in it and their places. Rows out: per scene its place, picture and content for the viewer."""
+    """Row in: a shard, rows in it and their places. Rows out: each scene's place, picture and viewer content."""
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
@@ -45,7 +45,7 @@ def pack_scenes(row: dict) -> list[dict]:
 def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
-    """The whole page, about 35 kB a scene. Scenes are packed by Ray, a task per few of a shard."""
+    """Render the page, about 35 kB per scene. Ray tasks pack CHUNK scenes of a shard each."""
     import ray.data
 
     tasks = [
@@ -74,7 +74,7 @@ def render_gallery_html(
 
 
 def list_scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
-    """What the page filters by and says of each scene: a number, word or null per column."""
+    """Return the values that the page shows and filters by: a number, word or null per scene and column."""
     table = catalogue.scenes.take(pa.array(indices))
     names = [name for name in ("scene_id", *CHOICES, *NUMBERS) if name in table.column_names]
     rows = table.select(names).to_pylist()
@@ -100,7 +100,8 @@ def _render_page(title: str, subtitle: str, data: dict) -> str:
 <button id="clear">clear</button><strong id="count"></strong></section>
 <div id="cards"></div></main>
 <dialog id="dialog"><div class="bar"><strong id="name"></strong><span></span>
-<button id="previous" title="previous">←</button><button id="next" title="next">→</button><button id="close" title="close">✕</button></div>
+<button id="previous" title="previous">←</button><button id="next" title="next">→</button>\
+<button id="close" title="close">✕</button></div>
 <div class="both"><canvas id="view"></canvas><dl id="values"></dl></div><p id="picked"></p></dialog>
 <script type="application/json" id="data">{content}</script>
 <script type="module">{read_script("viewer.js")}
@@ -110,21 +111,25 @@ def _render_page(title: str, subtitle: str, data: dict) -> str:
 GALLERY_STYLE = """
 #filters { display: flex; flex-wrap: wrap; gap: 12px 18px; align-items: end; padding: 18px 22px; }
 #choices { display: contents; } #filters label { display: grid; gap: 2px; font-size: 13px; color: var(--soft); }
-input, select, button { font: inherit; font-size: 15px; padding: 5px 10px; border: 1px solid var(--line); border-radius: 8px;
+input, select, button { font: inherit; font-size: 15px; padding: 5px 10px; border: 1px solid var(--line); \
+border-radius: 8px;
   background: var(--page); color: var(--ink); }
 input[type=number] { width: 7em; } button { cursor: pointer; } button:hover { border-color: var(--accent); }
 #count { margin-left: auto; font-weight: 500; color: var(--soft); }
 #cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 16px; padding-bottom: 60px; }
-.card { display: grid; gap: 4px; padding: 10px; text-align: left; background: var(--card); border-radius: 12px; overflow: hidden; }
+.card { display: grid; gap: 4px; padding: 10px; text-align: left; background: var(--card); \
+border-radius: 12px; overflow: hidden; }
 .card[hidden] { display: none; } .card img { width: 100%; border-radius: 6px; background: white; }
 .card span { font-size: 13px; overflow-wrap: anywhere; } .card small { color: var(--soft); }
 dialog { width: min(1300px, 96vw); height: 92vh; padding: 0; border: 1px solid var(--line); border-radius: 16px;
   background: var(--card); color: var(--ink); overflow: hidden; }
 dialog[open] { display: flex; flex-direction: column; } dialog::backdrop { background: #0008; }
 .bar { display: flex; gap: 10px; align-items: center; padding: 10px 16px; } .bar span { flex: 1; }
-.both { flex: 1; display: flex; min-height: 0; } #view { flex: 1; min-width: 0; width: 100%; height: 100%; cursor: grab; }
+.both { flex: 1; display: flex; min-height: 0; } \
+#view { flex: 1; min-width: 0; width: 100%; height: 100%; cursor: grab; }
 #values { width: 250px; margin: 0; padding: 0 18px; overflow: auto; font-size: 14px; }
-#values dt { color: var(--soft); } #values dd { margin: 0 0 8px; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+#values dt { color: var(--soft); } \
+#values dd { margin: 0 0 8px; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
 #picked { margin: 0; padding: 10px 16px; min-height: 2.6em; font-size: 14px; max-width: none; }
 @media (max-width: 720px) { #values { display: none; } }
 """

@@ -50,7 +50,8 @@ def render_inpaint_html(
     note = f"Inside the red line {SUBJECTS[contents]} regenerated; the rest is the given scene's."
     how = (
         "The latent outside the region is the given scene's, bit for bit, but decoders see the whole latent. The table "
-        "shows how far their output is off there. The scenes above and in the tables take that part from the given scene."
+        "shows how far their output is off there. The scenes above and in the tables take that part from the given "
+        "scene."
     )
     pictures = Pictures("Scenes", shown, min(PER_ROW, 1 + num_variants), note)
     table = Table("Drift outside the region", tuple(drift), [tuple(drift.values())], note=how)

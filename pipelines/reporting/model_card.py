@@ -1,23 +1,23 @@
-"""The card of a published model, in Markdown: what it is, how it was trained, what it scores, how it fails."""
+"""Write the card of a published model in Markdown: description, training, scores and failures."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
 
-HIDDEN = ("stage", "dataset", "lvae")  # of a run's options: paths and digests, told elsewhere
+HIDDEN = ("stage", "dataset", "lvae")  # options of a run that are paths and digests, reported elsewhere
 
 Points = tuple[Sequence[float], Sequence[float]]
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """One run of training, as MLflow or the training.json of a published entry tells it."""
+    """One run of training, as recorded by MLflow or in the training.json of a published model."""
 
     name: str  # lvae, dit; dit-2 where a second run began with the first one's weights
     stage: str
@@ -35,7 +35,7 @@ class TrainingRecord:
         return f"curves-{self.name}.svg"
 
     def record(self, data: Mapping) -> dict:
-        """What training.json keeps: nothing of the machine's paths, but what the dataset was."""
+        """Return the content of training.json, without paths of this machine and with the options of the dataset."""
         known = {key: value for key, value in self.options.items() if key not in HIDDEN}
         return asdict(self) | {"options": known, "data": self.data or dict(data)}
 
@@ -53,7 +53,7 @@ class TrainingRecord:
 
 @dataclass(frozen=True)
 class ModelCard:
-    """All that a card says. `scores` as metrics.json has them; `dataset` as dataset.json; `sampling`: how scenes were made."""
+    """Content of a card. `scores` are those of metrics.json, `dataset` is dataset.json, `sampling` holds options."""
 
     name: str
     version: str
@@ -73,16 +73,31 @@ class ModelCard:
         yield "---\nlicense: apache-2.0\nlibrary_name: diffusers"
         yield "tags: [3d, urban-scenes, primitives, layout, diffusion]\n---\n"
         yield f"# PrITTI on Ray: {self.name}\n"
-        yield f"Layout VAE and diffusion transformer that generate 3D semantic urban scenes of 64 m x 64 m as primitives on a rasterised ground. Version {self.version}, written by `jobs/publish_model.py`.\n"
+        yield (
+            "Layout VAE and diffusion transformer that generate 3D semantic urban scenes of 64 m x 64 m as "
+            f"primitives on a rasterised ground. Version {self.version}, written by `jobs/publish_model.py`.\n"
+        )
         yield "```python\nfrom models import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
-        yield f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, num_inference_steps=20)\n```\n'
-        yield f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, {self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}, the network's noise divided by {self.sampling.get('noise_scaling', 1):g}, primitives of an existence above {self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
+        yield (
+            f'pipeline.use_sampler("dpm++")\nscenes = pipeline.generate(["{self.labels[0]}"], seed=0, '
+            "num_inference_steps=20)\n```\n"
+        )
+        yield (
+            f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not "
+            f"chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, "
+            f"{self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}, the "
+            f"network's noise divided by {self.sampling.get('noise_scaling', 1):g}, primitives of an existence above "
+            f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
+        )
         yield f"Conditioned on: {self.label} ({', '.join(self.labels)}).\n"
 
     def _training(self) -> Iterator[str]:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
-        yield f"## Data\n\n{self.dataset['source']}, {scenes}. Trained on the train split; scored against the {self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
+        yield (
+            f"## Data\n\n{self.dataset['source']}, {scenes}. Trained on the train split; scored against the "
+            f"{self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
+        )
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training in self.trainings:
             yield f"## Training: {training.stage}\n\n![Losses by step]({training.picture})\n"
@@ -91,21 +106,34 @@ class ModelCard:
     def _scores(self) -> Iterator[str]:
         generation = self.scores["generation"]
         sides = generation["scenes"]
-        yield f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones of split {self.real_split}, and the layout VAE's reconstructions of {self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` has every figure; docs/evaluation.md says what each is.\n"
+        yield (
+            f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones of split "
+            f"{self.real_split}, and the layout VAE's reconstructions of "
+            f"{self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` "
+            "has every figure; docs/evaluation.md says what each is.\n"
+        )
         yield from render_table(
             ("score", "value"), ((name, format_value(value)) for name, value in list_headlines(self.scores))
         )
 
     def _limits(self) -> Iterator[str]:
         validity = self.scores["generation"]["validity"]
-        yield "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*Those with most faults among the first scenes that were scored.*\n"
+        yield (
+            "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*Those with most "
+            "faults among the first scenes that were scored.*\n"
+        )
         rows = [
             (VALIDITY[k], *(format_value(v[side]) or "–" for side in ("generated", "real")))
             for k, v in validity.items()
         ]
         yield from render_table(("share of", "generated", "real"), rows)
         yield "## Use and limits\n"
-        yield "Meant for research on layouts, for trying the tools, and as a start for training on other data. It knows nothing but the data named above: a procedural town is no survey of any real place, and scenes must not be taken for one. Nothing here was tested for the safety of vehicles. Repair faults with `jobs/edit_scenes.py repair`.\n"
+        yield (
+            "Meant for research on layouts, for trying the tools, and as a start for training on other data. It "
+            "knows nothing but the data named above: a procedural town is no survey of any real place, and scenes "
+            "must not be taken for one. Nothing here was tested for the safety of vehicles. Repair faults with "
+            "`jobs/edit_scenes.py repair`.\n"
+        )
         yield "Licence: Apache-2.0, weights and code.\n"
 
     def _files(self) -> Iterator[str]:
@@ -113,8 +141,8 @@ class ModelCard:
         yield from render_table(("file", "SHA-256"), self.checksums.items())
 
 
-def render_table(head: Sequence[str], rows: Sequence[Sequence[str]] | Iterator) -> Iterator[str]:
-    """Lines of a Markdown table, an empty one after it."""
+def render_table(head: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Iterator[str]:
+    """Yield the lines of a Markdown table and an empty line."""
     yield "| " + " | ".join(head) + " |"
     yield "|" + "---|" * len(head)
     for row in rows:

@@ -1,4 +1,4 @@
-"""How well scenes come back from the latent: one page of scores, by category and class, with the best and worst scenes."""
+"""Render the scores of layout-VAE reconstruction as one page, by category and class, with best and worst scenes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MEMORY = {
 def render_reconstruction_html(
     scores: Mapping, scenes: pa.Table, best: Sequence[Mapping], worst: Sequence[Mapping], subtitle: str = ""
 ) -> str:
-    """The whole page from `rebuild.Rebuilt` and the pictures of its first and last scenes (`rebuild.draw`)."""
+    """Render the page from a `Reconstruction` and the pictures of its first and last scenes (`draw_scenes`)."""
     sections = [
         make_key_figures(scores),
         *(
@@ -100,7 +100,8 @@ def draw_scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) 
             "truth_above": drawn["scene_id"],
             "rebuilt_above": f"ground IoU {_format_percent(row['ground_iou'], 0)} · RMSE {rmse}",
             "truth_oblique": f"{row['primitives']} primitives",
-            "rebuilt_oblique": f"{row['rebuilt_primitives']} primitives · voxel mIoU {_format_percent(row['voxel_miou'], 0)}",
+            "rebuilt_oblique": f"{row['rebuilt_primitives']} primitives · voxel mIoU "
+            f"{_format_percent(row['voxel_miou'], 0)}",
         }
         for name, caption in captions.items():
             pictures.append(Picture(caption, drawn[name], "truth" if name.startswith("truth") else "reconstruction"))
@@ -140,24 +141,60 @@ def build_overall_table(scores: Mapping) -> Table:
     voxels, matched, memory = scores["voxels"], scores["matched"], scores["memory_bytes"]
     bounds = scores["height_bounds_m"]
     rows = [
-        ("ground IoU", scores["ground_iou"], PAPER["ground_iou"], "the truth's pixels on which both sides have a class, over those on which either has; all classes together"),
-        ("ground IoU on the model's pixels", scores["raster_ground_iou"], None, f"the truth resampled to the model's rasters of {scores['raster_px']} x {scores['raster_px']}: what their resolution costs is left out"),
+        (
+            "ground IoU",
+            scores["ground_iou"],
+            PAPER["ground_iou"],
+            "the truth's pixels on which both sides have a class, over those on which either has; all classes together",
+        ),
+        (
+            "ground IoU on the model's pixels",
+            scores["raster_ground_iou"],
+            None,
+            f"the truth resampled to the model's rasters of {scores['raster_px']} x {scores['raster_px']}: what "
+            "their resolution costs is left out",
+        ),
         ("height RMSE, m", scores["height_rmse_m"], None, "over truly occupied pixels"),
         ("height MAE, m", scores["height_mae_m"], None, "over truly occupied pixels"),
         (
-            "height MSE, normalised", scores["height_mse_normalised"], PAPER["height_mse_normalised"],
-            f"heights scaled to [0, 1] by this model's bounds, {bounds['low']:.2f} to {bounds['high']:.2f} m; the paper's bounds are not known",
+            "height MSE, normalised",
+            scores["height_mse_normalised"],
+            PAPER["height_mse_normalised"],
+            f"heights scaled to [0, 1] by this model's bounds, {bounds['low']:.2f} to {bounds['high']:.2f} m; the "
+            "paper's bounds are not known",
         ),
         ("AP3D", scores["ap3d"], PAPER["ap3d"], "mean over categories and ten IoU3D thresholds, 0.05 to 0.50"),
         ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at IoU3D 0.50"),
         ("mean IoU3D", matched["mean_iou3d"], None, "over matched pairs of boxes"),
-        ("found", matched["found"], None, "share of true boxes that overlap the reconstructed one they are matched with"),
-        ("right", matched["right"], None, "share of reconstructed boxes that overlap the true one they are matched with"),
+        (
+            "found",
+            matched["found"],
+            None,
+            "share of true boxes that overlap the reconstructed one they are matched with",
+        ),
+        (
+            "right",
+            matched["right"],
+            None,
+            "share of reconstructed boxes that overlap the true one they are matched with",
+        ),
         ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty"),
         ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over classes, empty left out"),
-        ("density labels kept", scores["label_fidelity"]["joint_fidelity"], None, "share of scenes whose reconstruction has both density labels of the truth: what generated scenes can reach"),
-        ("size, MiB", (memory["rasters"] + memory["vectors"]) / MIB, PAPER["MiB"], f"rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors of one scene, as tensors; the paper's rasters have 256 x 256"),
-    ]  # fmt: skip
+        (
+            "density labels kept",
+            scores["label_fidelity"]["joint_fidelity"],
+            None,
+            "share of scenes whose reconstruction has both density labels of the truth: what generated scenes can "
+            "reach",
+        ),
+        (
+            "size, MiB",
+            (memory["rasters"] + memory["vectors"]) / MIB,
+            PAPER["MiB"],
+            f"rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors of one scene, as tensors; "
+            "the paper's rasters have 256 x 256",
+        ),
+    ]
     return Table(
         "Overall",
         ("measure", "here", "the paper, KITTI-360"),
@@ -182,7 +219,10 @@ def build_category_table(scores: Mapping) -> Table:
         for name in CATEGORIES
         if name in scores["truths"] or name in matched["category_right"]
     ]
-    note = "Ellipsoids have no AP3D, as in the paper; their IoU3D is that of ellipsoids, by sampling, and not part of the overall mean."
+    note = (
+        "Ellipsoids have no AP3D, as in the paper; their IoU3D is that of ellipsoids, by sampling, and not part of "
+        "the overall mean."
+    )
     return Table("Categories", ("category", "in truth", *columns), rows, note=note)
 
 
@@ -219,7 +259,10 @@ def describe_voxel_range(scores: Mapping) -> Table:
     rows.append(("all objects", voxels["objects_partly_outside"], voxels["objects_outside"]))
     for name, partly in voxels["category_partly_outside"].items():
         rows.append((spell_name(name), partly, voxels["category_outside"][name]))
-    note = f"Voxels reach from {voxels['bottom_m']:g} to {voxels['top_m']:g} m. Shares of the true scenes that lie beyond and do not count."
+    note = (
+        f"Voxels reach from {voxels['bottom_m']:g} to {voxels['top_m']:g} m. Shares of the true scenes that lie "
+        "beyond and do not count."
+    )
     return Table("What the voxels leave out", ("of", "partly outside", "wholly outside"), rows, note=note)
 
 
@@ -236,11 +279,16 @@ def list_definitions(scores: Mapping) -> Text:
         [
             "Scenes are decoded from the mean of their latent, without noise, and compared on the truth's own pixels. "
             "Every true primitive counts, those too that the tensors had no slot for.",
-            "AP3D: proposals of all scenes ranked by existence, greedily given the free truth of their scene and category "
+            "AP3D: proposals of all scenes ranked by existence, greedily given the free truth of their scene and "
+            "category "
             "that they overlap most, 101 recall points. IoU3D of boxes is exact.",
-            "Mean IoU3D: within a scene and category, reconstructed primitives above the existence threshold and true ones "
-            "are matched one to one such that the sum of their IoU3D is greatest; pairs that do not overlap are no pairs.",
-            "Voxels: a primitive fills a voxel whose centre lies in it, the finer category wins, and ground is the voxel that "
-            "the highest surface passes through. One confusion matrix over all scenes; a class on neither side does not count.",
+            "Mean IoU3D: within a scene and category, reconstructed primitives above the existence threshold and "
+            "true ones "
+            "are matched one to one such that the sum of their IoU3D is greatest; pairs that do not overlap are no "
+            "pairs.",
+            "Voxels: a primitive fills a voxel whose centre lies in it, the finer category wins, and ground is the "
+            "voxel that "
+            "the highest surface passes through. One confusion matrix over all scenes; a class on neither side does "
+            "not count.",
         ],
     )

@@ -95,7 +95,7 @@ Section = Text | KeyFigures | Pictures | Charts | Table
 
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
-    """Writes `report_html` to a temporary name beside `path` and moves it into place."""
+    """Write `render_report_html` to a temporary file next to `path` and move it into place."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     temporary.write_text(render_report_html(title, sections, subtitle), encoding="utf-8")
@@ -132,7 +132,10 @@ def _render_body(section: Section) -> str:
         case Pictures():
             return _render_paragraph(section.note) + _render_pictures(section)
         case Charts():
-            return f'{_render_paragraph(section.note)}<div class="charts">{"".join(map(_render_chart, section.charts))}</div>'
+            return (
+                f"{_render_paragraph(section.note)}<div "
+                f'class="charts">{"".join(map(_render_chart, section.charts))}</div>'
+            )
         case Table():
             return _render_paragraph(section.note) + _render_table(section)
     raise ValueError(f"not a section of a report: {section!r}")

@@ -20,7 +20,7 @@ SORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Every scene of a dataset directory, or of one source or split of it: its row of the scenes table and its place."""
+    """The scenes of a dataset directory, or of one source or split: their rows of the scenes table and their places."""
 
     root: str
     scenes: pa.Table  # n rows: the scenes table without world_from_imu, with source and split
@@ -98,7 +98,7 @@ class Catalogue:
             return self.draw(count, seed)
         if sort == "drive":
             keys = [(name, "ascending") for name in ("source", "split", "sequence", "frame")]
-            order = pc.sort_indices(self.scenes, keys).to_numpy()
+            order = pc.sort_indices(self.scenes, keys).to_numpy()  # pyright: ignore[reportAttributeAccessIssue]
         else:
             values = self.column(self.sort_column(sort)).astype(float)
             order = np.argsort(values, kind="stable")[: np.isfinite(values).sum()]
@@ -108,8 +108,8 @@ class Catalogue:
             return self.spread(order, count)
         return order[:count] if pick == "lowest" else order[::-1][:count]
 
-    def chunks(self, indices: Sequence[int], size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
-        """The scenes at `indices`, at most `size` at a time from one shard: shard, rows in it, places in `indices`."""
+    def chunks(self, indices: np.ndarray, size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
+        """Yield chunks of at most `size` scenes at `indices` from one shard: shard, rows in it, places in `indices`."""
         for shard in np.unique(self.shard[indices]):
             places = np.flatnonzero(self.shard[indices] == shard)
             for start in range(0, len(places), size):

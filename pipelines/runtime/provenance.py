@@ -1,4 +1,4 @@
-"""Where a result comes from: the command, the commit and the machine, in words. No host names, no paths of this machine."""
+"""Describe where a result comes from: command, commit and machine, without host names and paths of this machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def describe_machine() -> str:
-    """Processor, cores, memory and GPUs, as in "AMD EPYC, 2 cores, 24 GiB"."""
+    """Return processor, cores, memory and GPUs, as in "AMD EPYC, 2 cores, 24 GiB"."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.machine())
@@ -25,7 +25,7 @@ def describe_machine() -> str:
 
 
 def find_commit() -> str:
-    """The commit of this code, with a + if files have changed since; "unknown" outside a git checkout."""
+    """Return the commit of this code, with a + if files have changed since; "unknown" outside a git checkout."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(
@@ -39,7 +39,10 @@ def find_commit() -> str:
 
 
 def format_command() -> str:
-    """What was typed; of paths under $PRITTI_HOME or this checkout what comes after, of other absolute ones the last part."""
+    """Return the command line with shortened paths.
+
+    Paths under $PRITTI_HOME and this checkout become relative to them; other absolute paths keep their last part only.
+    """
     roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
 
     def public(word: str) -> str:

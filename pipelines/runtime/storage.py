@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, on a local disk or on anything pyarrow understands (s3://, gs://, ...)."""
+"""Read and write files atomically, on a local disk or on any file system of pyarrow (s3://, gs://, ...)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.fs as pafs
@@ -16,7 +16,7 @@ TEMPORARY = ".tmp-"
 
 
 def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
-    """File system and path of a URI or a local path (made absolute)."""
+    """Return the file system and the path of a URI or of a local path, which becomes absolute."""
     uri = os.fspath(uri)
     if "://" in uri:
         return pafs.FileSystem.from_uri(uri)
@@ -33,14 +33,14 @@ def exists(uri: str) -> bool:
 
 
 def fingerprint_file(uri: str) -> list[str | int]:
-    """Path, size in bytes and time of change of a file: another one after it was written again."""
+    """Return path, size in bytes and modification time of a file; they change when the file is rewritten."""
     fs, path = resolve_uri(uri)
     info = fs.get_file_info(path)
     return [path, info.size, str(info.mtime)]
 
 
 def list_files(uri: str, suffix: str) -> list[str]:
-    """Sorted URIs of the files under a directory, hidden and temporary ones left out; empty if it is missing."""
+    """Return the sorted URIs of the files under a directory, without hidden and temporary ones; [] if it is missing."""
     fs, path = resolve_uri(uri)
     found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
     inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
@@ -53,11 +53,14 @@ def list_files(uri: str, suffix: str) -> list[str]:
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
     """Create or replace a file by `write(stream)`: readers see the old file or the new one, never a part.
 
-    What killed writers of the same file left is deleted. Raises OSError naming the file and what to do.
+    Deletes the temporary files that killed writers of the same file left.
+
+    Raises:
+        OSError: The file cannot be written; the message names the file and the remedy.
     """
     fs, path = resolve_uri(uri)
     parent, name = path.rsplit("/", 1)
-    # Does not end as the file does: what globs for *.parquet takes hidden files too (DuckDB).
+    # The temporary name has another suffix, because DuckDB's *.parquet patterns match hidden files too.
     temporary = f"{parent}/{TEMPORARY}{name}-{os.getpid()}"
     try:
         fs.create_dir(parent, recursive=True)
@@ -78,12 +81,11 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
-    write_whole(
-        uri,
-        lambda stream: pq.write_table(
-            table, stream, compression="zstd", use_dictionary=_list_dictionary_columns(table)
-        ),
-    )
+    """Write a table as a Parquet file, zstd-compressed, with dictionaries for its string columns."""
+    dictionaries = cast(
+        Any, _list_dictionary_columns(table)
+    )  # pyarrow annotates a bool; its documentation allows names
+    write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=dictionaries))
 
 
 def _list_dictionary_columns(table: pa.Table) -> list[str]:
@@ -91,10 +93,20 @@ def _list_dictionary_columns(table: pa.Table) -> list[str]:
 
 
 def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None) -> pa.Table:
-    """A whole Parquet file. Raises ValueError naming the file if it is missing, truncated or of another schema."""
+    """Read a Parquet file.
+
+    Args:
+        uri: The file.
+        columns: Names of the columns to read (default: all).
+        schema: Types that the columns must have (default: any).
+
+    Raises:
+        ValueError: The file is missing, truncated or has another schema; the message names it.
+    """
     fs, path = resolve_uri(uri)
+    no_partitioning = cast(Any, None)  # pyarrow annotates a string; its documentation allows None
     try:
-        table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=None)
+        table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=no_partitioning)
     except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
         raise ValueError(
             f"{uri}: cannot be read as Parquet ({error}); delete it and run the job that wrote it again"
@@ -104,13 +116,14 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
         for name in wanted:
             if name not in table.column_names or table.schema.field(name).type != schema.field(name).type:
                 raise ValueError(
-                    f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another version"
+                    f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another"
+                    " version"
                 )
     return table
 
 
 def read_bytes(uri: str) -> bytes:
-    """A whole file. Raises ValueError naming it if it cannot be read."""
+    """Read a whole file. Raises ValueError naming it if it cannot be read."""
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path, compression=None) as stream:
@@ -120,7 +133,7 @@ def read_bytes(uri: str) -> bytes:
 
 
 def measure_file_bytes(uri: str) -> int:
-    """Size of a file."""
+    """Return the size of a file in bytes."""
     fs, path = resolve_uri(uri)
     return fs.get_file_info(path).size
 
@@ -134,7 +147,7 @@ def write_json(value: Any, uri: str) -> None:
 
 
 def read_json(uri: str) -> Any:
-    """Raises ValueError naming the file if it is missing or not JSON."""
+    """Read a JSON file. Raises ValueError naming the file if it is missing or not JSON."""
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path) as stream:
@@ -144,16 +157,16 @@ def read_json(uri: str) -> Any:
 
 
 def clean_temporaries(uri: str) -> int:
-    """Delete what killed writers left behind; how many there were."""
+    """Delete the temporary files that killed writers left; return their number."""
     fs, path = resolve_uri(uri)
     return _delete_files(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
 
 
 def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) -> int:
-    """Delete the files whose names begin with `prefix`; how many there were."""
+    """Delete the files whose names begin with `prefix`; return their number."""
     stale = [info.path for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
     for name in stale:
-        with suppress(FileNotFoundError):  # its writer was alive after all, and is done
+        with suppress(FileNotFoundError):  # its writer is alive and has just renamed it
             fs.delete_file(name)
     return len(stale)
 

@@ -1,4 +1,4 @@
-"""Where the axes of another method's files point, in words: "x+" is forward, "y+" left, "z+" up, "x-" back, and so on."""
+"""Name the directions of the axes of another method's files: "x+" is forward, "x-" back, "y+" left, "z+" up."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A dataset directory as a whole: statistics of its training split, the labels they give, dataset.json.
+"""A dataset directory: statistics of its training split, density labels and dataset.json.
 
-dataset.json is written last: where it is, everything else is.
+dataset.json is written last, so a directory that holds it is complete.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pipelines.schema.tables import SCENES, Shard
 
 DESCRIPTION = "dataset.json"
 Extremes = dict[str, list[list[float]]]  # name -> [lowest, highest], a number per entry
-# What ground heights are: tops of slabs, 0.3 m above what objects stand on, or that surface itself.
+# Meaning of ground heights: "top" of slabs, 0.3 m above the surface that objects stand on, or that "surface" itself.
 SURFACE = {"town": "top", "kitti360": "top", "av2": "surface", "own": "surface"}
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the training split says: label thresholds and the LayoutSpec."""
+    """Statistics of the training split: label thresholds and the LayoutSpec."""
 
     vegetation: DensityThresholds
     vehicle: DensityThresholds
@@ -33,16 +33,23 @@ class Statistics:
 
 
 def count_groups(scenes: pa.Table, group: tuple[int, ...]) -> np.ndarray:
-    """(n,) primitives of a group of categories per row of `scenes`."""
-    return sum(scenes[f"num_{CATEGORIES[k]}"].to_numpy() for k in group)
+    """(n,) number of primitives of a group of categories in each row of `scenes`."""
+    return np.asarray(sum(scenes[f"num_{CATEGORIES[k]}"].to_numpy() for k in group))
 
 
 def compute_training_statistics(
     manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | None
 ) -> Statistics:
-    """Thresholds, p95 counts and bounds of the training split. ValueError if it is empty.
+    """Compute thresholds, 95th percentiles of counts and bounds of the training split.
 
-    `slots` fixes the counts (the paper's N = 514) instead of the 95th percentile.
+    Args:
+        manifests: Manifests of all shards.
+        staging: Directory with the shards' tables.
+        grid: Grid of the rasters.
+        slots: Fixed number of slots per category (the paper's sum to N = 514); None for the 95th percentiles.
+
+    Raises:
+        ValueError: The training split is empty.
     """
     training = [m for m in manifests if m["split"] == "train" and m["scenes"]]
     if not training:
@@ -74,15 +81,19 @@ def compute_training_statistics(
         height_bounds_m=bounds("height", 1),
         surface=SURFACE[training[0]["source"]],
     )
-    thresholds = [
-        compute_density_thresholds(count_groups(scenes, group), scenes[volume].to_numpy())
-        for group, volume in ((VEGETATION, "vegetation_volume_m3"), (VEHICLES, "vehicle_volume_m3"))
-    ]
-    return Statistics(*thresholds, spec)
+
+    def thresholds(group: tuple[int, ...], volume: str) -> DensityThresholds:
+        return compute_density_thresholds(count_groups(scenes, group), scenes[volume].to_numpy())
+
+    return Statistics(
+        vegetation=thresholds(VEGETATION, "vegetation_volume_m3"),
+        vehicle=thresholds(VEHICLES, "vehicle_volume_m3"),
+        spec=spec,
+    )
 
 
 def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
-    """The scenes table with both density labels."""
+    """Return the scenes table with both density labels."""
     groups = (("vegetation", VEGETATION, statistics.vegetation), ("vehicle", VEHICLES, statistics.vehicle))
     for name, group, thresholds in groups:
         labels = classify_density(count_groups(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
@@ -95,7 +106,7 @@ def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset directory that is complete: its dataset.json, read and checked."""
+    """A complete dataset directory: its dataset.json, read and checked."""
 
     root: str
     source: str
@@ -125,7 +136,7 @@ class Dataset:
 
 
 def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
-    """The extremes of everything together."""
+    """Return the lowest and highest values over all parts."""
     parts = list(parts)
     return {
         name: [

@@ -38,8 +38,9 @@ EMPTY_HEX = "ffffff"
 
 
 def parse_rgb(color_hex: str) -> tuple[int, int, int]:
-    """(red, green, blue), 0..255, sRGB, of six hexadecimal digits."""
-    return tuple(bytes.fromhex(color_hex))
+    """Parse six hexadecimal digits to (red, green, blue), 0..255, sRGB."""
+    red, green, blue = bytes.fromhex(color_hex)
+    return red, green, blue
 
 
 def _list_colors_by_class_id() -> np.ndarray:
@@ -50,7 +51,7 @@ def _list_colors_by_class_id() -> np.ndarray:
     return colors
 
 
-CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white where there is nothing
+CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white for EMPTY
 CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) by category
 
 assert set(GROUND_CLASS_ID) == set(GROUND_CLASSES) and set(COLOR_HEX) == set(CLASS_ID)

@@ -16,13 +16,13 @@ def guard_options(
     discard: Callable[[], None],
     describe: Callable[[str], str],
 ) -> None:
-    """Record options; if the record holds other options, discard what was made with them unless it is in use.
+    """Record options; if the record holds other options, discard their results unless these are in use.
 
     Args:
         record: JSON file with the options.
         options: Options of this run, as JSON can hold them.
-        is_in_use: Whether anything was made with the recorded options that must be kept.
-        discard: Deletes what a run with other options left.
+        is_in_use: Whether a run with the recorded options has written results, which must be kept.
+        discard: Deletes the rest of a run with other options.
         describe: Makes the error message from the first option that differs ("seed=1, asked for 2").
 
     Raises:
@@ -74,5 +74,6 @@ def compare_options(recorded: Mapping[str, object], options: Mapping[str, object
     if recorded == asked:
         return ""
     name = next(key for key in sorted(recorded | asked) if recorded.get(key) != asked.get(key))
-    values = [json.dumps(side.get(name)) for side in (recorded, asked)]
+    values = [side.get(name) for side in (recorded, asked)]
+    values = [value if isinstance(value, str) else json.dumps(value) for value in values]
     return "{}={}, asked for {}".format(name, *values) if max(map(len, values)) < 80 else f"other {name}"

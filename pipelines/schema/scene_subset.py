@@ -1,4 +1,4 @@
-"""Which scenes of a dataset directory to take: evenly, by the distance of their poses, or equally many of each label."""
+"""Select scenes of a dataset directory: evenly spaced, by distance between poses, or balanced over labels."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ ONE_WORLD = ("kitti360",)  # sources whose drives share one world frame
 class SceneSubset:
     """Scenes of a source and a split, at most `limit` of them, chosen by `pick`.
 
-    * spread: evenly over all; first: the first ones.
-    * farthest: each pose as far as can be from those chosen before it (paper, supplement, Precision and Recall Metrics).
-    * apart: every pose that is at least apart_m away from those taken before it, evenly thinned to `limit` (ditto).
-    * balanced: equally many of each pair of density labels, as far as they go, evenly over each.
+    * spread: evenly spaced over all scenes.
+    * first: the first scenes.
+    * farthest: farthest point sampling of the poses (paper, supplement, Precision and Recall Metrics).
+    * apart: poses at least apart_m from all earlier ones, evenly thinned to `limit` (same section of the paper).
+    * balanced: equally many scenes of each pair of density labels where available, evenly spaced within each pair.
     """
 
     root: str
@@ -43,11 +44,11 @@ class SceneSubset:
             raise ValueError(f"apart_m is {self.apart_m}, expected a distance above 0")
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Shards with the rows to take, in order; decided at the first call. Raises ValueError where there is none."""
+        """Return shards with the rows to take, in order; the first call decides. Raises ValueError if there is none."""
         return self._shards
 
     def files(self) -> list[list]:
-        """The chosen files as they are now, with the rows to take: other ones once scenes have come, gone or changed."""
+        """Return fingerprints of the chosen files with the rows to take; they differ once scenes or files change."""
         return [[*storage.fingerprint_file(shard.path("scenes")), rows] for shard, rows in self._shards]
 
     @cached_property
@@ -64,7 +65,7 @@ class SceneSubset:
         return [(shard, r.tolist()) for shard, r in zip(shards, rows, strict=True) if len(r)]
 
     def chosen(self, scenes: pa.Table, source: np.ndarray) -> np.ndarray:
-        """Rows to take of a table of all scenes, in the order of being chosen; source (n,) of each."""
+        """Return the rows to take of a table of all scenes, in order of selection; `source` is (n,)."""
         total = len(scenes)
         wanted = min(total, self.limit or total)
         if self.pick == "first":
@@ -80,13 +81,13 @@ class SceneSubset:
 
 
 def read_described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
-    """COLUMNS of the scenes of some shards' rows, in that order, and the source (n,) of each."""
+    """Return COLUMNS of the scenes in some shards' rows, in that order, and their sources (n,)."""
     table = pa.concat_tables([shard.read("scenes", COLUMNS).take(rows) for shard, rows in parts])
     return table, np.repeat([shard.source for shard, _ in parts], [len(rows) for _, rows in parts])
 
 
 def list_label_pairs(scenes: pa.Table) -> np.ndarray:
-    """(n,) both density labels of each scene as one word."""
+    """(n,) str: both density labels of each scene."""
     return np.array([str(pair) for pair in zip(*(scenes[name].to_pylist() for name in COLUMNS[-2:]), strict=True)])
 
 
@@ -103,7 +104,7 @@ def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices by farthest point sampling of poses (n, 2), the first pose first; every prefix is a sample too."""
+    """(count,) indices by farthest point sampling of poses (n, 2). The first is 0; every prefix is a sample as well."""
     nearest_m = np.full(len(xy_m), np.inf)
     chosen = np.zeros(count, int)
     for place in range(1, count + 1):
@@ -117,9 +118,9 @@ def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarr
 
 
 def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
-    """Indices of the poses (n, 2), in order, that lie at least apart_m from every one taken before.
+    """Return indices of poses (n, 2), in order, that lie at least apart_m from every pose selected before.
 
-    A pose is compared with those in its own and the eight neighbouring cells of a grid of that width.
+    A pose is compared with the poses in its cell and the eight neighbouring cells of a grid of that width.
     """
     cells: dict[tuple[int, int, int], list[np.ndarray]] = {}
     taken = []
@@ -133,7 +134,7 @@ def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndar
 
 
 def select_balanced(labels: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices, equally many of each label; what a rare one lacks is shared among the others."""
+    """(count,) indices, equally many of each label; other labels share the places that a rare label cannot fill."""
     groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     shares = np.zeros(len(groups), int)
     while (left := count - shares.sum()) > 0:

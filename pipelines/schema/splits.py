@@ -1,11 +1,11 @@
-"""Which poses train and which test (paper, supplement A, Dataset Construction). numpy and scipy only."""
+"""Split poses into training, test and unused ones (paper, supplement A, Dataset Construction)."""
 
 from __future__ import annotations
 
 import logging
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 TRAIN, TEST, UNUSED = "train", "test", "unused"
 
@@ -14,30 +14,37 @@ MAX_SEGMENTS = 100
 TEST_M = 15.0
 MARGIN_M = 5.0
 REMOVAL_M = 5.0
-# The paper leaves open: drives shorter than its 73.7 km. A segment needs its 25 m of test and margins, and as
-# much again to train on.
+# The paper does not define splits of drives shorter than its 73.7 km. A segment needs 25 m for test poses and margins,
+# and another 25 m for training poses.
 MIN_SEGMENT_M = 50.0
 
-# Argoverse 2 comes split by log; its own test logs have no annotations.
+# Argoverse 2 is split by log; its test logs have no annotations.
 ARGOVERSE2_SPLIT = {"train": TRAIN, "val": TEST}
 
 logger = logging.getLogger(__name__)
 
 
 def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Per sequence (p,) str, one of train, test, unused, for its positions (p, 3): metres, one world for all.
+    """Label every pose of every sequence.
 
-    Give every pose of every sequence, in driving order, before any is dropped: the distance driven is cut
-    into equal segments, sequence after sequence; the jump from one to the next counts nothing. Of each
-    segment
+    The distance driven is cut into equal segments, sequence after sequence; the jump between two sequences has no
+    length. A segment has the parts
 
         train ... | 5 m unused | 15 m test | 5 m unused
 
-    and then every train pose within 5 m (BEV) of a test pose, and every test pose within 5 m of a train pose,
-    becomes unused. The paper leaves open which goes first: both sides are judged on the labels before any
-    removal, so both partners of a close pair go.
+    Then every train pose within 5 m (BEV) of a test pose becomes unused, and every test pose within 5 m of a train
+    pose. The paper does not define the order of the two removals. Here both use the labels before any removal, so
+    both poses of a close pair become unused.
 
-    Raises ValueError for positions that are not (p, 3) and finite.
+    Args:
+        positions_by_sequence: (p, 3) positions of each sequence in metres, in driving order, in one world frame. Give
+            all poses; poses that are dropped first would shorten the distance driven.
+
+    Returns:
+        (p,) str per sequence: train, test or unused.
+
+    Raises:
+        ValueError: Positions are not (p, 3) or not finite.
     """
     for sequence, position_m in positions_by_sequence.items():
         if np.ndim(position_m) != 2 or np.shape(position_m)[1] != 3:
@@ -56,12 +63,12 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
 
 
 def make_no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Every pose trains."""
+    """Label every pose "train"."""
     return {sequence: np.full(len(p), TRAIN, object) for sequence, p in positions_by_sequence.items()}
 
 
 def count_segments(total_m: float) -> int:
-    """min(100, floor(distance / 50 m)), at least 1; says so when it is fewer than the paper's 100."""
+    """Return min(100, floor(distance / 50 m)), at least 1; log a warning if it is below the paper's 100."""
     count = max(1, min(MAX_SEGMENTS, int(total_m // MIN_SEGMENT_M)))
     if count < MAX_SEGMENTS:
         logger.warning(
@@ -76,7 +83,7 @@ def count_segments(total_m: float) -> int:
 
 
 def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Distance driven at each pose of all sequences together (sum of p,), and in total; metres."""
+    """(sum of p,) distance driven at each pose of all sequences, and the total distance; metres."""
     steps = [
         np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])
         for p in positions_m
@@ -98,7 +105,7 @@ def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> n
 
 
 def _remove_close(labels: np.ndarray, bev_m: np.ndarray) -> np.ndarray:
-    """The labels (p,) after removal: train and test poses within 5 m (BEV) of one another are unused."""
+    """(p,) labels in which train and test poses within 5 m (BEV) of each other are unused."""
     train, test = np.flatnonzero(labels == TRAIN), np.flatnonzero(labels == TEST)
     if len(train) == 0 or len(test) == 0:
         return labels

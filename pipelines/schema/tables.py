@@ -1,9 +1,9 @@
 """Scenes <-> Parquet tables: the project's one schema, for real and generated scenes alike.
 
-Under a dataset directory lie `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
+A dataset directory holds `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
 hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
-same order, so a reader never joins. Units are in the names, and every file says itself what its columns mean:
-docs/tables.md, for people who never read this.
+same order, so a reader never joins. Units are in the names, and the metadata of every file describes its columns.
+docs/tables.md documents the tables for users.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from pipelines.runtime import storage
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # what 16 bits hold
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # the largest height that 16 bits hold
 
-# What the categories and ground classes hold, for people who look at columns and not at code.
+# Meanings of the categories and ground classes, for the descriptions of columns.
 # fmt: off
 CATEGORY_MEANING = {
     "vegetation_cuboid":    "trees, bushes and hedges annotated as boxes",
@@ -52,10 +52,10 @@ GROUND_MEANING = {
 
 
 def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
-    """A schema that explains itself, from rows of (name, type, unit, description); unit "" where none applies.
+    """Make a self-describing schema from rows of (name, type, unit, description); unit "" where none applies.
 
-    Every field carries `unit` and `description`. DuckDB does not show those, so the same rows stand once more, as
-    JSON, among the table's own key-values, under `pritti_columns`.
+    Every field has the metadata `unit` and `description`. DuckDB does not show field metadata, so the table's metadata
+    repeats the rows as JSON under `pritti_columns`.
     """
     fields, rows = [], []
     for name, kind, unit, meaning in columns:
@@ -70,62 +70,98 @@ def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) 
 
 
 # fmt: off
-_FRAME = "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles counter-clockwise from x, seen from above."
+_FRAME = (
+    "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles "
+    "counter-clockwise from x, seen from above."
+)
 _SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
-_SEQUENCE = ("sequence", pa.string(), "", "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: the seed.")
+_SEQUENCE = ("sequence", pa.string(), "",
+             "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: "
+             "the seed.")
 
 SCENES = _make_schema(
-    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and totals. " + _FRAME,
+    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and "
+    "totals. " + _FRAME,
     _SCENE_ID,
     _SEQUENCE,
-    ("frame",                pa.int64(),   "1; av2: ns", "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
-    ("x_m",                  pa.float64(), "m",   "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
-    ("y_m",                  pa.float64(), "m",   "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
-    ("z_m",                  pa.float64(), "m",   "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
-    ("yaw_rad",              pa.float64(), "rad", "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
+    ("frame",                pa.int64(),   "1; av2: ns",
+     "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
+    ("x_m",                  pa.float64(), "m",
+     "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
+    ("y_m",                  pa.float64(), "m",
+     "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
+    ("z_m",                  pa.float64(), "m",
+     "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
+    ("yaw_rad",              pa.float64(), "rad",
+     "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
     # A variable list: Parquet has no null of a fixed size.
-    ("world_from_imu",       pa.list_(pa.float64()), "1; m", "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
-    ("vegetation_density",   pa.string(),  "",    "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing was."),
-    ("vehicle_density",      pa.string(),  "",    "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
-    ("vegetation_volume_m3", pa.float64(), "m3",  "Sum of the volumes of all vegetation primitives; overlaps count twice."),
+    ("world_from_imu",       pa.list_(pa.float64()), "1; m",
+     "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
+    ("vegetation_density",   pa.string(),  "",
+     "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing "
+     "was."),
+    ("vehicle_density",      pa.string(),  "",
+     "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
+    ("vegetation_volume_m3", pa.float64(), "m3",
+     "Sum of the volumes of all vegetation primitives; overlaps count twice."),
     ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all vehicles, big and small."),
     ("num_primitives",       pa.int32(),   "1",   "Number of primitives of all categories."),
-    *[(f"num_{name}",        pa.int32(),   "1",   f"Number of {name} primitives: {CATEGORY_MEANING[name]}.") for name in CATEGORIES],
-    *[(f"{name}_area_m2",    pa.float64(), "m2",  f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.") for name in GROUND_CLASSES],
-    ("primitive_offset",     pa.int64(),   "1",   "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
+    *[(f"num_{name}",        pa.int32(),   "1",
+       f"Number of {name} primitives: {CATEGORY_MEANING[name]}.")
+      for name in CATEGORIES],
+    *[(f"{name}_area_m2",    pa.float64(), "m2",
+       f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.")
+      for name in GROUND_CLASSES],
+    ("primitive_offset",     pa.int64(),   "1",
+     "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
 )
 
 PRIMITIVES = _make_schema(
-    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen from several poses has a row in each. " + _FRAME,
+    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen "
+    "from several poses has a row in each. " + _FRAME,
     _SCENE_ID,
     ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
-    ("label",       pa.string(),  "",    "Class name as the source dataset spells it; generated primitives: the category."),
+    ("label",       pa.string(),  "",
+     "Class name as the source dataset spells it; generated primitives: the category."),
     ("kind",        pa.string(),  "",    "Shape that fills the box: cuboid or ellipsoid."),
-    ("instance_id", pa.int64(),   "",    "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects apart."),
+    ("instance_id", pa.int64(),   "",
+     "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects "
+     "apart."),
     ("x_m",         pa.float32(), "m",   "x of the centre in the scene frame: distance ahead of the ego vehicle."),
-    ("y_m",         pa.float32(), "m",   "y of the centre in the scene frame: distance to the left of the ego vehicle."),
-    ("z_m",         pa.float32(), "m",   "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
+    ("y_m",         pa.float32(), "m",
+     "y of the centre in the scene frame: distance to the left of the ego vehicle."),
+    ("z_m",         pa.float32(), "m",
+     "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
     ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes that are not the height axis."),
     ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
     ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
     ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
-    ("heading_rad", pa.float32(), "rad", "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
-    ("rotation",    pa.list_(pa.float32(), 9), "1", "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
-    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5", "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
-    ("existence",   pa.float32(), "1",   "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
+    ("heading_rad", pa.float32(), "rad",
+     "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
+    ("rotation",    pa.list_(pa.float32(), 9), "1",
+     "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
+    ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5",
+     "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
+    ("existence",   pa.float32(), "1",
+     "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
 )
 
 RASTERS = _make_schema(
-    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from above. " + _FRAME,
+    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from "
+    "above. " + _FRAME,
     _SCENE_ID,
-    ("height",         pa.binary(),  "height_step_m", "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
-    ("occupied",       pa.binary(),  "",    "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
+    ("height",         pa.binary(),  "height_step_m",
+     "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
+    ("occupied",       pa.binary(),  "",
+     "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
     ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
     ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
     ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is farthest ahead."),
     ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is leftmost."),
-    ("front_m",        pa.float64(), "m",   "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
-    ("left_m",         pa.float64(), "m",   "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
+    ("front_m",        pa.float64(), "m",
+     "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
+    ("left_m",         pa.float64(), "m",
+     "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
     ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
 )
 
@@ -139,7 +175,8 @@ REJECTS = _make_schema(
 
 
 EDITS = _make_schema(
-    "One row per primitive that a step of the list of edits touched, in the scene that was given under the same scene_id.",
+    "One row per primitive that a step of the list of edits touched, in the scene that was given under the "
+    "same scene_id.",
     _SCENE_ID,
     ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
     ("edit",       pa.string(),  "",    "remove, duplicate, translate, rotate, scale, relabel, snap or repair."),
@@ -155,7 +192,8 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
     """(C, h, w) posterior moments per scene; float16, channels first."""
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
     return _make_schema(
-        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the rasters.",
+        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the "
+        "rasters.",
         _SCENE_ID,
         ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
         ("logvar", tensor, "1", "Natural logarithm of its variance: float16 (channel, row, col) in C order."),
@@ -167,7 +205,7 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
 
 
 def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
-    """(height, occupied) as bytes: only occupied pixels carry a height, each as the difference to the one before."""
+    """Return (height, occupied) as bytes; only occupied pixels have a height, as the difference to the one before."""
     steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
     if len(steps) and np.abs(steps).max() > 32767:
         raise ValueError(f"scene {scene.scene_id}: ground heights beyond ±327 m, worst {scene.height_m.max()}")
@@ -225,7 +263,7 @@ def _make_fixed_lists(values: np.ndarray, width: int) -> pa.Array:
 
 
 def make_primitives_table(scenes: Sequence[Scene]) -> pa.Table:
-    """The rows of `primitives` for some scenes, one or more."""
+    """Return the rows of `primitives` for one or more scenes."""
 
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
@@ -269,7 +307,7 @@ def _make_rasters_table(scenes: Sequence[Scene]) -> pa.Table:
 
 
 def make_scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
-    """One aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
+    """Return one aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
     return {
         "scenes": _make_scenes_table(scenes),
         "primitives": make_primitives_table(scenes),
@@ -288,7 +326,19 @@ def parse_scenes(
     split: str,
     rows: Sequence[int] | None = None,
 ) -> Iterator[Scene]:
-    """The Scenes of one shard, or only those in `rows`, in that order; one at a time."""
+    """Yield the Scenes of one shard, or only those in `rows` in that order.
+
+    Args:
+        scenes: The shard's rows of `scenes`.
+        primitives: Its rows of `primitives`.
+        rasters: Its rows of `rasters`.
+        source: Value of the source column.
+        split: Value of the split column.
+        rows: Numbers of the scenes (default: all).
+
+    Raises:
+        ValueError: The tables do not hold the same scenes in the same order, or a category is unknown.
+    """
     fields = _read_primitive_fields(primitives)
     rows = list(range(len(scenes)) if rows is None else rows)
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
@@ -321,8 +371,8 @@ def parse_scenes(
 
 
 def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
-    """(n,) int8 index into CATEGORIES. Raises ValueError for a name that is none."""
-    category = pc.index_in(names, pa.array(CATEGORIES))
+    """(n,) int8 index into CATEGORIES. Raises ValueError for an unknown name."""
+    category = pc.index_in(names, pa.array(CATEGORIES))  # pyright: ignore[reportAttributeAccessIssue]
     if category.null_count:
         raise ValueError("primitives hold a category of another version; preprocess again")
     return category.to_numpy().astype(np.int8)
@@ -377,10 +427,10 @@ class Shard:
         return storage.read_parquet(self.path(table), columns, schema)
 
     def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
-        """Its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
-        tables = [self.read(table) for table in ("scenes", "primitives", "rasters")]
+        """Return its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
+        scenes, primitives, rasters = (self.read(table) for table in ("scenes", "primitives", "rasters"))
         try:
-            return list(parse_scenes(*tables, self.source, self.split, rows))
+            return list(parse_scenes(scenes, primitives, rasters, self.source, self.split, rows))
         except ValueError as error:
             raise ValueError(f"{self.path('scenes')}: {error}") from error
 
@@ -393,7 +443,7 @@ class Shard:
 
 
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
-    """The shards of a table, in order. Raises ValueError if there is none: nothing passes on empty input."""
+    """Return the shards of a table, in order. Raises ValueError if there is none: no job accepts empty input."""
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
         *_, source_part, split_part, name = path.split("/")
@@ -417,7 +467,7 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
 def read_scenes(
     root: str, source: str | None = None, split: str | None = None, limit: int | None = None
 ) -> Iterator[Scene]:
-    """Scenes of a dataset directory, shard by shard."""
+    """Yield scenes of a dataset directory, shard by shard; at most `limit`."""
     left = limit
     for shard in find_shards(root, "scenes", source, split):
         for scene in shard.scenes():

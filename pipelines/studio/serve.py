@@ -8,7 +8,7 @@ from ray.serve import Application
 
 from pipelines.studio.session import Studio, build_studio_app
 
-REQUESTS = 32  # at once; more wait, and beyond as many again are told to come back
+REQUESTS = 32  # concurrent requests; as many more wait, and the others are refused with a request to try again
 
 
 def make_deployment(

@@ -1,7 +1,7 @@
-"""The studio: one scene per visitor, made, edited, inpainted and extended; every step can be undone.
+"""The studio: each visitor generates, edits, inpaints and extends one scene, and can undo every step.
 
-`Desk` is a visitor's scene and its history, without any web; `studio_app` is the HTTP interface around it. Long work runs
-in a thread, one at a time over all visitors, says how far it is and can be cancelled.
+`Session` holds a visitor's scene and its history, independent of HTTP; `build_studio_app` is the HTTP interface. Long
+operations run in a thread, one at a time over all visitors, report their progress and can be cancelled.
 """
 
 from __future__ import annotations
@@ -311,9 +311,13 @@ def draw_thumbnail(catalogue: Catalogue, index: int) -> str:
 
 
 def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, ...] = LOOPBACK) -> FastAPI:
-    """The HTTP interface. `studio()` gives the one Studio; with a token, every request must bear it, once as ?token=.
+    """Build the HTTP interface.
 
-    `hosts` are the names under which it may be asked: a page elsewhere cannot reach it by a name of its own.
+    Args:
+        studio: Returns the one Studio.
+        token: Token that every request must send, the first one as ?token=; "" for none.
+        hosts: Host names that requests may use. Others are refused, so that a foreign page cannot reach the studio
+            through its own host name.
     """
     app = FastAPI(title="PrITTI studio", docs_url=None, redoc_url=None, openapi_url=None)
 

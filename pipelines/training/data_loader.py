@@ -1,11 +1,11 @@
-"""Tables -> training batches, read ahead by Ray tasks, in an order that depends on the seed alone.
+"""Load training batches from tables; Ray tasks read ahead, in an order that depends on the seed alone.
 
 The stream of samples is fixed before anything is read: epoch after epoch, shards in random order, rows shuffled
-within a window of a few shards. Every worker knows from its rank and the step which rows it needs, so that a resumed
-run goes on with the very next batch and two workers see what one would have seen.
+within a window of a few shards. Every worker computes from its rank and the step which rows it needs. A resumed run
+therefore continues with the next batch, and two workers see the samples that one worker would see.
 
-Not by Ray Data: its executor lives in the training process and, while finished blocks wait to be consumed, polls
-without a pause. With Python's lock in its hands that made steps on two cores four times as long (BENCHMARKS.md).
+The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, it polls
+without a pause and holds Python's lock, which makes steps on two cores four times as long (BENCHMARKS.md).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
@@ -29,8 +30,8 @@ from pipelines.schema.tables import Shard, find_category_indices, list_ground_st
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
-AHEAD = 2  # tasks under way or done while the samples of another are consumed
-READER_CPUS = 0.5  # leaves room beside a training worker on two cores: more would wait for each other for ever
+AHEAD = 2  # tasks running or done while the samples of another are consumed
+READER_CPUS = 0.5  # leaves room next to a training worker on two cores; with more, both would wait for each other
 
 Arrays = dict[str, np.ndarray]
 Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # shard, rows, their places in the stream -> stacked samples
@@ -78,7 +79,7 @@ def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.nd
 
 
 def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
-    """The rank's share of `count` consecutive global batches from batch `first`, in order."""
+    """Read the rank's share of `count` consecutive global batches from batch `first`, in order."""
     shard, row = stream.positions(first * batch, count * batch)
     mine = (np.arange(count * batch) % batch) // (batch // world) == rank
     shard, row, place = shard[mine], row[mine], first * batch + np.flatnonzero(mine)
@@ -95,9 +96,21 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 def iterate_batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
-    """Local batches of steps start_step .. stop_step - 1 for one worker; Ray tasks read AHEAD of them.
+    """Yield the local batches of steps start_step .. stop_step - 1 of one worker; Ray tasks read AHEAD of them.
 
-    Arrays are read-only. Raises ValueError if the global batch does not divide by the number of workers.
+    Args:
+        stream: Order of the samples.
+        read: Reads samples of a shard.
+        start_step: First step.
+        stop_step: Step after the last one.
+        rank: Number of the worker.
+        world: Number of workers.
+
+    Yields:
+        Read-only arrays by name, (batch size / world, ...) each.
+
+    Raises:
+        ValueError: The number of workers does not divide the global batch size.
     """
     batch = stream.batch_size
     if batch % world:
@@ -111,22 +124,25 @@ def iterate_batches(
             reading.append(reader.remote(*shared, first, min(per_task, stop_step - first), batch, rank, world))
         if not reading:
             return
-        samples = ray.get(reading.popleft())
+        samples = cast(Arrays, ray.get(reading.popleft()))
         for start in range(0, len(next(iter(samples.values()))), local):
             yield {name: values[start : start + local] for name, values in samples.items()}
 
 
 @dataclass(frozen=True)
 class LayoutReader:
-    """Samples for stage 1: compact layouts (models/tensors.py) under a LayoutSpec, of augmented scenes if wanted."""
+    """Reads samples for stage 1: encoded layouts (models/tensors.py) under a LayoutSpec, optionally augmented."""
 
     spec: LayoutSpec
     augment: Augmentation | None = None
 
     def __call__(self, shard: Shard, rows: np.ndarray, places: np.ndarray | None = None) -> Arrays:
-        if self.augment:
+        augment = self.augment
+        if augment:
+            if places is None:
+                raise ValueError("augmented samples need their places in the stream")
             scenes = parse_scenes(*_read_scene_tables(shard), shard.source, shard.split, rows.tolist())
-            layouts = (encode_layout(self.augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
+            layouts = (encode_layout(augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
         else:
             stored = _read_stored_layouts(shard)
             layouts = (stored.layout(int(row), self.spec) for row in rows)
@@ -146,7 +162,7 @@ def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLayouts:
-    """What layouts need of a shard, without making Scenes: half of the time."""
+    """The columns of a shard that layouts need; encoding them without Scenes takes half the time."""
 
     first: np.ndarray  # (scenes,) row of a scene's first primitive
     count: np.ndarray  # (scenes,)
@@ -156,13 +172,13 @@ class StoredLayouts:
     rasters: pa.Table
 
     def layout(self, row: int, spec: LayoutSpec) -> Arrays:
-        """`compact_layout` of one scene."""
+        """`encode_layout` of one scene."""
         here = slice(self.first[row], self.first[row] + self.count[row])
         primitives = encode_primitives(self.category[here], self.center_m[here], self.cholesky[here], spec)
         return self.ground(row, spec) | primitives
 
     def ground(self, row: int, spec: LayoutSpec) -> Arrays:
-        """`compact_ground` of one scene: every height that can be stored is scaled once, for all scenes."""
+        """Encode the ground of one scene; a table of all stored heights is scaled once, for all scenes."""
         raster = {name: self.rasters[name][row].as_py() for name in self.rasters.column_names}
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
@@ -178,7 +194,7 @@ class StoredLayouts:
 
 @lru_cache(maxsize=4)
 def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
-    """(65536,) uint16: `compact_height` of every 16-bit number of height steps."""
+    """(65536,) uint16: `encode_height` of every 16-bit number of height steps."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
     return encode_height(steps * np.float32(step_m), spec)
 
@@ -205,7 +221,9 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
     table = Shard(latents_root, shard.source, shard.split, shard.number).read("latents")
     scenes = shard.read("scenes", ["scene_id", "vegetation_density", "vehicle_density"])
     if table["scene_id"].to_pylist() != scenes["scene_id"].to_pylist():
-        raise ValueError(f"{shard.path('latents')} is not aligned with {shard.path('scenes')}; encode the latents anew")
+        raise ValueError(
+            f"{shard.path('latents')} is not aligned with {shard.path('scenes')}; encode the latents again"
+        )
     moments = {name: table[name].combine_chunks().to_numpy_ndarray() for name in ("mean", "logvar")}
     return moments | {"label": label_indices(scenes, label)}
 
@@ -219,7 +237,7 @@ def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LatentReader:
-    """Samples for stage 2: posterior moments and labels."""
+    """Reads samples for stage 2: posterior moments and labels."""
 
     latents_root: str
     label: str

@@ -1,4 +1,4 @@
-"""Scenes -> latents: one Ray Data graph, a model per actor, one latents shard per scenes shard."""
+"""Encode scenes to latents: one Ray Data graph, a model per actor, one latents shard per scenes shard."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipelines.schema.tables import Shard, find_shards, make_latents_schema
 
 
 def digest_weights(model: torch.nn.Module) -> str:
-    """Twelve hex digits of a model's weights."""
+    """Return twelve hexadecimal digits of a hash of a model's weights."""
     digest = hashlib.sha256()
     for name, value in sorted(model.state_dict().items()):
         digest.update(name.encode())
@@ -27,7 +27,7 @@ def digest_weights(model: torch.nn.Module) -> str:
 
 
 def load_lvae(directory: str) -> LayoutVAE:
-    """Raises ValueError if the directory holds no LVAE."""
+    """Load a layout VAE. Raises ValueError if the directory holds none."""
     if not storage.exists(storage.join_uri(directory, "config.json")):
         raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
     try:
@@ -46,7 +46,7 @@ class Encoder:
 
     @torch.no_grad()
     def encode(self, shard: Shard) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Ids, means and log-variances of one shard, float16 (n, c, h, w)."""
+        """Return ids, means and log-variances of one shard; the latter are float16 (n, c, h, w)."""
         scenes, spec = shard.scenes(), self.model.spec
         parts = []
         for start in range(0, len(scenes), self.batch_size):
@@ -87,8 +87,21 @@ def encode_latents(
 ) -> dict:
     """Write `output`/latents/... and latents.json (LVAE, its digest, channel statistics of the training split).
 
-    Goes on where it stopped. Raises ValueError if the LVAE has another LayoutSpec than the dataset, or if the
-    directory holds latents of another LVAE.
+    Another call resumes an interrupted one.
+
+    Args:
+        dataset: Dataset to encode.
+        lvae: Directory of the layout VAE.
+        output: Directory for latents.
+        num_actors: Number of actors, each with a model.
+        batch_size: Scenes per forward pass.
+        on_shard: Receives the row of each finished shard.
+
+    Returns:
+        Content of latents.json.
+
+    Raises:
+        ValueError: The LVAE has another LayoutSpec than the dataset, or the directory holds latents of another LVAE.
     """
     model = load_lvae(lvae)
     dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
@@ -104,7 +117,9 @@ def encode_latents(
     storage.clean_temporaries(storage.join_uri(output, "latents"))
 
     shards = find_shards(dataset.root, source=dataset.source)
-    total, square, cells, counts = 0.0, 0.0, 0, {}
+    total: np.ndarray | float = 0.0
+    square: np.ndarray | float = 0.0
+    cells, counts = 0, {}
     for row in map_actors(range(len(shards)), Encoder, (lvae, output, shards, batch_size), num_actors):
         counts[row["split"]] = counts.get(row["split"], 0) + int(row["count"])
         if row["split"] == "train":
@@ -112,7 +127,7 @@ def encode_latents(
             cells += int(row["count"]) * int(row["cells"])
         if on_shard:
             on_shard(row)
-    mean = total / cells
+    mean = np.asarray(total / cells)
     content |= {
         "complete": True,
         "scenes": counts,

@@ -12,7 +12,8 @@ def test_gallery_page_filters_opens_and_picks(gallery_page, gallery_scenes, brow
     assert browser.execute_script("return document.getElementById('count').textContent") == "3 of 3 scenes"
     fewest = min(len(scene) for scene in gallery_scenes)
     browser.execute_script(
-        "const set = (id, value, event) => { const e = document.getElementById(id); e.value = value; e['on' + event](); };"
+        "const set = (id, value, event) => {"
+        " const e = document.getElementById(id); e.value = value; e['on' + event](); };"
         "set('number', 'num_primitives', 'change'); set('high', arguments[0], 'input');",
         str(fewest),
     )
@@ -29,7 +30,8 @@ def test_gallery_page_filters_opens_and_picks(gallery_page, gallery_scenes, brow
         "for (let y = 0.3; y < 0.9; y += 0.05) for (let x = 0.1; x < 0.9; x += 0.05) {"
         "  for (const kind of ['pointerdown', 'pointerup']) v.dispatchEvent(new PointerEvent(kind,"
         "    {pointerId: 1, button: 0, clientX: r.left + x * r.width, clientY: r.top + y * r.height}));"
-        "  const said = document.getElementById('picked').textContent; if (/^[0-9]+:/.test(said)) return said; } return '';"
+        "  const said = document.getElementById('picked').textContent;"
+        "  if (/^[0-9]+:/.test(said)) return said; } return '';"
     )
     number = int(picked.split(":")[0])
     assert scene.label[number] in picked

@@ -165,10 +165,10 @@ def slowed(function: Callable, seconds: float) -> Callable:
 def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatch, seed):
     (tasks, undisturbed), quota = (
         shards,
-        {"_drive_or_reason": 1, "Map(write)": 3, "training_statistics": 1, "Map(move)": 2},
+        {"_read_drive_or_reason": 1, "Map(write)": 3, "training_statistics": 1, "Map(move)": 2},
     )
     for name, seconds in (
-        ("_drive_or_reason", 0.6),
+        ("_read_drive_or_reason", 0.6),
         ("write_shard", 0.2),
         ("training_statistics", 0.6),
         ("label_scenes", 0.2),
@@ -661,14 +661,15 @@ def write_av2(root: Path) -> None:
         folder = root / "train" / log
         (folder / "map").mkdir(parents=True)
         n = 6 * len(SWEEPS)
-        yaw = rng.uniform(-3, 3, n)
+        yaw, spans = rng.uniform(-3, 3, n), ((1, 15), (-7, 7), (0, 1))
+        categories = ("REGULAR_VEHICLE", "BUS", "DOG", "SIGN", "PEDESTRIAN", "EGO_VEHICLE")
         boxes = {
             "timestamp_ns": np.repeat(SWEEPS, 6),
             "track_uuid": [f"{log}-{k % 6}" for k in range(n)],
-            "category": [("REGULAR_VEHICLE", "BUS", "DOG", "SIGN", "PEDESTRIAN", "EGO_VEHICLE")[k % 6] for k in range(n)],
+            "category": [categories[k % 6] for k in range(n)],
             **{name: rng.uniform(1, 4, n) for name in argoverse2.SIZE},
             **dict(zip(argoverse2.QUATERNION, [np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], strict=True)),
-            **{name: rng.uniform(*span, n) for name, span in zip(argoverse2.TRANSLATION, ((1, 15), (-7, 7), (0, 1)), strict=True)},
+            **{name: rng.uniform(*span, n) for name, span in zip(argoverse2.TRANSLATION, spans, strict=True)},
         }  # fmt: skip
         time = np.concatenate([SWEEPS, SWEEPS + 50_000_000])
         poses = {"timestamp_ns": time} | {name: np.zeros(len(time)) for name in argoverse2.QUATERNION}

@@ -17,7 +17,7 @@ def test_paint_job_paints_drive_and_resumes(controlnet_weights, tmp_path, cluste
         "streets": str(tmp_path / "streets" / "drive"),
         "diffusion": controlnet_weights[0],
         "controlnet": controlnet_weights[1],
-        "steps": 1,
+        "num_inference_steps": 1,
     }
     assert paint(Config(**options)) == (options["streets"], 2)
     files = {path.name: path.stat().st_mtime_ns for path in (drive / "photo").iterdir()}

@@ -211,10 +211,10 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
     from pipelines.schema.scene_subset import SceneSubset
 
     def request(name: str, **options) -> OutpaintRequest:
-        resampling = RePaintConfig(num_inference_steps=4, jump_length=2, resamplings=2)
+        repaint = RePaintConfig(num_inference_steps=4, jump_length=2, resamplings=2)
         model = str(smoke / "models/pritti-smoke")
-        made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", resampling, 1.0)
-        return replace(made, **{"last": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
+        made = OutpaintRequest(model, str(tmp_path / name), "street", None, 0, 0.25, "reencode", repaint, 1.0)
+        return replace(made, **{"num_blocks": (3, 0, 0, 1), "order": "colours", "batch_size": 2} | options)
 
     chosen = SceneSubset(str(samples), "generated-samples", None, 1, "first")
     table = outpaint_scenes(request("whole"), chosen)
@@ -247,7 +247,7 @@ def test_outpaint_is_independent_of_actors_and_actor_kill(smoke, samples, tmp_pa
         (again,) = read_scenes(str(tmp_path / name))
         for part in ("category", "center_m", "size_m", "height_m", "occupied"):
             assert np.array_equal(getattr(again, part), getattr(whole, part)), (name, part)
-    (outward,) = outpaint_scenes(request("outward", order="outward", last=(1, 0, 0, 0)), chosen).to_pylist()[1:]
+    (outward,) = outpaint_scenes(request("outward", order="outward", num_blocks=(1, 0, 0, 0)), chosen).to_pylist()[1:]
     assert outward["ahead"] == 1
     assert count_blocks(Config(extent_m=(512.0, 128.0))) == (7, 7, 1, 1) != count_blocks(Config(extent_m=(64.0, 65.0)))
     for wrong in (
@@ -303,8 +303,8 @@ def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
 
     model = str(smoke / "models/pritti-smoke")
     pipeline = load_pipeline(model)
-    for run, resampling in (("paper", RePaintConfig()), ("guided", RePaintConfig.guided())):
-        request = OutpaintRequest(model, str(tmp_path), run, None, 0, 0.5, "reencode", resampling, 1.0)
+    for run, repaint in (("paper", RePaintConfig()), ("guided", RePaintConfig.guided())):
+        request = OutpaintRequest(model, str(tmp_path), run, None, 0, 0.5, "reencode", repaint, 1.0)
         pipeline.register_to_config(noise_scaling=1.0)
         guard_generation_run(request, pipeline, [str(smoke)])
         pipeline.register_to_config(noise_scaling=1.01)

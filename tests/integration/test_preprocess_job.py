@@ -41,7 +41,8 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     dataset = Dataset.open(str(town))
     rows = table(
         town,
-        "select split, num_vegetation_cuboid + num_vegetation_ellipsoid, vegetation_volume_m3, vegetation_density from TABLE",
+        "select split, num_vegetation_cuboid + num_vegetation_ellipsoid, vegetation_volume_m3, vegetation_density "
+        "from TABLE",
     )
     training = [row for row in rows if row[0] == "train"]
     count, volume = (np.array([row[k] for row in training], float) for k in (1, 2))

@@ -111,7 +111,10 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatc
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
     monkeypatch.setattr("jobs.implementation.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
     config = Config(
-        model=str(smoke / "models/pritti-smoke"), evaluation=str(evaluated), output=str(tmp_path / "second"), register=False
+        model=str(smoke / "models/pritti-smoke"),
+        evaluation=str(evaluated),
+        output=str(tmp_path / "second"),
+        register=False,
     )  # fmt: skip
     with pytest.raises(ValueError, match="made these weights"):
         publish(config)

@@ -22,7 +22,8 @@ def weights(directory: Path) -> dict:
 def test_train_dit_creates_inputs_of_smoke_preset(home):
     assert (home / "datasets/smoke/dataset.json").exists()
     rows = duckdb.sql(
-        f"select split, count(*), count(distinct vegetation_density) from '{home}/datasets/smoke/scenes/**/*.parquet' group by 1"
+        "select split, count(*), count(distinct vegetation_density) "
+        f"from '{home}/datasets/smoke/scenes/**/*.parquet' group by 1"
     ).fetchall()
     assert {split: count for split, count, _ in rows} == {"train": 32, "test": 16}
     latents = json.loads((home / "datasets/smoke/latents.json").read_text())

@@ -1,13 +1,16 @@
-"""Imports point one way: jobs -> pipelines -> models. models runs without Ray."""
+"""Imports point one way: pritti -> jobs -> pipelines -> models, without cycles. models runs without Ray."""
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from helpers import ROOT
 
+PACKAGES = ("pritti", "jobs", "pipelines", "models")
 FORBIDDEN = {
     "models": {"ray", "pyarrow", "mlflow", "trimesh", "pipelines", "jobs", "tyro"},
     "pipelines": {"mlflow", "jobs", "tyro"},
@@ -23,6 +26,90 @@ def imported(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             names.add(node.module.split(".")[0])
     return names
+
+
+def list_modules(root: Path) -> dict[str, Path]:
+    """Dotted names and files of all modules of our packages below a directory."""
+    files = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
+    return {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+def find_imports(root: Path) -> dict[str, set[str]]:
+    """Modules of our packages that each module imports, anywhere in its file; also for type checkers only."""
+    modules = list_modules(root)
+    graph: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        targets = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                targets |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                members = {f"{node.module}.{alias.name}" for alias in node.names}
+                targets |= members & modules.keys() or {node.module}
+        graph[name] = (targets & modules.keys()) - {name}
+    return graph
+
+
+def collapse(graph: dict[str, set[str]], package: str) -> dict[str, dict[str, str]]:
+    """Imports between the direct children of a package, modules or folders, each with one import as an example."""
+    edges: dict[str, dict[str, str]] = {}
+    for module, targets in graph.items():
+        for target in targets:
+            if module.startswith(f"{package}.") and target.startswith(f"{package}."):
+                here, there = (name.removeprefix(f"{package}.").split(".")[0] for name in (module, target))
+                if here != there:
+                    edges.setdefault(here, {})[there] = f"{module} imports {target}"
+    return edges
+
+
+def find_cycle(graph: dict[str, dict[str, str]]) -> list[str]:
+    """The imports of one cycle of a graph, in order; empty if there is none."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        nodes = error.args[1][::-1]  # the sorter lists predecessors
+        return [graph[here][there] for here, there in pairwise(nodes)]
+    return []
+
+
+def find_cycles(root: Path) -> list[str]:
+    """Cycles of imports between modules, and between the children of any package; each as lines with its imports."""
+    graph = find_imports(root)
+    modules = {name: {target: f"{name} imports {target}" for target in targets} for name, targets in graph.items()}
+    found = [find_cycle(modules)]
+    packages = {name[:end] for name in graph for end, character in enumerate(name) if character == "."}
+    found += [find_cycle(collapse(graph, package)) for package in sorted(packages)]
+    return ["\n".join(lines) for lines in found if lines]
+
+
+def test_architecture_has_no_import_cycle():
+    assert len(find_imports(ROOT)) > 100
+    cycles = find_cycles(ROOT)
+    assert not cycles, "import cycles:\n" + "\n\n".join(cycles)
+
+
+def test_architecture_names_edges_of_planted_cycles(tmp_path):
+    sources = {
+        "pipelines/a/one.py": "from pipelines.b.two import x",
+        "pipelines/b/two.py": "x = 1",
+        "pipelines/b/three.py": "def f():\n    from pipelines.a import four",
+        "pipelines/a/four.py": "",
+    }
+    for package in PACKAGES:
+        (tmp_path / package).mkdir()
+    for name, source in sources.items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(source)
+    (folders,) = find_cycles(tmp_path)  # no module cycle, but one of folders
+    assert "pipelines.a.one imports pipelines.b.two" in folders
+    assert "pipelines.b.three imports pipelines.a.four" in folders
+    (tmp_path / "pipelines/b/two.py").write_text("import pipelines.a.one")
+    assert "pipelines.b.two imports pipelines.a.one" in find_cycles(tmp_path)[0]
+
+
+def test_pipelines_modules_lie_in_folders():
+    assert {path.name for path in (ROOT / "pipelines").glob("*.py")} == {"__init__.py"}
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)

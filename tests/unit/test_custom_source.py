@@ -565,12 +565,20 @@ LEVEL = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 115]
 NAN, INF = float("nan"), float("inf")
 # name -> (change of the street, file that the error names, message)
 MISTAKES = {
-    "category": (changed("boxes", 2, category="tree"), "boxes", "category of row 2 is 'tree', expected one of vegetation_cuboid, "),
+    "category": (
+        changed("boxes", 2, category="tree"),
+        "boxes",
+        "category of row 2 is 'tree', expected one of vegetation_cuboid, ",
+    ),
     "category null": (changed("boxes", 2, category=None), "boxes", "category of row 2 is null, expected a text"),
     "category number": (changed("boxes", 2, category=3), "boxes", "category of row 2 is 3, expected a text"),
     "no category": (everywhere("boxes", category=...), "boxes", "column category is missing"),
     "no size": (everywhere("boxes", width_m=...), "boxes", "column width_m is missing"),
-    "zero size": (changed("boxes", 1, height_m=0), "boxes", "height_m of row 1 is 0, expected a number of 0.001..1000 m"),
+    "zero size": (
+        changed("boxes", 1, height_m=0),
+        "boxes",
+        "height_m of row 1 is 0, expected a number of 0.001..1000 m",
+    ),
     "negative size": (changed("boxes", 1, width_m=-2.0), "boxes", "width_m of row 1 is -2.0"),
     "huge size": (changed("boxes", 1, length_m=5000), "boxes", "length_m of row 1 is 5000"),
     "nan": (changed("boxes", 3, x_m=NAN), "boxes", "x_m of row 3 is nan"),
@@ -580,60 +588,151 @@ MISTAKES = {
     "text": (changed("boxes", 3, y_m="3"), "boxes", "y_m of row 3 is '3', expected a number"),
     "true": (changed("boxes", 3, y_m=True), "boxes", "y_m of row 3 is True"),
     "far": (changed("boxes", 3, x_m=1e8), "boxes", "x_m of row 3 is 100000000.0, expected a number of -1e+07..1e+07 m"),
-    "high": (changed("boxes", 3, z_m=5e6), "boxes", "z_m of row 3 is 5000000.0, expected a number of -10000..10000 m (z up)"),
+    "high": (
+        changed("boxes", 3, z_m=5e6),
+        "boxes",
+        "z_m of row 3 is 5000000.0, expected a number of -10000..10000 m (z up)",
+    ),
     "endless integer": (changed("boxes", 3, x_m=10**4000), "boxes", "x_m of row 3 is an integer of over 40 digits"),
-    "degrees": (changed("boxes", 0, yaw_rad=90), "boxes", "yaw_rad of row 0 is 90, expected a number of -6.2832..6.2832 (radians)"),
-    "no orientation": (everywhere("boxes", yaw_rad=...), "boxes", "no orientation; give either yaw_rad or qw, qx, qy, qz"),
+    "degrees": (
+        changed("boxes", 0, yaw_rad=90),
+        "boxes",
+        "yaw_rad of row 0 is 90, expected a number of -6.2832..6.2832 (radians)",
+    ),
+    "no orientation": (
+        everywhere("boxes", yaw_rad=...),
+        "boxes",
+        "no orientation; give either yaw_rad or qw, qx, qy, qz",
+    ),
     "two orientations": (changed("boxes", 0, qw=1.0), "boxes", "both yaw_rad and a quaternion"),
     "half a quaternion": (everywhere("boxes", yaw_rad=..., qw=1.0, qz=0.0), "boxes", "column qx is missing"),
     "quaternion in some rows": (
-        lambda tables: [everywhere("boxes", yaw_rad=..., qw=1, qx=0, qy=0, qz=0)(tables), changed("boxes", 5, qy=...)(tables)],
+        lambda tables: [
+            everywhere("boxes", yaw_rad=..., qw=1, qx=0, qy=0, qz=0)(tables),
+            changed("boxes", 5, qy=...)(tables),
+        ],
         "boxes",
         "qy of row 5 is null",
     ),
-    "norm": (everywhere("boxes", yaw_rad=..., qw=0.5, qx=0, qy=0, qz=0), "boxes", "quaternion of row 0 has norm 0.5, expected 1; normalise it"),
-    "frame text": (changed("boxes", 4, frame="10"), "boxes", "frame of row 4 is '10', expected a whole number of 0 or more; null means"),
-    "frame -1": (changed("boxes", 4, frame=-1), "boxes", "frame of row 4 is -1, expected a whole number of 0 or more; null means that a box stands still"),
+    "norm": (
+        everywhere("boxes", yaw_rad=..., qw=0.5, qx=0, qy=0, qz=0),
+        "boxes",
+        "quaternion of row 0 has norm 0.5, expected 1; normalise it",
+    ),
+    "frame text": (
+        changed("boxes", 4, frame="10"),
+        "boxes",
+        "frame of row 4 is '10', expected a whole number of 0 or more; null means",
+    ),
+    "frame -1": (
+        changed("boxes", 4, frame=-1),
+        "boxes",
+        "frame of row 4 is -1, expected a whole number of 0 or more; null means that a box stands still",
+    ),
     "frame 1.5": (changed("boxes", 4, frame=1.5), "boxes", "frame of row 4 is 1.5"),
     "frame nan": (changed("boxes", 4, frame=NAN), "boxes", "frame of row 4 is nan"),
     "frame true": (changed("boxes", 4, frame=True), "boxes", "frame of row 4 is True"),
     "frame too large": (changed("boxes", 4, frame=2**63), "boxes", "frame of row 4 is 9223372036854775808"),
-    "rounded time": (changed("boxes", 4, frame=1.5e18), "boxes", "frame of row 4 is 1.5e+18, a float that has lost its last digits"),
+    "rounded time": (
+        changed("boxes", 4, frame=1.5e18),
+        "boxes",
+        "frame of row 4 is 1.5e+18, a float that has lost its last digits",
+    ),
     "other frames": (
         lambda tables: [changed("boxes", row, frame=1000 + row)(tables) for row in (4, 5, 6)],
         "boxes",
         "no box's frame is a frame of the poses, e.g. 1004 (poses: 10..20)",
     ),
     "id": (changed("boxes", 4, instance_id=-3), "boxes", "instance_id of row 4 is -3"),
-    "id list": (changed("boxes", 4, instance_id=[1]), "boxes", "instance_id of row 4 is [1], expected a whole number of 0 or more, a text or null"),
+    "id list": (
+        changed("boxes", 4, instance_id=[1]),
+        "boxes",
+        "instance_id of row 4 is [1], expected a whole number of 0 or more, a text or null",
+    ),
     "label": (changed("boxes", 4, label=4), "boxes", "label of row 4 is 4, expected a text"),
-    "heading": (changed("boxes", 4, heading_known="yes"), "boxes", "heading_known of row 4 is 'yes', expected true, false or null"),
-    "typing error": (changed("boxes", 4, frames=3), "boxes", "column 'frames' means nothing here (meant frame?); drop it, or rename it to one of category, "),
+    "heading": (
+        changed("boxes", 4, heading_known="yes"),
+        "boxes",
+        "heading_known of row 4 is 'yes', expected true, false or null",
+    ),
+    "typing error": (
+        changed("boxes", 4, frames=3),
+        "boxes",
+        "column 'frames' means nothing here (meant frame?); drop it, or rename it to one of category, ",
+    ),
     "boxes of elsewhere": (
         lambda tables: [changed("boxes", row, x_m=row, y_m=0.0)(tables) for row in range(7)],
         "boxes",
         "all of it lies more than 100 m from every pose",
     ),
-    "class": (changed("polygons", 0, **{"class": "grass"}), "polygons", "class of row 0 is 'grass', expected one of road, sidewalk, parking, terrain, ground, crossing; map"),
+    "class": (
+        changed("polygons", 0, **{"class": "grass"}),
+        "polygons",
+        "class of row 0 is 'grass', expected one of road, sidewalk, parking, terrain, ground, crossing; map",
+    ),
     "no class": (everywhere("polygons", **{"class": ...}), "polygons", "column class is missing"),
-    "no outline": (changed("polygons", 1, outline=None), "polygons", "outline of row 1 is null, expected a list of points"),
-    "wkt": (changed("polygons", 1, outline="POLYGON ((0 0, 1 1, 1 0))"), "polygons", "outline of row 1 is 'POLYGON ((0 0, 1 1, 1 0))'"),
-    "flat point": (with_outline(corner(0, 0), corner(9, 0)[:2], corner(9, 9)), "polygons", "point 1 of the outline of row 1 is [45"),
+    "no outline": (
+        changed("polygons", 1, outline=None),
+        "polygons",
+        "outline of row 1 is null, expected a list of points",
+    ),
+    "wkt": (
+        changed("polygons", 1, outline="POLYGON ((0 0, 1 1, 1 0))"),
+        "polygons",
+        "outline of row 1 is 'POLYGON ((0 0, 1 1, 1 0))'",
+    ),
+    "flat point": (
+        with_outline(corner(0, 0), corner(9, 0)[:2], corner(9, 9)),
+        "polygons",
+        "point 1 of the outline of row 1 is [45",
+    ),
     "no points": (with_outline(), "polygons", "outline of row 1 has 0 different points"),
-    "two points": (with_outline(corner(0, 0), corner(9, 0), corner(0, 0)), "polygons", "outline of row 1 has 2 different points, expected 3 or more"),
+    "two points": (
+        with_outline(corner(0, 0), corner(9, 0), corner(0, 0)),
+        "polygons",
+        "outline of row 1 has 2 different points, expected 3 or more",
+    ),
     "one point": (with_outline(*[corner(0, 0)] * 4), "polygons", "outline of row 1 has 0 different points"),
-    "nan point": (with_outline(corner(0, 0), corner(9, 0), [NAN, 0, 0]), "polygons", "point 2 of the outline of row 1 is [nan, 0, 0], expected [x, y, z]"),
-    "text point": (with_outline(corner(0, 0), corner(9, 0), "far"), "polygons", "point 2 of the outline of row 1 is 'far'"),
-    "high point": (with_outline(corner(0, 0), corner(9, 0), corner(9, 9, 2e4)), "polygons", "point 2 of the outline of row 1 is 20115 m high"),
-    "on a line": (with_outline([0, 0, 115], [9, 9, 115], [4, 4, 115]), "polygons", "outline of row 1 is no simple polygon"),
-    "bow tie": (with_outline(corner(0, 0), corner(9, 9), corner(9, 0), corner(0, 9)), "polygons", "outline of row 1 is no simple polygon, Self-intersection["),
+    "nan point": (
+        with_outline(corner(0, 0), corner(9, 0), [NAN, 0, 0]),
+        "polygons",
+        "point 2 of the outline of row 1 is [nan, 0, 0], expected [x, y, z]",
+    ),
+    "text point": (
+        with_outline(corner(0, 0), corner(9, 0), "far"),
+        "polygons",
+        "point 2 of the outline of row 1 is 'far'",
+    ),
+    "high point": (
+        with_outline(corner(0, 0), corner(9, 0), corner(9, 9, 2e4)),
+        "polygons",
+        "point 2 of the outline of row 1 is 20115 m high",
+    ),
+    "on a line": (
+        with_outline([0, 0, 115], [9, 9, 115], [4, 4, 115]),
+        "polygons",
+        "outline of row 1 is no simple polygon",
+    ),
+    "bow tie": (
+        with_outline(corner(0, 0), corner(9, 9), corner(9, 0), corner(0, 9)),
+        "polygons",
+        "outline of row 1 is no simple polygon, Self-intersection[",
+    ),
     "touches itself": (
         with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(4, 4), corner(0, 9), corner(4, 4)),
         "polygons",
         "no simple polygon",
     ),
-    "cliff": (with_outline(corner(0, 0), corner(9, 0), corner(9, 0, 4), corner(9, 9)), "polygons", "point 1 of the outline of row 1 has the next one right above or below it"),
-    "open cliff": (with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(0, 0, 4)), "polygons", "point 3 of the outline of row 1 has the next one"),
+    "cliff": (
+        with_outline(corner(0, 0), corner(9, 0), corner(9, 0, 4), corner(9, 9)),
+        "polygons",
+        "point 1 of the outline of row 1 has the next one right above or below it",
+    ),
+    "open cliff": (
+        with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(0, 0, 4)),
+        "polygons",
+        "point 3 of the outline of row 1 has the next one",
+    ),
     "ground at 0": (
         lambda tables: [point.__setitem__(2, 0.0) for row in tables["polygons"] for point in row["outline"]],
         "polygons",
@@ -641,14 +740,26 @@ MISTAKES = {
     ),
     "no pose": (lambda tables: tables["poses"].clear(), "poses", "holds no pose"),
     "no frame": (everywhere("poses", frame=...), "poses", "column frame is missing"),
-    "null frame": (changed("poses", 1, frame=None), "poses", "frame of row 1 is null, expected a whole number of 0 or more"),
-    "frame twice": (changed("poses", 1, frame=10), "poses", "frame of row 1 is 10 after 10; sort the poses by frame, each frame once"),
+    "null frame": (
+        changed("poses", 1, frame=None),
+        "poses",
+        "frame of row 1 is null, expected a whole number of 0 or more",
+    ),
+    "frame twice": (
+        changed("poses", 1, frame=10),
+        "poses",
+        "frame of row 1 is 10 after 10; sort the poses by frame, each frame once",
+    ),
     "unsorted": (changed("poses", 1, frame=3), "poses", "frame of row 1 is 3 after 10"),
     "no place": (everywhere("poses", z_m=...), "poses", "column z_m is missing"),
     "pose nan": (changed("poses", 1, yaw_rad=NAN), "poses", "yaw_rad of row 1 is nan"),
     "pose unturned": (everywhere("poses", yaw_rad=...), "poses", "no orientation"),
-    "matrix and place": (changed("poses", 1, world_from_ego=LEVEL), "poses", "has world_from_ego and x_m; give the pose in one way only"),
-}  # fmt: skip
+    "matrix and place": (
+        changed("poses", 1, world_from_ego=LEVEL),
+        "poses",
+        "has world_from_ego and x_m; give the pose in one way only",
+    ),
+}
 
 
 def matrix_of(values) -> list[dict]:
@@ -664,8 +775,11 @@ BROKEN_MATRICES = {
     "transposed": (np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 115]]).T.ravel().tolist(), "holds no rotation"),
     "high": ([*LEVEL[:-1], 6e6], "z of row 0 is 6e+06 m"),
     "z down": (np.hstack([np.diag([1, -1, -1]), ORIGIN[:, None]]).ravel().tolist(), "the z axis of row 0 points down"),
-    "camera": ([0, 0, 1, 5, -1, 0, 0, 6, 0, -1, 0, 115], "the z axis of row 0 points sideways; give the pose of a vehicle"),
-}  # fmt: skip
+    "camera": (
+        [0, 0, 1, 5, -1, 0, 0, 6, 0, -1, 0, 115],
+        "the z axis of row 0 points sideways; give the pose of a vehicle",
+    ),
+}
 
 
 def assert_refused(root: Path, file: str, reason: str) -> None:

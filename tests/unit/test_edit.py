@@ -8,7 +8,7 @@ import pytest
 from helpers import assert_same_primitives, random_scene
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Scene, canonicalize_boxes
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, UNSET, Scene, canonicalize_boxes
 from pipelines.editing import edit
 from pipelines.editing.edit import Select, parse_edits, replay_edits, serialize_edits
 from pipelines.io.mesh_export import triangulate_scene
@@ -218,7 +218,7 @@ def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Sce
     return replace(
         scene,
         category=np.full(2, CAR, np.int8),
-        label=None,
+        label=UNSET,
         center_m=center_m,
         size_m=np.array(sizes_m, np.float32),
         rotation=np.tile(np.eye(3, dtype=np.float32), (2, 1, 1)),

@@ -9,7 +9,16 @@ from helpers import random_scene
 
 from models.geometry.iou3d import compute_ellipsoid_iou3d_matrix, compute_iou3d_matrix, extract_boxes
 from models.layout import LayoutSpec
-from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, KITTI_GROUND_CLASSES, Grid, Scene, make_yaw_rotation
+from models.scene import (
+    CATEGORIES,
+    CATEGORY_INDEX,
+    ELLIPSOID,
+    KITTI_GROUND_CLASSES,
+    UNSET,
+    Grid,
+    Scene,
+    make_yaw_rotation,
+)
 from models.tensors import make_layout_batch
 from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.metrics.reconstruction import (
@@ -45,7 +54,7 @@ def scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scen
         rotation=make_yaw_rotation(np.zeros(n) if yaw_rad is None else yaw_rad).astype(np.float32),
         size_m=np.ones((n, 3), np.float32) if size_m is None else np.asarray(size_m, np.float32),
         ground_classes=KITTI_GROUND_CLASSES, height_m=ground, occupied=ground > 0, grid=GRID,
-        existence=None if existence is None else np.asarray(existence, np.float32),
+        existence=UNSET if existence is None else np.asarray(existence, np.float32),
     )  # fmt: skip
 
 

@@ -248,7 +248,9 @@ def test_linear_init_is_optimal_with_unit_variance_codes():
 
 def test_linear_init_lowers_learning_rate():
     lvae = small_lvae(shortcut=True, decoder="cells")
-    trainer = Trainer(lvae, None, OptimizerConfig(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu"))
+    trainer = Trainer(
+        lvae, lambda *_: {}, OptimizerConfig(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu")
+    )
     share = {id(p): group["share"] for group in trainer.optimiser.param_groups for p in group["params"]}
     assert len(share) == len(list(lvae.parameters()))
     names = {name: share[id(p)] for name, p in lvae.named_parameters()}

@@ -110,7 +110,8 @@ def test_block_grid_rejects_wrong_overlaps():
         BlockGrid.from_overlap(8, 0.5, rank=rank_four_colors, num_blocks=None)
 
 
-# ------------------------------------------------------------------------------------------------------------ composition
+# ------------------------------------------------------------------------------------------------------------
+# composition
 
 
 @pytest.mark.parametrize("mode", ["copy", "reencode"])

@@ -79,7 +79,7 @@ def test_samplers_are_independent_of_batch_composition(pipeline):
     assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
     pipeline.use_sampler("dpm++")  # after the one of its kind that draws noise
     assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
-    with pytest.raises(ValueError, match="num_steps is 600"):
+    with pytest.raises(ValueError, match="num_inference_steps is 600"):
         pipeline.sample_latents(labels, 3, range(3), 600)
     with pytest.raises(ValueError, match="sampler 'euler' is unknown, expected one of: ddpm, ddim, dpm"):
         pipeline.use_sampler("euler")
@@ -116,13 +116,13 @@ def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
     again = PrITTIPipeline.from_pretrained(tmp_path)
     again.set_progress_bar_config(disable=True)
     assert torch.equal(drawn("dpm++", again), more) and torch.equal(drawn("ddpm", again), plain["ddpm"])
-    with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 1 \(none\) or a little more"):
+    with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 1 \(none\) or slightly more"):
         drawn("dpm++", noise_scaling=2.0)
     pipeline.use_sampler("ddpm")
 
 
 def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
-    latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.identity("run", 0, 0, "low")]
+    latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.new_identity("run", 0, 0, "low")]
     (everything,) = pipeline.decode(latents, identities, 1e-6)
     existence = np.sort(everything.existence)
     gap = np.argmax(np.diff(existence))  # away from any primitive, whose existence may round differently after loading
@@ -320,7 +320,7 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
     lvae = LayoutVAE(layout=SPEC.to_dict(), **architecture)
     channels, size, _ = lvae.latent_shape
     mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2))
-    with pytest.raises(ValueError, match="mixes ground and objects: objects cannot be made anew alone"):
+    with pytest.raises(ValueError, match="mixes ground and objects: objects cannot be regenerated alone"):
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
 
 

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT, random_scene
 
-from models.scene import CATEGORIES, VEGETATION, VEHICLES, Scene, make_yaw_rotation
+from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
 from pipelines.preprocess.sources import argoverse2, kitti360
@@ -127,9 +127,9 @@ def invented(scene: Scene, index: int) -> Scene:
         frame=index,
         size_m=some.size_m * np.float32(0.8),
         existence=np.linspace(0.3, 1, len(some), dtype=np.float32),
-        heading_rad=None,
-        instance_id=None,
-        label=None,
+        heading_rad=UNSET,
+        instance_id=UNSET,
+        label=UNSET,
         world_xyz_m=(0.0, 0.0, 0.0),
         world_yaw_rad=0.0,
         world_from_imu=None,
@@ -312,7 +312,7 @@ def test_tables_page_objects_seen_again(answers, town):
     for k, name in enumerate(CATEGORIES):
         if name in answer.index:
             assert answer.loc[name].tolist() == [seen_again[k], moved[k], mistaken[k]]
-    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.translate.sum() > 0
+    assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
 
 
 def test_tables_page_scene_contents(answers, town, fake):

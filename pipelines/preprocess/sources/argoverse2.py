@@ -338,7 +338,7 @@ def _read_sim2(path: Path) -> np.ndarray:
         isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
     ):
         raise ValueError(f"{path}: R or t is missing or not of 4 and 2 numbers; download the log again")
-    if not _are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
+    if scale is None or not _are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
         raise ValueError(f"{path}: R, t or s is no sensible number; download the log again")
     matrix = np.array(rotation, np.float64).reshape(2, 2)
     if np.abs(matrix @ matrix.T - np.eye(2)).max() > 1e-3:

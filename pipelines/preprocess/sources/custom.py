@@ -132,7 +132,7 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     `classes` are the ground classes of the whole dataset (`ground_classes`), None those of this drive alone.
     `timestamp` is the frame of a moving box, else STATIC; `instance_id` the given number, of a text a hash that is
     equal on every machine, -1 where there is none; `heading_rad` the yaw of the x axis where that is known.
-    Raises ValueError, naming file and row, for whatever is missing or makes no sense.
+    Raises ValueError naming file and row of a missing or invalid value.
     """
     folder = Path(root, name)
     if not folder.is_dir():
@@ -140,17 +140,18 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     frame, world_from_ego = read_poses(root, name)
     boxes, polygons = _read_boxes(folder), _read_polygons(folder)
     classes = classes or tuple(c for c in GROUND_CLASSES if c in polygons.texts("class"))
+    ground = _make_ground(polygons, classes)
     drive = Drive(
         source=SOURCE,
         sequence=name,
         **_make_boxes(boxes),
         ground_classes=classes,
-        ground=_make_ground(polygons, classes),
+        ground=ground,
         frame=frame,
         world_from_imu=world_from_ego,
     )
     _check_in_sight(boxes.path, drive.center_m, world_from_ego)
-    _check_in_sight(polygons.path, drive.ground.triangles_m.reshape(-1, 3), world_from_ego)
+    _check_in_sight(polygons.path, ground.triangles_m.reshape(-1, 3), world_from_ego)
     moving = drive.timestamp[drive.timestamp != STATIC]
     if len(moving) and not np.isin(moving, frame).any():
         raise ValueError(
@@ -353,8 +354,9 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     fallen = np.flatnonzero(world_from_ego[:, 2, 2] < MIN_UP)
     if len(fallen):
         raise ValueError(
-            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])}; give"
-            " the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other axes)"
+            f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])};"
+            " give the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other"
+            " axes)"
         )
     return frame, world_from_ego
 
@@ -398,8 +400,8 @@ def _is_text(value: object) -> bool:
 
 
 def _is_whole(value: object) -> bool:
-    """Whether this is an integer of 0 or more; a float will do, pandas makes them of integers beside a null."""
-    return type(value) in (int, float) and 0 <= value <= MAX_WHOLE and value == value // 1
+    """Whether this is an integer of 0 or more; a float may hold it, as in pandas' columns with nulls."""
+    return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:
@@ -440,7 +442,7 @@ def _make_boxes(table: _Table) -> dict[str, np.ndarray]:
 
 
 def _make_instance_ids(table: _Table) -> np.ndarray:
-    """(rows,) int64: numbers as they are, texts by the first 63 bits of their BLAKE2 hash, -1 where there is none."""
+    """(rows,) int64: numbers unchanged, texts as the first 63 bits of their BLAKE2 hash, -1 for nulls."""
     ids = []
     for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
         if _is_text(value):

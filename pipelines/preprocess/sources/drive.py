@@ -58,9 +58,10 @@ class SlabGround:
 
     @cached_property
     def _upper(self) -> tuple[np.ndarray, np.ndarray]:
-        """The triangles without undersides, and the slab of each.
+        """Return the triangles without undersides, and the slab of each.
 
-        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the second half of its vertices is its first half, moved down (FORMAT of KITTI-360).
+        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the
+        second half of its vertices is its first half, moved down (format of KITTI-360).
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
@@ -229,6 +230,7 @@ class Drive:
         rotation, size = canonicalize_boxes(make_yaw_rotation(-pose.yaw_rad) @ self.rotation[near], self.size_m[near])
         heading = (self.heading_rad[near] - pose.yaw_rad + np.pi) % (2 * np.pi) - np.pi
         height, occupied = self.ground.rasterise(pose, grid, len(self.ground_classes))
+        x_m, y_m, z_m = (float(v) for v in pose.xyz_m)
         return Scene(
             scene_id=f"{self.source}-{self.sequence}-{frame:010d}",
             source=self.source,
@@ -246,7 +248,7 @@ class Drive:
             height_m=height,
             occupied=occupied,
             grid=grid,
-            world_xyz_m=tuple(float(v) for v in pose.xyz_m),
+            world_xyz_m=(x_m, y_m, z_m),
             world_yaw_rad=pose.yaw_rad,
             world_from_imu=self.world_from_imu[index],
         )

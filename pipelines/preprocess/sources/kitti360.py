@@ -184,8 +184,10 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
             continue
         if _find_copies(seen, (plain, parsed.timestamp), parsed.vertices_m):
             duplicates += 1
+        elif isinstance(parsed, _Box):
+            boxes.append(parsed)
         else:
-            (boxes if isinstance(parsed, _Box) else slabs).append(parsed)
+            slabs.append(parsed)
     objects = len(boxes) + len(slabs) + dropped.total() + unknown.total() + duplicates + len(defects)
     report = ReadReport(objects, len(boxes), len(slabs), dict(dropped), dict(unknown), duplicates, tuple(defects))
     if objects == 0:

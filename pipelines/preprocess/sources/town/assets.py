@@ -46,9 +46,9 @@ class Site:
 
 
 def draw_sizes(
-    rng: np.random.Generator, what: str, n: int, scale: float | tuple[float, float, float] = 1.0
+    rng: np.random.Generator, what: str, n: int, scale: float | np.ndarray | tuple[float, float, float] = 1.0
 ) -> np.ndarray:
-    """(n, 3) extents drawn for a kind of thing; l >= w."""
+    """(n, 3) random extents of a kind of object, in metres, length >= width; `scale` is one factor or (3,)."""
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
     drawn = (np.array(median) * scale * factor).clip(low, high)
@@ -66,7 +66,7 @@ def plant_strip(
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
-    """Cars parked at s; most look the way the traffic beside them goes."""
+    """Park cars at s; most point in the direction of the adjacent lane."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
     site.sheet.boxes(

@@ -3,7 +3,7 @@
     drive = town_drive(7)          # one town and one drive through its streets
     scene = drive.scene(0)         # what lies ahead of the first pose
 
-numpy only. The same seed gives the same town (under one numpy); a change of what comes out raises TOWN_VERSION.
+numpy only. The same seed gives the same town (under one numpy); a change of its output raises TOWN_VERSION.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ POSE_SPACING_M = 10.0
 IMU_HEIGHT_M = 0.93  # above the true surface of the road, as KITTI-360's
 METRES_PER_FRAME = 0.7
 
-# KITTI-360's own names (its XML spelling) -> our categories; vegetation is told apart by its shape.
+# KITTI-360's names (in the spelling of its XML) -> our categories; the shape decides the category of vegetation.
 LABEL_CATEGORY = {
     "vegetation": "vegetation_cuboid",
     "truck": "vehicle_big",
@@ -285,9 +285,9 @@ def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
 
 def list_slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
     """(4 n - 4, 3) faces of a slab in KITTI-360's order: top, bottom, then two per side."""
-    top = np.array(top)
+    upper = np.array(top)
     ring = np.arange(n - 1)
     first = np.stack([ring, ring + 1, n + ring], axis=1)
     second = np.stack([ring + 1, n + ring + 1, n + ring], axis=1)
     sides = np.stack([first, second], axis=1).reshape(-1, 3)
-    return np.concatenate([top, top + n, sides, [[0, n - 1, n], [n - 1, n, 2 * n - 1]]])
+    return np.concatenate([upper, upper + n, sides, [[0, n - 1, n], [n - 1, n, 2 * n - 1]]])

@@ -60,15 +60,26 @@ def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: int = 0) -> None:
-    """Writes the XML and poses.txt of one drive with slab ground under ROOT, as sequence int(drive.sequence) % 10000.
+    """Write the XML and poses.txt of one drive, as sequence int(drive.sequence) % 10000.
 
-    With `defects`: mirrored and slightly sheared boxes, objects written twice where annotation windows meet, empty
-    plane matrices, labels of no category, fields and objects in any order. `seed` chooses which.
+    Args:
+        drive: Drive with slab ground.
+        root: Directory in KITTI-360's layout.
+        defects: Whether to add the defects of KITTI-360's files: mirrored and slightly sheared boxes, objects written
+            twice where annotation windows meet, empty plane matrices, labels of no category, fields and objects in any
+            order.
+        seed: Seed of the defects.
+
+    Raises:
+        ValueError: The drive's ground is not slabs.
     """
+    ground = drive.ground
+    if not isinstance(ground, SlabGround):
+        raise ValueError(f"drive {drive.sequence} has no slab ground; KITTI-360's format holds no other ground")
     rng = np.random.default_rng([7302, seed])
     name = f"2013_05_28_drive_{int(drive.sequence) % 10_000:04d}_sync"
     boxes, poses = Path(root) / "data_3d_bboxes" / "train_full", Path(root) / "data_poses" / name
-    slabs = _write_slabs(drive.ground)
+    slabs = _write_slabs(ground)
     boxes.mkdir(parents=True, exist_ok=True)
     poses.mkdir(parents=True, exist_ok=True)
 
@@ -87,7 +98,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
         if defects and static and len(box_windows[k]) > 1 and rng.random() < 0.5:
             twice.append(fields | _write_window(drive, box_windows[k][1]))
     for k, (vertices, faces) in enumerate(slabs):
-        label = XML_GROUND[drive.ground_classes[drive.ground.slab_class[k]]]
+        label = XML_GROUND[drive.ground_classes[ground.slab_class[k]]]
         fields = _write_head(drive, label, "stuff", None, slab_windows[k][0]) | _write_slab(vertices, faces)
         if defects and rng.random() < 0.1:
             fields |= _write_mesh("_plane") | {"transform_plane": _write_matrix(None)}

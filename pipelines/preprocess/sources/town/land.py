@@ -7,6 +7,7 @@ board abuts in the world, streets curve and junctions are not all square.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,8 +122,8 @@ class Sheet:
         self,
         frame: LocalFrame,
         label: str,
-        s: np.ndarray,
-        t: np.ndarray,
+        s: np.ndarray | Sequence[float] | float,
+        t: np.ndarray | Sequence[float] | float,
         size_m: np.ndarray,
         yaw_rad: np.ndarray | float = 0.0,
         bottom_m: np.ndarray | float = 0.0,
@@ -130,7 +131,20 @@ class Sheet:
         timestamp: np.ndarray | int = -1,
         track: np.ndarray | int = -1,
     ) -> None:
-        """n boxes of one label at (s, t): length axis turned by yaw from s to t, bottom above the surface, metres."""
+        """Add n boxes of one label.
+
+        Args:
+            frame: Frame of (s, t).
+            label: Their label.
+            s: (n,) or one position along the frame, in metres.
+            t: (n,) or one position inward.
+            size_m: (n, 3) or (3,) length, width and height.
+            yaw_rad: Direction of the length axis, from s to t.
+            bottom_m: Height of the lower side above the surface.
+            ellipsoid: Whether they are ellipsoids.
+            timestamp: Frame of a moving box; -1 for static ones.
+            track: Number of a moving object; -1 for static ones.
+        """
         s, t, size_m = np.atleast_1d(s), np.atleast_1d(t), np.atleast_2d(size_m)
         rows = np.empty((len(s), 11))
         rows[:, :2] = frame.uv(s, t)

@@ -1,4 +1,4 @@
-"""A row of houses along a street: plots with driveways, paths, gardens, borders and what stands before a house."""
+"""Build a row of houses along a street: plots with driveways, paths, gardens, borders and small objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SQUEEZE = 0.4  # share of the last plot of a row that its neighbours make room f
 
 @dataclass(frozen=True)
 class House:
-    """What a plot is planned for: extent along and away from the street, height, width kept free for a driveway."""
+    """Plan of a house: extent along and away from the street, height, and width of its driveway."""
 
     front_m: float
     back_m: float
@@ -26,7 +26,7 @@ class House:
 
 
 def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) -> None:
-    """Houses side by side along a street, each on its plot; plots give or take a little so that the row is full."""
+    """Build houses side by side along a street, each on its plot; plots are resized slightly to fill the row."""
     planned, used = [], 0.0
     scale = np.array(site.district.house_scale) * [site.mood.room, site.mood.room**0.5, 1.0]
     while True:
@@ -54,7 +54,7 @@ def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) 
 
 
 def build_plot(site: Site, frame: LocalFrame, width: float, depth: float, house: House) -> None:
-    """One plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles; or an orchard."""
+    """Build one plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles; or an orchard."""
     if site.rng.random() < site.mood.vacant:
         lawn = TERRAIN if site.rng.random() < site.district.terrain_front else NOTHING
         paint_plots(site, frame, width, depth, lawn, lawn, depth, [])
@@ -108,9 +108,9 @@ def _build_house(site: Site, frame: LocalFrame, walls: Rect, house: House) -> No
 def _build_garage(
     site: Site, frame: LocalFrame, width: float, depth: float, walls: Rect, room: float, left: bool
 ) -> list[tuple[int, Rect]]:
-    """A garage beside the house where there is room, else behind it, and the driveway to it, perhaps with a car.
+    """Build a garage next to the house if there is room, else behind it, and a driveway, perhaps with a car.
 
-    Returns what to paint, the driveway first; nothing if the plot is too shallow.
+    Returns the rectangles to paint, the driveway first; none if the plot is too shallow.
     """
     size = draw_sizes(site.rng, "garage", 1)[0]
     beside = max(2.8, min(room, size[1]))
@@ -135,9 +135,9 @@ def _compute_overlap(a: Rect, b: Rect) -> bool:
 def _plant_borders(
     site: Site, frame: LocalFrame, width: float, depth: float, setback: float, gate: tuple[float, float], court: bool
 ) -> None:
-    """Hedges and walls round a plot, open at the gate (s0, s1) and before a court; steps and low walls inside."""
+    """Plant hedges and walls around a plot, open at the gate (s0, s1) and at a court; add steps and low walls."""
     g0, g1 = gate
-    lines = []
+    lines: list[tuple[float, float, float, float]] = []
     if not court and setback > 1.2:
         gate_right = g1 > g0 > width / 2
         lines.append(
@@ -162,7 +162,7 @@ def _plant_borders(
 
 
 def _place_belongings(site: Site, frame: LocalFrame, walls: Rect, gate: tuple[float, float]) -> None:
-    """Bins, boxes and bicycles before the house and beside its drive."""
+    """Place bins, boxes and bicycles in front of the house and next to its driveway."""
     s0, s1, t0, _ = walls
     n = site.rng.poisson(site.district.things_per_plot * site.mood.things)
     if n:
@@ -187,7 +187,7 @@ def paint_plots(
     split: float,
     rects: list[tuple[int, Rect]],
 ) -> None:
-    """Slabs of a plot: `front` before t = split, `back` behind it, and `rects` (class, (s0, s1, t0, t1)) on top."""
+    """Paint a plot's slabs: `front` before t = split, `back` after it, `rects` (class, (s0, s1, t0, t1)) on top."""
     for low, high, base in ((0.0, split, front), (split, depth, back)):
         if high - low < 0.3:
             continue

@@ -104,7 +104,7 @@ def make_sample(scenes: Iterable[Scene]) -> Sample:
 
 
 def measure_town(scenes: Iterable[Scene] | Sample) -> list[Row]:
-    """Measured beside target for every number of TARGETS; labels come from the scenes' own percentiles.
+    """Compare measured and target values of all TARGETS; labels come from the percentiles of these scenes.
 
     A category or label that never occurs gives nan and is not ok.
     """

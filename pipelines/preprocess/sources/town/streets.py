@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -121,12 +121,13 @@ def list_blocks(
     u, v, hu, hv = streets.u_m, streets.v_m, streets.half_u_m, streets.half_v_m
     blocks = []
     for i0, i1, j0, j1 in cells:
-        corners = tuple(streets.corner_m[n] for n in ((i0, j0), (i1, j0), (i1, j1), (i0, j1)))
+        radii = streets.corner_m
+        corners = (radii[i0, j0], radii[i1, j0], radii[i1, j1], radii[i0, j1])
         kind = kind_at((u[i0] + u[i1]) / 2, (v[j0] + v[j1]) / 2)
-        box = (u[i0] + hu[i0], u[i1] - hu[i1], v[j0] + hv[j0], v[j1] - hv[j1])
-        blocks.append(CityBlock(*map(float, box), (True,) * 4, corners, kind))
+        u0, u1, v0, v1 = u[i0] + hu[i0], u[i1] - hu[i1], v[j0] + hv[j0], v[j1] - hv[j1]
+        blocks.append(CityBlock(u0, u1, v0, v1, (True, True, True, True), corners, kind))
     south, north, west, east = v[0] - hv[0], v[-1] + hv[-1], u[0] - hu[0], u[-1] + hu[-1]
-    d, none = outskirts_m, (0.0,) * 4
+    d, none = outskirts_m, (0.0, 0.0, 0.0, 0.0)
     for i in range(len(u) - 1):
         left, right = (west if i == 0 else u[i]), (east if i == len(u) - 2 else u[i + 1])
         middle = (u[i] + u[i + 1]) / 2
@@ -143,8 +144,8 @@ def list_blocks(
         blocks.append(CityBlock(east, east + d, low, high, (False, False, False, True), none, kind_at(u[-1], middle)))
     for left, right, i in ((west - d, west, 0), (east, east + d, -1)):
         for low, high, j in ((south - d, south, 0), (north, north + d, -1)):
-            blocks.append(CityBlock(left, right, low, high, (False,) * 4, none, kind_at(u[i], v[j])))
-    return [CityBlock(*map(float, (b.u0, b.u1, b.v0, b.v1)), b.streets, b.corners, b.kind) for b in blocks]
+            blocks.append(CityBlock(left, right, low, high, (False, False, False, False), none, kind_at(u[i], v[j])))
+    return [replace(b, u0=float(b.u0), u1=float(b.u1), v0=float(b.v0), v1=float(b.v1)) for b in blocks]
 
 
 def pave_streets(streets: Streets, sheet: Sheet) -> None:
@@ -170,7 +171,7 @@ def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
     points: list[tuple[float, float]] = []
     for quadrant, (su, sv) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
         first, second = arms[quadrant], arms[(quadrant + 1) % 4]
-        # The end of an arm is a straight edge: its two corners come from the quadrants beside it.
+        # The end of an arm is a straight edge; the two adjacent quadrants add one corner each.
         along_first = (hu + r, hv) if quadrant % 2 == 0 else (hu, hv + r)
         along_second = (hu, hv + r) if quadrant % 2 == 0 else (hu + r, hv)
         if first and second:
