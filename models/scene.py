@@ -104,7 +104,7 @@ class Grid:
         h, w = cells.shape
         return cells.repeat(self.rows // h, axis=0).repeat(self.cols // w, axis=1)
 
-    def pixel(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    def pixel(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> tuple[Any, Any]:
         """(row, col) of the pixel that holds each point; may lie outside the grid."""
         row = np.floor((self.front_m - np.asarray(x_m)) / self.resolution_m).astype(np.int64)
         col = np.floor((self.left_m - np.asarray(y_m)) / self.resolution_m).astype(np.int64)

@@ -29,7 +29,8 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
         made = export_scenes(
             selection, config.formats, output, config.overwrite, lambda count: bar.advance(shown, count)
         )
-    return output, *made
+    counts, skipped = made
+    return output, {str(name): count for name, count in counts.items()}, skipped
 
 
 def main(config: Config) -> None:

@@ -46,7 +46,7 @@ def draw_scenes(config: OneScene) -> list[str]:
     written = []
     with Progress() as bar:
         shown = bar.add_task("draw scenes", total=len(chosen))
-        for shard, rows, _ in catalogue.chunks(chosen.tolist(), 8):
+        for shard, rows, _ in catalogue.chunks(chosen, 8):
             for scene in shard.scenes(rows):
                 files = {"png": encode_png(draw_scene_plate(scene)[0])} | (
                     {"glb": export_glb(scene)} if config.glb else {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass
 from functools import reduce
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
     return features
 
 
+@runtime_checkable
 class Gaussian(Protocol):
     """Mean (d,) and covariance (d, d) of features: Moments, or stored ones (adm_npz.py)."""
 

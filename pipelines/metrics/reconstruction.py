@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -75,7 +76,9 @@ class GroundScores:
     class_height_mse: dict[str, float]
 
 
-def compute_ground_scores(sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray) -> GroundScores:
+def compute_ground_scores(
+    sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray | Sequence[Any]
+) -> GroundScores:
     """Scores of the summed scenes; height_bounds_m is (2,) or (G, 2), lowest and highest height of the data.
 
     Raises ValueError if no pixel is occupied at all or if bounds are empty intervals.

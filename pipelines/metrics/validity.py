@@ -8,6 +8,7 @@ fidelity; real scenes give the level to compare with, it is not 0.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +101,9 @@ def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle:
     return np.array([[bool(value), value is not None] for value in right], np.float64)
 
 
-def compute_validity_rates(records: np.ndarray, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
+def compute_validity_rates(
+    records: np.ndarray | Sequence[Any], names: Sequence[str] = MEASURES
+) -> dict[str, float | None]:
     """Compute the share per measure over all scenes, from records (scenes, measures, 2); None if nothing was judged."""
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T

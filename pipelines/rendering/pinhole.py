@@ -8,6 +8,7 @@ numbers (u to the right, v down).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -50,7 +51,9 @@ class StreetCamera:
     camera_from_scene: np.ndarray  # (3, 3) rotation
 
     @staticmethod
-    def at(position_m: np.ndarray, yaw_rad: float, pitch_rad: float = 0.0, lens: Lens | None = None) -> StreetCamera:
+    def at(
+        position_m: np.ndarray | Sequence[float], yaw_rad: float, pitch_rad: float = 0.0, lens: Lens | None = None
+    ) -> StreetCamera:
         """Make a level camera, turned left by yaw from the scene's x axis, then up by pitch."""
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         level_from_scene = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Chart:
     """
 
     title: str
-    series: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    series: Mapping[str, tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]]
     x_label: str = ""
     y_label: str = ""
     log_y: bool = False
@@ -93,14 +94,16 @@ class _Axis:
     end_px: float
     log: bool = False
 
-    def __call__(self, value: np.ndarray | float) -> np.ndarray:
+    def __call__(self, value: np.ndarray | float) -> Any:
         scale = np.log10 if self.log else np.asarray
         value, low, high = scale(value), scale(self.low), scale(self.high)
         share = (value - low) / (high - low) if high > low else np.full_like(value, 0.5)
         return self.start_px + share * (self.end_px - self.start_px)
 
 
-def _find_drawable(x: Sequence[float], y: Sequence[float], log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+def _find_drawable(
+    x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray, log_y: bool
+) -> tuple[np.ndarray, np.ndarray]:
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     if xs.shape != ys.shape:
         raise ValueError(f"a series has {xs.size} x values and {ys.size} y values")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,9 @@ def compute_density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> Dens
     return DensityThresholds(*np.percentile(count, [25, 75]), *np.percentile(volume_m3, [25, 75]))
 
 
-def classify_density(count: np.ndarray, volume_m3: np.ndarray, thresholds: DensityThresholds) -> np.ndarray:
+def classify_density(
+    count: np.ndarray | Sequence[float], volume_m3: np.ndarray | Sequence[float], thresholds: DensityThresholds
+) -> np.ndarray:
     """(n,) str: low if count and volume lie below their p25, high if both lie above their p75, else medium."""
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)

@@ -32,7 +32,7 @@ class SceneSubset:
     source: str | None = None
     split: str | None = None
     limit: int | None = None
-    pick: Pick = "spread"
+    pick: Pick | str = "spread"
     apart_m: float = 0.0
 
     def __post_init__(self) -> None:

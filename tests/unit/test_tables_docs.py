@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import ROOT, random_scene
 
+from models.layout import LayoutSpec
 from models.scene import CATEGORIES, UNSET, VEGETATION, VEHICLES, Scene, make_yaw_rotation
 from pipelines.editing.edit import Remove, Select
 from pipelines.generation.batch_edit import EditRequest, edit_shard
@@ -432,7 +433,7 @@ def test_label_scenes_keeps_column_descriptions(root, tmp_path):
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
     thresholds = compute_density_thresholds(np.arange(4), np.arange(4.0))
     final = str(tmp_path / "final.parquet")
-    storage.write_parquet(label_scenes(staged, Statistics(thresholds, thresholds, None)), final)
+    storage.write_parquet(label_scenes(staged, Statistics(thresholds, thresholds, LayoutSpec())), final)
     assert_explained(final, SCENES)
 
 

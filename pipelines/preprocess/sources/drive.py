@@ -6,8 +6,10 @@ numpy only: the town is usable without ray or pyarrow.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -25,11 +27,11 @@ class Pose:
     xyz_m: np.ndarray  # (3,) float64
     yaw_rad: float
 
-    def to_ego(self, points_m: np.ndarray) -> np.ndarray:
+    def to_ego(self, points_m: np.ndarray | Sequence[Any]) -> np.ndarray:
         """World points (..., 3) in the ego frame. Subtracts in float64 before anything else."""
         return (np.asarray(points_m, np.float64) - self.xyz_m) @ make_yaw_rotation(self.yaw_rad)
 
-    def to_world(self, points_m: np.ndarray) -> np.ndarray:
+    def to_world(self, points_m: np.ndarray | Sequence[Any]) -> np.ndarray:
         return np.asarray(points_m, np.float64) @ make_yaw_rotation(self.yaw_rad).T + self.xyz_m
 
 
