@@ -1,7 +1,7 @@
 # Each target sets up what it needs in .venv; a second call does no set-up work.
 #
 #   make demo        train, sample and report with the demo preset
-#   make lint        ruff: rules and format
+#   make lint        ruff (rules and format) and pyright
 #   make test-fast   tests/unit: no Ray, no browser, about a minute
 #   make test        all tests but slow ones
 #   make test-slow   long checks, marked slow
@@ -29,6 +29,7 @@ demo: .venv/ready
 lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/pyright
 
 $(TESTS): export RAY_DATA_USE_DATASOURCE_V2 = 0
 $(TESTS): export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from models.dit import DiT
     from models.lvae import LayoutVAE
     from models.pipeline import PrITTIPipeline
+    from models.sampling.repaint import RePaintConfig
     from models.scene import Scene
 
 try:
@@ -22,12 +23,13 @@ try:
 except PackageNotFoundError:  # a checkout that is not installed
     __version__ = "unknown"
 
-__all__ = ["DiT", "LayoutVAE", "PrITTIPipeline", "Scene", "__version__"]
+__all__ = ["DiT", "LayoutVAE", "PrITTIPipeline", "RePaintConfig", "Scene", "__version__"]
 
 MODULES = {
     "DiT": "models.dit",
     "LayoutVAE": "models.lvae",
     "PrITTIPipeline": "models.pipeline",
+    "RePaintConfig": "models.sampling.repaint",
     "Scene": "models.scene",
 }
 

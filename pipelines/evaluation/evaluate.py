@@ -15,8 +15,9 @@ import ray
 
 from models.scene import CATEGORIES
 from pipelines.metrics import distributions, statistics, validity
-from pipelines.metrics.adm_npz import ReferenceMoments, StoredGaussian
+from pipelines.metrics.adm_npz import ReferenceMoments
 from pipelines.metrics.frechet import (
+    StoredGaussian,
     compute_frechet_distance,
     compute_frechet_influence,
     compute_influence_maps,

@@ -18,17 +18,11 @@ from typing import NamedTuple, cast
 import numpy as np
 import pyarrow as pa
 
+from pipelines.metrics.frechet import StoredGaussian
 from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
 from pipelines.runtime.storage import resolve_uri, write_whole
 
 PICTURES = "arr_0"
-
-
-class StoredGaussian(NamedTuple):
-    """Mean and covariance of a set of features, for `frechet.compute_frechet_distance`."""
-
-    mean: np.ndarray  # (d,) float64
-    covariance: np.ndarray  # (d, d) float64
 
 
 class ReferenceMoments(NamedTuple):

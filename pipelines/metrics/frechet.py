@@ -8,7 +8,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass
 from functools import reduce
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,15 +30,11 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
     return features
 
 
-@runtime_checkable
-class Gaussian(Protocol):
-    """Mean (d,) and covariance (d, d) of features: Moments, or stored ones (adm_npz.py)."""
+class StoredGaussian(NamedTuple):
+    """Mean and covariance of a set of features, for `frechet.compute_frechet_distance`."""
 
-    @property
-    def mean(self) -> np.ndarray: ...
-
-    @property
-    def covariance(self) -> np.ndarray: ...
+    mean: np.ndarray  # (d,) float64
+    covariance: np.ndarray  # (d, d) float64
 
 
 @dataclass(frozen=True)
@@ -64,6 +60,9 @@ class Moments:
         mean = self.mean + step * (other.count / count)
         between = np.outer(step, step) * (self.count * other.count / count)
         return Moments(count, mean, self.scatter + other.scatter + between)
+
+
+Gaussian = Moments | StoredGaussian  # mean (d,) and covariance (d, d) of features
 
 
 def compute_moments(features: np.ndarray) -> Moments:

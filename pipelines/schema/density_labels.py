@@ -28,7 +28,9 @@ def compute_density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> Dens
 
 
 def classify_density(
-    count: np.ndarray | Sequence[float], volume_m3: np.ndarray | Sequence[float], thresholds: DensityThresholds
+    count: np.ndarray | Sequence[float] | float,
+    volume_m3: np.ndarray | Sequence[float] | float,
+    thresholds: DensityThresholds,
 ) -> np.ndarray:
     """(n,) str: low if count and volume lie below their p25, high if both lie above their p75, else medium."""
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)

@@ -33,7 +33,7 @@ def option_types(job: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test_earlier_option_names_are_free_and_present_ones_exist(job):
+def test_renames_name_existing_options(job):
     options = set(option_types(job))
     assert not options & (set(OPTIONS) - set(JOB_OPTIONS.get(job, {})))
     for old, new in JOB_OPTIONS.get(job, {}).items():
@@ -43,7 +43,7 @@ def test_earlier_option_names_are_free_and_present_ones_exist(job):
 
 
 @pytest.mark.parametrize(("job", "option"), VALUES, ids=lambda word: word)
-def test_present_option_values_are_choices(job, option):
+def test_renames_name_existing_values(job, option):
     choices = option_types(job)[option]
     literals = [choices] if get_origin(choices) is Literal else get_args(choices)
     values = {value for literal in literals for value in get_args(literal)}
@@ -64,11 +64,11 @@ def test_present_option_values_are_choices(job, option):
         ("export_scenes", ["--limit", "20"], "--limit is now --max-scenes"),
     ],
 )
-def test_an_earlier_name_or_value_is_reported_with_the_present_one(job, words, message):
+def test_find_renamed_names_present_option_or_value(job, words, message):
     assert find_renamed(job, words) == message
 
 
-def test_an_earlier_name_ends_with_exit_code_2():
+def test_job_exits_with_code_2_for_renamed_option():
     done = run_python("jobs/sample_scenes.py", "--guidance", "4")
     assert (done.returncode, done.stderr) == (2, "error: --guidance is now --guidance-scale\n")
 
@@ -82,7 +82,7 @@ def test_option_modules_import_nothing_heavy():
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test_every_option_has_a_help_line(job):
+def test_options_have_help_lines(job):
     tree = ast.parse((ROOT / "jobs" / f"{job}.py").read_text())
     for cls in [node for node in tree.body if isinstance(node, ast.ClassDef)]:
         for field, following in zip(cls.body, [*cls.body[1:], None], strict=True):
@@ -98,7 +98,7 @@ def test_pritti_lists_all_jobs_with_one_line_each():
     assert all(10 < len(summary) <= 90 and summary.endswith(".") for _, summary in lines)
 
 
-def test_pritti_runs_a_job_as_its_file_does():
+def test_pritti_runs_job_as_its_file_does():
     script, file = (
         run_python("-m", "pritti.cli", "sample-scenes", "--help"),
         run_python("jobs/sample_scenes.py", "--help"),
@@ -113,7 +113,7 @@ def test_pritti_suggests_jobs_with_similar_names():
     assert done.returncode == 2 and "error: unknown job 'sampel-scenes'; did you mean sample-scenes" in done.stderr
 
 
-def test_the_facade_is_lazy():
+def test_pritti_facade_is_lazy():
     code = "import sys, pritti; assert 'torch' not in sys.modules; from pritti import *; print(PrITTIPipeline, Scene)"
     assert "models.pipeline.PrITTIPipeline" in run_python("-c", code).stdout
     import pritti
@@ -142,14 +142,3 @@ def test_jobs_import_one_way():
             ours = {name for name in imported_modules(path) if name.split(".")[0] == "jobs"}
             assert all(name.startswith(support) for name in ours), path
             assert folder != "jobs" or not {n for n in imported_modules(path) if n.startswith(("models", "pipelines"))}
-
-
-def test_implementations_import_no_cycle():
-    files = {f"jobs.implementation.{path.stem}": path for path in (ROOT / "jobs/implementation").glob("*.py")}
-    graph = {
-        name: {other for other in files if any(f"{n}.".startswith(f"{other}.") for n in imported_modules(path))}
-        for name, path in files.items()
-    }
-    while leaves := {name for name, needed in graph.items() if not needed & set(graph)}:
-        graph = {name: needed for name, needed in graph.items() if name not in leaves}
-    assert not graph

@@ -6,14 +6,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from pipelines.metrics.adm_npz import (
-    StoredGaussian,
-    iterate_pictures,
-    read_picture_shape,
-    read_reference_moments,
-    write_npz,
-)
-from pipelines.metrics.frechet import compute_frechet_distance, compute_moments
+from pipelines.metrics.adm_npz import iterate_pictures, read_picture_shape, read_reference_moments, write_npz
+from pipelines.metrics.frechet import StoredGaussian, compute_frechet_distance, compute_moments
 
 
 def pictures(n=7, height=5, width=6) -> np.ndarray:

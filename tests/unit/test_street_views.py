@@ -11,7 +11,7 @@ from helpers import random_scene
 from lxml import etree
 from scipy.integrate import cumulative_trapezoid
 
-from models.scene import ELLIPSOID, Grid, Scene
+from models.scene import ELLIPSOID, UNSET, Grid, Scene
 from pipelines.geometry.centerlines import extract_road_network, plan_drive
 from pipelines.io.mesh_export import GROUND, triangulate_scene
 from pipelines.io.opendrive import export_opendrive, fit_reference_lines, list_lanes
@@ -94,7 +94,7 @@ def test_street_view_normals_face_camera_and_are_deterministic(town_scenes):
 def test_street_view_clips_at_near_plane():
     """A long box next to the camera, from behind it to far ahead: its side fills the left half of the picture."""
     scene = random_scene(0, 1, tilt_rad=0)
-    box = {"category": np.array([6], np.int8), "center_m": np.array([[0, 3, 0]], np.float32), "label": None}
+    box = {"category": np.array([6], np.int8), "center_m": np.array([[0, 3, 0]], np.float32), "label": UNSET}
     box |= {"size_m": np.array([[100, 2, 8]], np.float32), "rotation": np.eye(3, dtype=np.float32)[None]}
     scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m), **box)
     lens = Lens(100, 50, 50.0, 50.0, 49.5, 24.5)
