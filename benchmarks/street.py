@@ -64,7 +64,7 @@ def write(scene: Scene, cameras: list[StreetCamera]) -> None:
 
 def main() -> None:
     print(where())
-    request, chosen = StreetRequest("", "", 1.0, 1.55, 0.0, Lens().resized(704, 188), 0.25, FRAMES), []
+    request, chosen = StreetRequest("", "", 1.0, 1.55, 0.0, Lens().resize(704, 188), 0.25, FRAMES), []
     for seed in DENSE_SEEDS:
         scene = generate_town(seed).scene(20)
         cameras = place_cameras(plan_drive(extract_road_network(scene)), request)

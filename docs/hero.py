@@ -24,7 +24,7 @@ FRAMES = 3
 
 def street_views(scene: Scene) -> list[np.ndarray]:
     """Views along the road through a scene, evenly spread."""
-    lens = Lens().resized(WIDTH, FRAME)
+    lens = Lens().resize(WIDTH, FRAME)
     request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
     cameras = place_cameras(plan_drive(extract_road_network(scene)), request)
     renderer = StreetRenderer(scene)

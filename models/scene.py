@@ -76,7 +76,7 @@ class Grid:
         """(cols,) y of the pixel centres."""
         return self.left_m - (np.arange(self.cols) + 0.5) * self.resolution_m
 
-    def contains(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    def contains(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> Any:
         """True where a point lies inside the grid's rectangle (half-open: the far and left border belong)."""
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 

@@ -221,7 +221,7 @@ class Trainer:
             more = first + size < len(positions)
             no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # of DistributedDataParallel
             with no_sync() if more else nullcontext():
-                losses = self._losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
+                losses = self._compute_losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
                     raise NonFiniteLossError(self.steps_done, self._find_nonfinite_samples(arrays, positions))
                 (share * losses["loss"]).backward()
@@ -233,7 +233,7 @@ class Trainer:
         self.update_ema()
         return totals | {"grad_norm": norm}
 
-    def _losses(
+    def _compute_losses(
         self, network: Callable[..., Any], arrays: dict[str, Tensor], positions: list[int]
     ) -> dict[str, Tensor] | None:
         """The parts of the loss of `network`, or None if it is not finite. Each sample has its own noise."""
@@ -254,7 +254,8 @@ class Trainer:
         bad = [
             position
             for k, position in enumerate(positions)
-            if self._losses(self.model, {name: value[k : k + 1] for name, value in arrays.items()}, [position]) is None
+            if self._compute_losses(self.model, {name: value[k : k + 1] for name, value in arrays.items()}, [position])
+            is None
         ]
         return bad if len(bad) < len(positions) else []
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from pritti import __version__
 
 
-def job_files() -> dict[str, Path]:
+def list_job_files() -> dict[str, Path]:
     """Return the executables of the installed jobs package by command name, such as sample-scenes."""
     spec = find_spec("jobs")
     if spec is None or not spec.submodule_search_locations:
@@ -24,16 +24,16 @@ def job_files() -> dict[str, Path]:
     return {path.stem.replace("_", "-"): path for path in files}
 
 
-def summarize(path: Path) -> str:
+def summarize_job(path: Path) -> str:
     """Return the first line of a file's docstring."""
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n", 1)[0]
 
 
 def describe_usage() -> str:
     """Return the help text with one line per job."""
-    files = job_files()
+    files = list_job_files()
     width = max(map(len, files))
-    lines = [f"  {name:{width}}  {summarize(path)}" for name, path in files.items()]
+    lines = [f"  {name:{width}}  {summarize_job(path)}" for name, path in files.items()]
     return "\n".join(
         [
             "usage: pritti JOB [OPTIONS]",
@@ -57,7 +57,7 @@ def main() -> None:
     if name == "--version":
         print(f"pritti {__version__}")
         return
-    files = job_files()
+    files = list_job_files()
     path = files.get(name.replace("_", "-"))
     if path is None:
         near = difflib.get_close_matches(name.replace("_", "-"), files, n=3)

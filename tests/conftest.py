@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,16 +12,26 @@ os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included. Not so in
-# packages with local functions that Ray pickles: checked functions cannot be pickled by value.
-CHECKED = ("models", *(f"pipelines.{name}" for name in ("editing", "geometry", "io", "metrics", "rendering", "schema")))
-install_import_hook([*CHECKED, "pipelines.preprocess.sources", "pipelines.reporting"], "typechecker.check_types")
+
+def list_checked_modules() -> list[str]:
+    """Modules of models and pipelines without Ray, which pickles local functions by value; checked ones cannot be."""
+    paths = [path for package in ("models", "pipelines") for path in sorted((ROOT / package).rglob("[!_]*.py"))]
+    modules = [
+        path
+        for path in paths
+        if not re.search(r"^\s*(import|from) (ray|pipelines.*ray_tasks)\b", path.read_text(), re.M)
+    ]
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in modules]
+
+
+# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included.
+ROOT = Path(__file__).parents[1]
+install_import_hook(list_checked_modules(), "typechecker.check_types")
 
 import numpy as np
 import pytest
 from helpers import (
     REJECT_REASON,
-    ROOT,
     SHARD_SIZES,
     TOWN_SLOTS,
     free_port,
@@ -134,14 +145,14 @@ def smoke(tmp_path_factory, cluster) -> Path:
 
     import jobs.support.trainer
     from jobs.implementation.train_dit import train
-    from jobs.support.trainer import as_tensors
+    from jobs.support.trainer import convert_to_tensors
     from jobs.train_dit import Config
     from pipelines.training.data_loader import iterate_batches
 
     def fit_here(run, num_workers: int, output: str) -> str:
         trainer = run.build(torch.device("cpu"), lambda model: model)
         for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
-            trainer.step(as_tensors(batch), range(run.stream.batch_size))
+            trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))
         model = trainer.ema_model()
         jobs.support.trainer.tag_weights(run.tracker, model, trainer.steps_done)
         model.save_pretrained(output)
@@ -313,10 +324,12 @@ def studio_url(studio_files, cluster) -> Iterator[str]:
     """URL of a studio that Ray Serve serves."""
     from ray import serve as ray_serve
 
-    from jobs.implementation.serve_studio import serve
+    from jobs.implementation.serve_studio import serve_studio
     from jobs.serve_studio import Config
 
-    yield serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), num_threads=1))
+    yield serve_studio(
+        Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), num_threads=1)
+    )
     ray_serve.shutdown()
 
 

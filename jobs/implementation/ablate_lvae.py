@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.support.tracking import Tracker
@@ -51,7 +51,7 @@ RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in st
 
 def compare_encodings(config: Encoding) -> str:
     """Train missing trials, write the tables, figures and page, and return the directory."""
-    output = absolute(config.output) if config.output else home("ablations", "encoding")
+    output = make_absolute(config.output) if config.output else home_path("ablations", "encoding")
     settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
@@ -123,7 +123,7 @@ def write_encoding_report(
 
 def compare_variants(config: Branches) -> str:
     """Train and score missing variants, write the table, curves and page, and return the directory."""
-    output = absolute(config.output) if config.output else home("ablations", config.name)
+    output = make_absolute(config.output) if config.output else home_path("ablations", config.name)
     if config.minutes <= 0 or config.num_seeds < 1:
         raise ValueError(f"--minutes is {config.minutes}, --num-seeds {config.num_seeds}: expected more than 0")
     find_preset(LVAE_PRESETS, config.preset)
@@ -134,16 +134,16 @@ def compare_variants(config: Branches) -> str:
     scores = []
     for seed in range(config.num_seeds):
         for variant in chosen:
-            path = storage.join_uri(output, "runs", f"{slug(variant)}-seed{seed}.json")
+            path = storage.join_uri(output, "runs", f"{make_slug(variant)}-seed{seed}.json")
             if not storage.exists(path):
                 storage.write_json(train_variant(config, variant, seed, output), path)
             scores.append(storage.read_json(path))
-            kept = {f"{slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
+            kept = {f"{make_slug(variant)}.{name}": scores[-1][name] for name in ablation.MEASURES}
             tracker.metrics({name: value for name, value in kept.items() if value is not None}, seed)
     rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
     table = ablation.build_variant_table(rows)
     write_tables(output, config.name, rows, [table], curves)
-    equal = "equal time" if at_equal_time(config) and not config.steps else "equally many steps"
+    equal = "equal time" if is_at_equal_time(config) and not config.steps else "equally many steps"
     how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", describe_machine()]
     html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
     write_page(output, html, [table], tracker)
@@ -170,12 +170,12 @@ def select_variants(config: Branches) -> dict[str, Variant]:
     }
 
 
-def at_equal_time(config: Branches) -> bool:
+def is_at_equal_time(config: Branches) -> bool:
     """Return whether the variants of a study train for equal time, not for equally many steps."""
     return isinstance(config, Decoders | Ground)
 
 
-def slug(variant: str) -> str:
+def make_slug(variant: str) -> str:
     """Return a variant's name in a form that is valid in file names and MLflow metric names."""
     return re.sub(r"\W+", "-", variant.replace("'", ""))
 
@@ -203,11 +203,11 @@ def prepare_variant(config: Branches, variant: str, name: str, seed: int, steps:
 
 def train_variant(config: Branches, variant: str, seed: int, output: str) -> dict:
     """Train one variant with one seed, reconstruct the held-out scenes, and return its scores."""
-    timed = variant if at_equal_time(config) else next(iter(select_variants(replace(config, only_variants=()))))
+    timed = variant if is_at_equal_time(config) else next(iter(select_variants(replace(config, only_variants=()))))
     steps = config.steps or measure_steps(config, timed, output)
-    name = f"{config.name}-{slug(variant)}-seed{seed}"
+    name = f"{config.name}-{make_slug(variant)}-seed{seed}"
     training, started = prepare_variant(config, variant, name, seed, steps), time.perf_counter()
-    model = fit(training, config.num_workers, storage.join_uri(output, "models", f"{slug(variant)}-seed{seed}"))
+    model = fit(training, config.num_workers, storage.join_uri(output, "models", f"{make_slug(variant)}-seed{seed}"))
     seconds = time.perf_counter() - started
     root = training.identity["dataset"]
     source = training.stream.shards[0].source
@@ -229,9 +229,9 @@ def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
 
 def measure_steps(config: Branches, variant: str, output: str) -> int:
     """Return the steps of a variant in --minutes, measured once and then read from timing-<variant>.json."""
-    record = storage.join_uri(output, f"timing-{slug(variant)}.json")
+    record = storage.join_uri(output, f"timing-{make_slug(variant)}.json")
     if not storage.exists(record):
-        name = f"timing-{slug(variant)}"
+        name = f"timing-{make_slug(variant)}"
         training = prepare_variant(config, variant, f"{config.name}-{name}", 0, TIMING_STEPS)
         training = replace(training, validate=None, log_every=1)
         fit(training, config.num_workers, storage.join_uri(output, "models", name))

@@ -14,8 +14,8 @@ from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
 from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
-from jobs.support.cli import absolute, home, require_positive
-from jobs.support.model_directories import pipeline_directory, require_model_labels
+from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.model_directories import find_pipeline_directory, require_model_labels
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
@@ -23,14 +23,14 @@ from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 
 
-def training_dataset_root(config: LVAEConfig | DiTConfig, source: str) -> str:
+def find_training_dataset(config: LVAEConfig | DiTConfig, source: str) -> str:
     """Return --dataset, or the directory of the preset's dataset."""
     if config.dataset:
-        return absolute(config.dataset)
-    return home("datasets", "smoke" if config.preset == "smoke" else source)
+        return make_absolute(config.dataset)
+    return home_path("datasets", "smoke" if config.preset == "smoke" else source)
 
 
-def makes_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
+def needs_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
     """Return whether a training run generates its own missing inputs."""
     return config.preset == "smoke" and not config.dataset
 
@@ -38,16 +38,16 @@ def makes_smoke_inputs(config: LVAEConfig | DiTConfig) -> bool:
 def check_train_lvae(config: LVAEConfig) -> None:
     row = find_preset(LVAE_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
-    if not makes_smoke_inputs(config):
-        Dataset.open(training_dataset_root(config, row.source))
+    if not needs_smoke_inputs(config):
+        Dataset.open(find_training_dataset(config, row.source))
 
 
 def check_train_dit(config: DiTConfig) -> None:
     row = find_preset(DIT_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
-    if not makes_smoke_inputs(config):
-        root = Dataset.open(training_dataset_root(config, LVAE_PRESETS[row.lvae].source)).root
-        require_latents(absolute(config.latents) if config.latents else root, root)
+    if not needs_smoke_inputs(config):
+        root = Dataset.open(find_training_dataset(config, LVAE_PRESETS[row.lvae].source)).root
+        require_latents(make_absolute(config.latents) if config.latents else root, root)
 
 
 def require_latents(latents_root: str, dataset_root: str) -> None:
@@ -68,21 +68,21 @@ def require_latents(latents_root: str, dataset_root: str) -> None:
 
 
 def check_encode_latents(config: EncodeConfig) -> None:
-    Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
+    Dataset.open(make_absolute(config.dataset) if config.dataset else home_path("datasets", "town"))
 
 
 def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
-    if not isinstance(config, Town) and "://" not in config.input and not os.path.isdir(absolute(config.input)):
+    if not isinstance(config, Town) and "://" not in config.input and not os.path.isdir(make_absolute(config.input)):
         raise ValueError(f"--input {config.input}: no such directory; give the dataset's root")
 
 
 def check_sample_scenes(config: SampleConfig) -> None:
     require_positive(config, "num_scenes", "num_inference_steps", "num_actors", "batch_size")
-    require_model_labels(pipeline_directory(config.model), config.labels)
+    require_model_labels(find_pipeline_directory(config.model), config.labels)
 
 
 def check_publish_model(config: PublishConfig) -> None:
-    pipeline_directory(config.model)
+    find_pipeline_directory(config.model)
 
 
 def check_inpaint_scenes(config: InpaintConfig) -> None:
@@ -93,12 +93,12 @@ def check_inpaint_scenes(config: InpaintConfig) -> None:
         raise ValueError(f"--num-examples is {config.num_examples}, expected 0 or more")
     if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
         raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of at least three corners")
-    require_model_labels(pipeline_directory(config.model), [config.label] if config.label else [])
+    require_model_labels(find_pipeline_directory(config.model), [config.label] if config.label else [])
 
 
 def check_outpaint_scenes(config: OutpaintConfig) -> None:
     require_positive(config, "num_actors", "batch_size")
-    require_model_labels(pipeline_directory(config.model), [config.label] if config.label else [])
+    require_model_labels(find_pipeline_directory(config.model), [config.label] if config.label else [])
 
 
 def check_evaluate_scenes(config: EvaluateConfig) -> None:
@@ -107,7 +107,7 @@ def check_evaluate_scenes(config: EvaluateConfig) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected {least} or more")
     if config.max_reconstructed_scenes is not None and not config.lvae:
         raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
-    if config.inception and not storage.exists(absolute(config.inception)):
+    if config.inception and not storage.exists(make_absolute(config.inception)):
         raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
-    if config.lvae and not storage.exists(storage.join_uri(absolute(config.lvae), "config.json")):
+    if config.lvae and not storage.exists(storage.join_uri(make_absolute(config.lvae), "config.json")):
         raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from itertools import islice
 
 from jobs.run_demo import Config
-from jobs.support.cli import home
-from jobs.support.tracking import Tracker, client, tracking_uri
+from jobs.support.cli import home_path
+from jobs.support.tracking import Tracker, find_tracking_uri, make_client
 from models.scene import Scene
 from pipelines.preprocess.sources.town.reference_statistics import measure_town
 from pipelines.rendering.render import render_3d, render_bev
@@ -29,7 +29,7 @@ MEANINGS = {
 }
 
 
-def scene_picture_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, Picture]:
+def draw_scene_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, Picture]:
     """Return a scene in 3D and from above."""
     return (
         Picture(caption, render_3d(scene, 640, 480), tag),
@@ -37,15 +37,15 @@ def scene_picture_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, P
     )
 
 
-def scene_pictures(title: str, note: str, scenes: list[Scene], tag: str) -> Pictures:
+def draw_scene_pictures(title: str, note: str, scenes: list[Scene], tag: str) -> Pictures:
     """Return two rows of pictures: scenes in 3D, and from above."""
-    pairs = [scene_picture_pair(s, f"{s.vegetation_density} vegetation · {len(s)} objects", tag) for s in scenes]
+    pairs = [draw_scene_pair(s, f"{s.vegetation_density} vegetation · {len(s)} objects", tag) for s in scenes]
     return Pictures(
         title, [first for first, _ in pairs] + [second for _, second in pairs], columns=len(pairs), note=note
     )
 
 
-def one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
+def select_one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
     """Return `count` scenes with low, medium and high vegetation in turn, as far as there are enough."""
     groups = {name: iter([s for s in scenes if s.vegetation_density == name]) for name in ("low", "medium", "high")}
     chosen: list[Scene] = []
@@ -61,12 +61,12 @@ def one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
 
 def read_curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float], list[float]]]:
     """Return metric histories of an experiment's last run: label -> (steps, values)."""
-    api = client(tracking_uri())
+    api = make_client(find_tracking_uri())
     found = api.get_experiment_by_name(experiment)
     if found is None:
         raise ValueError(f"MLflow has no experiment {experiment!r}; run the demo again")
     run_id = api.search_runs([found.experiment_id], max_results=1)[0].info.run_id
-    tracker = Tracker(tracking_uri(), run_id)
+    tracker = Tracker(find_tracking_uri(), run_id)
     histories = {label: tracker.history(name) for name, label in names.items()}
     return {label: ([x for x, _ in points], [y for _, y in points]) for label, points in histories.items() if points}
 
@@ -80,20 +80,20 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
         scores: Nested scores of the evaluation.
         seconds: Duration of each stage.
     """
-    data = home("datasets", "town")
+    data = home_path("datasets", "town")
     real = list(read_scenes(data, "town", "test"))
-    generated = list(read_scenes(home("generated"), "generated-samples"))
+    generated = list(read_scenes(home_path("generated"), "generated-samples"))
     sections: list[Section] = [
-        *introduction_sections(config, scores["reconstruction"], len(real), len(generated), sum(seconds.values())),
-        *scene_sections(config, real, generated),
-        training_charts(),
+        *make_introduction_sections(config, scores["reconstruction"], len(real), len(generated), sum(seconds.values())),
+        *make_scene_sections(config, real, generated),
+        draw_training_charts(),
         *score_sections(scores, data),
-        *closing_sections(config, seconds),
+        *make_closing_sections(config, seconds),
     ]
     write_report(path, "PrITTI on Ray: the demo", sections, "Primitive-based generation of 3D semantic urban scenes")
 
 
-def introduction_sections(
+def make_introduction_sections(
     config: Config, reconstruction: dict, num_real: int, num_generated: int, total_seconds: float
 ) -> list[Section]:
     """What the page shows, and its key figures."""
@@ -125,37 +125,37 @@ def introduction_sections(
     ]
 
 
-def scene_sections(config: Config, real: list[Scene], generated: list[Scene]) -> list[Section]:
+def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene]) -> list[Section]:
     """Pictures of released, real, generated and outpainted scenes."""
     released = []
     if config.num_released_scenes:
         released = [
-            scene_pictures(
+            draw_scene_pictures(
                 "Scenes of the released model",
                 "The weights come with the package and were trained for longer than a demo (models/weights/town).",
-                one_per_label(list(read_scenes(home("released"), "generated-samples")), SHOWN),
+                select_one_per_label(list(read_scenes(home_path("released"), "generated-samples")), SHOWN),
                 "generated",
             )
         ]
     return [
         *released,
-        scene_pictures(
+        draw_scene_pictures(
             "Real scenes",
             "Held-out scenes of the town, 64 x 64 m, in 3D and from above. The car is at the bottom edge, facing up.",
-            one_per_label(real, SHOWN),
+            select_one_per_label(real, SHOWN),
             "real",
         ),
-        scene_pictures(
+        draw_scene_pictures(
             "Generated scenes",
             "Sampled by the diffusion transformer of this demo, for the vegetation label above each picture.",
-            one_per_label(generated, SHOWN),
+            select_one_per_label(generated, SHOWN),
             "generated",
         ),
-        outpainting_pictures(next(read_scenes(home("outpainted"), "generated-outpainted"))),
+        draw_outpainting_pictures(next(read_scenes(home_path("outpainted"), "generated-outpainted"))),
     ]
 
 
-def outpainting_pictures(scene: Scene) -> Pictures:
+def draw_outpainting_pictures(scene: Scene) -> Pictures:
     """One outpainted scene from the side and from above."""
     return Pictures(
         "An outpainted scene",
@@ -173,7 +173,7 @@ def outpainting_pictures(scene: Scene) -> Pictures:
     )
 
 
-def training_charts() -> Charts:
+def draw_training_charts() -> Charts:
     """Loss and validation curves of both stages."""
     losses = {"loss": "training", "validation_loss": "held out"}
     return Charts(
@@ -219,7 +219,7 @@ def score_sections(scores: dict, data: str) -> list[Section]:
     ]
 
 
-def closing_sections(config: Config, seconds: dict[str, float]) -> list[Section]:
+def make_closing_sections(config: Config, seconds: dict[str, float]) -> list[Section]:
     """Duration of the stages, and the options of the run."""
     return [
         Table(

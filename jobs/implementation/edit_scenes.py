@@ -16,7 +16,7 @@ from jobs.edit_scenes import (
     Snap,
     Translate,
 )
-from jobs.support.cli import absolute
+from jobs.support.cli import make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
@@ -35,7 +35,7 @@ def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
     if isinstance(config, Replay):
         if not config.edits:
             raise ValueError("replay needs a file: give the JSON file with the list of edits")
-        content = storage.read_json(absolute(config.edits))
+        content = storage.read_json(make_absolute(config.edits))
         content = content.get("edits") if isinstance(content, dict) else content
         try:
             return edit.parse_edits(content)

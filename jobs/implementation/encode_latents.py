@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.encode_latents import Config
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from pipelines.schema.dataset import Dataset
 from pipelines.training.latents import encode_latents
@@ -13,9 +13,9 @@ from pipelines.training.latents import encode_latents
 
 def encode(config: Config) -> dict:
     """Encode the scenes of a dataset and return the content of latents.json."""
-    dataset = Dataset.open(absolute(config.dataset) if config.dataset else home("datasets", "town"))
-    lvae = absolute(config.lvae) if config.lvae else home("models", "lvae-town")
-    output = absolute(config.output) if config.output else dataset.root
+    dataset = Dataset.open(make_absolute(config.dataset) if config.dataset else home_path("datasets", "town"))
+    lvae = make_absolute(config.lvae) if config.lvae else home_path("models", "lvae-town")
+    output = make_absolute(config.output) if config.output else dataset.root
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("encode latents", total=sum(dataset.scenes.values()))

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
@@ -33,10 +33,10 @@ def evaluate(config: Config) -> dict:
     check_evaluate_scenes(config)
     dataset: Dataset | None = None
     if config.lvae or not config.real.endswith(".npz"):
-        dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
+        dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
     named = config.run or config.generated_source or not config.lvae
-    wanted = config.generated or (home("generated") if named else "")
-    output = absolute(config.output) if config.output else home("evaluations", config.run or "latest")
+    wanted = config.generated or (home_path("generated") if named else "")
+    output = make_absolute(config.output) if config.output else home_path("evaluations", config.run or "latest")
     scores: dict = {}
     sides = select_sides(config, dataset) if wanted else {}
     start_ray()
@@ -47,10 +47,10 @@ def evaluate(config: Config) -> dict:
             scores["generation"] = evaluate_generation(config, dataset, sides, output, bar)
     storage.write_json(describe_inputs(config, dataset, sides), storage.join_uri(output, "evaluation.json"))
     tags = {
-        "real": config.real or home("datasets", "town"),
+        "real": config.real or home_path("datasets", "town"),
         "split": config.real_split,
         "generated": wanted,
-        "lvae": config.lvae and absolute(config.lvae),
+        "lvae": config.lvae and make_absolute(config.lvae),
     }
     pages = {"reconstruction": "reconstruction.html", "generation": "evaluation.html"}
     return publish_scores(output, scores, tags, [pages[name] for name in scores])
@@ -59,7 +59,7 @@ def evaluate(config: Config) -> dict:
 def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, SceneSet]) -> dict:
     """Return what was evaluated: sides, sampling options if one run generated all scenes, weights of the LVAE."""
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
-    about["lvae_weights"] = digest_weights(load_lvae(absolute(config.lvae))) if config.lvae else None
+    about["lvae_weights"] = digest_weights(load_lvae(make_absolute(config.lvae))) if config.lvae else None
     made = sides.get("generated")
     about["generated"] = made and made.root
     sources = {shard.source for shard, _ in made.shards()} if isinstance(made, SceneSubset) else ()
@@ -74,7 +74,7 @@ def evaluate_generation(
     config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
 ) -> dict:
     """Score generated scenes; write evaluation.html, and the features of each scene to described/."""
-    looks = FeatureConfig(config.supersample, config.inception and absolute(config.inception))
+    looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))
     described = {}
     for name, side in sides.items():
         task, directory = (
@@ -107,10 +107,10 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
         ValueError: The pictures of the sides differ in size.
     """
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
-    generated = absolute(config.generated) if config.generated else home("generated")
+    generated = make_absolute(config.generated) if config.generated else home_path("generated")
     labels: Pick = "balanced" if config.balance_labels else "spread"
     sides, counts, sizes = {}, {}, {}
-    for name, path in (("real", absolute(config.real) if config.real else ""), ("generated", generated)):
+    for name, path in (("real", make_absolute(config.real) if config.real else ""), ("generated", generated)):
         if path.endswith(".npz"):
             count, *sizes[name], _ = read_picture_shape(path)
             counts[name], sides[name] = min(count, config.max_scenes), ImageFile(path, count)
@@ -159,7 +159,7 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
 def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Score reconstructions; write reconstruction.parquet and reconstruction.html with the best and worst scenes."""
     real = SceneSubset(dataset.root, dataset.source, config.lvae_split, config.max_reconstructed_scenes)
-    lvae = absolute(config.lvae)
+    lvae = make_absolute(config.lvae)
     shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))
     rebuilt = evaluate_reconstruction(
         real,

@@ -7,7 +7,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_seams import Config
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.evaluate import convert_estimates
@@ -28,18 +28,21 @@ SHOWN = 6
 
 def evaluate_seams(config: Config) -> dict:
     """Measure seams, write all files, and return the ratios of both sides."""
-    output = absolute(config.output) if config.output else home("evaluations", "seams")
+    output = make_absolute(config.output) if config.output else home_path("evaluations", "seams")
     source = f"generated-{config.run}" if config.run else None
     sides = {
         "generated": (
             SceneSubset(
-                absolute(config.generated) if config.generated else home("outpainted"), source, None, config.max_scenes
+                make_absolute(config.generated) if config.generated else home_path("outpainted"),
+                source,
+                None,
+                config.max_scenes,
             ),
             SeamLines(config.rows_m, config.cols_m),
         ),
         "real": (
             SceneSubset(
-                absolute(config.real) if config.real else home("datasets", "town"),
+                make_absolute(config.real) if config.real else home_path("datasets", "town"),
                 None,
                 config.real_split,
                 config.max_scenes,

@@ -7,7 +7,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_voxels import Config
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.voxel_reconstruction import group_files_by_scene, list_true_scenes, pair_files, score_voxels
@@ -23,18 +23,22 @@ def evaluate(config: Config) -> dict:
     for words in (axes, truth_axes):
         compute_scene_from_axes(words)
     grid = VoxelGrid(bottom_m=config.voxel_range_m[0], top_m=config.voxel_range_m[1])
-    truth = list_true_scenes(absolute(config.ground_truth), config.split)
-    rebuilt = group_files_by_scene(absolute(config.reconstructed), ".npz")
-    stored = group_files_by_scene(absolute(config.compressed)) if config.compressed else None
+    truth = list_true_scenes(make_absolute(config.ground_truth), config.split)
+    rebuilt = group_files_by_scene(make_absolute(config.reconstructed), ".npz")
+    stored = group_files_by_scene(make_absolute(config.compressed)) if config.compressed else None
     pairs = pair_files(truth, rebuilt, stored, config.allow_missing)
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("score voxels", total=len(pairs))
         scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
     scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
-    output = absolute(config.output) if config.output else home("evaluations", "voxels")
+    output = make_absolute(config.output) if config.output else home_path("evaluations", "voxels")
     storage.write_parquet(scenes, storage.join_uri(output, "voxels.parquet"))
-    tags = {"truth": absolute(config.ground_truth), "split": config.split, "rebuilt": absolute(config.reconstructed)}
+    tags = {
+        "truth": make_absolute(config.ground_truth),
+        "split": config.split,
+        "rebuilt": make_absolute(config.reconstructed),
+    }
     return publish_scores(output, scores, tags)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.export_scenes import Config
-from jobs.support.cli import absolute
+from jobs.support.cli import make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from pipelines.io.export import export_scenes
@@ -21,7 +21,7 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     if not config.formats:
         raise ValueError("--formats is empty, expected some of glb, ply, npz, xodr")
     selection = select_scenes(config)
-    output = absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
+    output = make_absolute(config.output) if config.output else storage.join_uri(selection.root, "export")
     total = sum(len(rows) for _, rows in selection.shards())
     start_ray()
     with Progress() as bar:

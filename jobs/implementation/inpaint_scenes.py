@@ -6,9 +6,9 @@ from rich.progress import Progress
 
 from jobs.implementation.checks import check_inpaint_scenes
 from jobs.inpaint_scenes import Config
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
-from jobs.support.scene_requests import repaint_settings, select_scenes
+from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_scenes
 
 
@@ -18,7 +18,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())
     request = InpaintRequest(
-        model=pipeline_directory(config.model),
+        model=find_pipeline_directory(config.model),
         output=config.output_directory(),
         run=config.run,
         where=RegionConfig(
@@ -28,7 +28,7 @@ def inpaint(config: Config) -> dict[str, float | None]:
         variants=config.num_variants,
         label=config.label or None,
         seed=config.seed,
-        repaint=repaint_settings(config),
+        repaint=make_repaint_config(config),
         guidance_scale=config.guidance_scale,
     )
     start_ray()

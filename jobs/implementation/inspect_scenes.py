@@ -6,7 +6,7 @@ import numpy as np
 from rich.progress import Progress
 
 from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
-from jobs.support.cli import absolute, home, require_positive
+from jobs.support.cli import home_path, make_absolute, require_positive
 from jobs.support.ray_session import start_ray
 from jobs.support.value_names import SHEET_PICKS
 from pipelines.io.mesh_export import export_glb
@@ -26,22 +26,22 @@ from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
 
 
-def dataset_directory(config: DatasetOptions) -> str:
+def find_dataset_directory(config: DatasetOptions) -> str:
     """Return --dataset or its default."""
-    return absolute(config.dataset) if config.dataset else home("datasets", "town")
+    return make_absolute(config.dataset) if config.dataset else home_path("datasets", "town")
 
 
-def output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> str:
+def make_output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> str:
     """Return --output, or a path under $PRITTI_HOME named after the dataset."""
     if config.output:
-        return absolute(config.output)
-    return home("inspect", dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")
+        return make_absolute(config.output)
+    return home_path("inspect", find_dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")
 
 
 def draw_scenes(config: OneScene) -> list[str]:
     """Write PNG and GLB files and return their paths."""
     require_positive(config, "max_scenes")
-    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
     chosen = catalogue.find(config.ids) if config.ids else catalogue.draw(config.max_scenes, config.seed)
     written = []
     with Progress() as bar:
@@ -52,7 +52,7 @@ def draw_scenes(config: OneScene) -> list[str]:
                     {"glb": export_glb(scene)} if config.glb else {}
                 )
                 for kind, content in files.items():
-                    written.append(storage.join_uri(output_path(config, ""), f"{scene.scene_id}.{kind}"))
+                    written.append(storage.join_uri(make_output_path(config, ""), f"{scene.scene_id}.{kind}"))
                     storage.write_whole(written[-1], lambda stream, content=content: stream.write(content))
                 bar.advance(shown)
     return written
@@ -69,12 +69,12 @@ def draw_pictures(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> lis
 def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
     require_positive(config, "max_scenes", "size_px")
-    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
     chosen = catalogue.choose(config.max_scenes, config.sort, SHEET_PICKS[config.pick], config.seed)
     pictures = [picture for (picture,) in draw_pictures(catalogue, chosen, (View(config.view, config.size_px),))]
     title = make_sheet_title(catalogue, len(chosen), config.sort, SHEET_PICKS[config.pick])
     sheet = draw_scene_sheet(pictures, make_captions(catalogue, chosen, config.sort), title, config.num_columns or None)
-    path = output_path(config, "sheet.png")
+    path = make_output_path(config, "sheet.png")
     storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
     return path
 
@@ -84,7 +84,7 @@ def write_dataset_report(config: Report) -> str:
     with Progress() as bar:
         shown = bar.add_task("read tables", total=None)
         facts = read_facts(
-            dataset_directory(config),
+            find_dataset_directory(config),
             config.source or None,
             config.split or None,
             lambda done, total: bar.update(shown, completed=done, total=total),
@@ -99,7 +99,7 @@ def write_dataset_report(config: Report) -> str:
         ):
             scenes.append((Picture(name, oblique), Picture(remark, above)))
     html = render_dataset_html(facts, scenes)
-    path = output_path(config, "report.html")
+    path = make_output_path(config, "report.html")
     storage.write_text(html, path)
     return path
 
@@ -107,13 +107,13 @@ def write_dataset_report(config: Report) -> str:
 def write_gallery(config: Gallery) -> str:
     """Write the page and return its path."""
     require_positive(config, "max_scenes")
-    catalogue = Catalogue.read(dataset_directory(config), config.source or None, config.split or None)
+    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
     chosen = catalogue.choose(config.max_scenes, "drive")
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("pack scenes", total=len(chosen))
         html = render_gallery_html(catalogue, chosen, config.title, lambda: bar.advance(shown))
-    path = output_path(config, "gallery.html")
+    path = make_output_path(config, "gallery.html")
     storage.write_text(html, path)
     return path
 

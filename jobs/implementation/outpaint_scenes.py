@@ -9,9 +9,9 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from jobs.implementation.checks import check_outpaint_scenes
 from jobs.outpaint_scenes import Config
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
-from jobs.support.scene_requests import repaint_settings, select_scenes
+from jobs.support.scene_requests import make_repaint_config, select_scenes
 from pipelines.generation.outpaint import HARDLY_KNOWN, OutpaintRequest, outpaint_scenes
 
 BLOCK_M = 64.0  # size of the scenes in every dataset (paper, Sec. 3.1)
@@ -48,14 +48,14 @@ def outpaint(config: Config) -> pa.Table:
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
     request = OutpaintRequest(
-        model=pipeline_directory(config.model),
+        model=find_pipeline_directory(config.model),
         output=config.output_directory(),
         run=config.run,
         label=config.label or None,
         seed=config.seed,
         overlap=config.overlap,
         mode=config.neighbour_latents,
-        repaint=repaint_settings(config),
+        repaint=make_repaint_config(config),
         guidance_scale=config.guidance_scale,
         num_blocks=counts,
         order=config.order,

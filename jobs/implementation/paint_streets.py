@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.paint_streets import Config
-from jobs.support.cli import absolute, home, require_positive
+from jobs.support.cli import home_path, make_absolute, require_positive
 from jobs.support.ray_session import start_ray
 from pipelines.rendering.controlnet import PhotoRequest, list_drives, paint_streets
 from pipelines.runtime import storage
@@ -18,13 +18,13 @@ def paint(config: Config) -> tuple[str, int]:
             raise ValueError(f"{name} is missing: give a local directory in diffusers' layout")
     require_positive(config, "num_inference_steps", "num_actors")
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
-        if not storage.list_files(absolute(value), ".json"):
+        if not storage.list_files(make_absolute(value), ".json"):
             raise ValueError(f"{name} {value}: no model here; give a local directory in diffusers' layout")
-    streets = absolute(config.streets) if config.streets else home("generated", "streets", "drive")
+    streets = make_absolute(config.streets) if config.streets else home_path("generated", "streets", "drive")
     directories = list_drives(streets)
     request = PhotoRequest(
-        diffusion=absolute(config.diffusion),
-        controlnet=absolute(config.controlnet),
+        diffusion=make_absolute(config.diffusion),
+        controlnet=make_absolute(config.controlnet),
         prompt=config.prompt,
         negative_prompt=config.negative_prompt,
         steps=config.num_inference_steps,

@@ -8,7 +8,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from jobs.implementation.checks import check_preprocess_scenes
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
@@ -23,27 +23,27 @@ def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
     """Return the shards to write."""
     if isinstance(config, Town):
         return sharding.plan_town(config.num_train, config.num_test, config.seed)
-    root = absolute(config.input)
+    root = make_absolute(config.input)
     if isinstance(config, Av2):
         return sharding.plan_argoverse2(root)
     plan_drives = sharding.plan_kitti360 if isinstance(config, Kitti360) else sharding.plan_custom
     return plan_drives(root, config.make_split, config.skip_unreadable)
 
 
-def recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
+def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
     """Return the options that dataset.json records: a run with other options does not resume."""
     options = {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED}
     options["source"] = type(config).__name__.lower()
     if isinstance(config, Town):
         return options | {"town_version": TOWN_VERSION}
-    return options | {"input": absolute(config.input)}
+    return options | {"input": make_absolute(config.input)}
 
 
 def main(config: Town | Kitti360 | Av2 | Own) -> None:
     check_preprocess_scenes(config)
-    options, shards = recorded_options(config), plan_shards(config)
+    options, shards = make_recorded_options(config), plan_shards(config)
     source = options["source"]
-    output = absolute(config.output) if config.output else home("datasets", source)
+    output = make_absolute(config.output) if config.output else home_path("datasets", source)
     skip = getattr(config, "skip_unreadable", False)
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
     start_ray()

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from jobs.publish_model import Config
-from jobs.support.cli import absolute, home
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
-from jobs.support.tracking import Tracker, client, hide_credentials, tracking_uri
+from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client
 from jobs.support.trainer import publish_directory
 from models.labels import LABELS
 from models.pipeline import PrITTIPipeline
@@ -42,9 +42,9 @@ def publish(config: Config) -> list[str]:
     Returns:
         Values of --model for it: its directory and, if registered, models:/NAME/VERSION and the id of the run.
     """
-    pipeline = load_pipeline(pipeline_directory(config.model))
+    pipeline = load_pipeline(find_pipeline_directory(config.model))
     weights = [digest_weights(pipeline.lvae), digest_weights(pipeline.dit)]
-    directory = absolute(config.evaluation) if config.evaluation else home("evaluations", "latest")
+    directory = make_absolute(config.evaluation) if config.evaluation else home_path("evaluations", "latest")
     about, scores = read_evaluation(directory, weights)
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
     if about["sampling"]["sampler"] != "ddpm":
@@ -52,13 +52,13 @@ def publish(config: Config) -> list[str]:
     pipeline.register_to_config(**as_judged)
     facts = storage.read_json(storage.join_uri(about["real"], "dataset.json"))
     stages = [
-        history("pritti-lvae", "Layout VAE", pipeline.lvae),
-        history("pritti-dit", "Diffusion transformer", pipeline.dit),
+        read_history("pritti-lvae", "Layout VAE", pipeline.lvae),
+        read_history("pritti-dit", "Diffusion transformer", pipeline.dit),
     ]
     for *_, last in stages:
         require_data(last, about["real"], facts, directory)
     trainings = [training for stage in stages for training in stage]
-    output = absolute(config.output) if config.output else home("zoo", config.name)
+    output = make_absolute(config.output) if config.output else home_path("zoo", config.name)
     entry = {"trainings": trainings, "facts": facts, "scores": scores, "about": about}
     with tempfile.TemporaryDirectory() as staging:
         version = write_entry(staging, config.name, pipeline, "-".join(weights), **entry)
@@ -123,7 +123,7 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
     return about, scores
 
 
-def history(experiment: str, stage: str, model: torch.nn.Module) -> list[TrainingRecord]:
+def read_history(experiment: str, stage: str, model: torch.nn.Module) -> list[TrainingRecord]:
     """Return the runs that trained a model's weights, oldest first: a run may start from the weights of an earlier one.
 
     Raises:
@@ -144,8 +144,8 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
     Raises:
         ValueError: Neither MLflow nor a published entry has a record of it.
     """
-    uri = tracking_uri()
-    api = client(uri)
+    uri = find_tracking_uri()
+    api = make_client(uri)
     known = api.get_experiment_by_name(experiment)
     runs = api.search_runs([known.experiment_id], f"tags.weights = '{digest}'") if known else []
     if not runs:
@@ -162,16 +162,16 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
         digest,
         parameters,
         int(found.data.tags["steps"]),
-        hours_of_steps(tracker, int(found.data.params["batch_size"])),
+        compute_hours(tracker, int(found.data.params["batch_size"])),
         {name: value for name, value in found.data.params.items() if name != "architecture"},
         {name: found.data.tags.get(name, "not recorded") for name in ("command", "commit", "machine", "versions")},
-        {words: axes(tracker.history(name)) for name, words in CURVES.items()},
+        {words: convert_axes(tracker.history(name)) for name, words in CURVES.items()},
     )
 
 
 def read_published_training(digest: str) -> dict[str, Any] | None:
     """Return the record of a training run from a published entry of the package or of this machine."""
-    for zoo in (str(WEIGHTS), home("zoo")):
+    for zoo in (str(WEIGHTS), home_path("zoo")):
         for path in storage.list_files(zoo, TRAINING_NAME):
             for record in storage.read_json(path):
                 if record["weights"] == digest:
@@ -193,11 +193,11 @@ def require_data(training: TrainingRecord, real: str, facts: Mapping, evaluation
         )
 
 
-def axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float]]:
+def convert_axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float]]:
     return [step for step, _ in points], [value for _, value in points]
 
 
-def hours_of_steps(tracker, batch_size: int) -> float:
+def compute_hours(tracker, batch_size: int) -> float:
     """Return the training time in hours from the logged speeds, without start-up, validation and pauses."""
     last, seconds = 0, 0.0
     for step, speed in tracker.history("scenes_per_second"):

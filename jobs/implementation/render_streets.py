@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.render_streets import Config
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from pipelines.rendering.pinhole import Lens
@@ -27,12 +27,12 @@ def render(config: Config) -> dict[str, int]:
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())
     request = StreetRequest(
-        output=absolute(config.output) if config.output else selection.root,
+        output=make_absolute(config.output) if config.output else selection.root,
         run=config.run,
         spacing_m=config.spacing_m,
         height_m=config.camera_height_m,
         pitch_deg=config.pitch_deg,
-        lens=Lens().resized(config.width_px, config.height_px),
+        lens=Lens().resize(config.width_px, config.height_px),
         right=config.lateral_offset,
         most=config.max_frames,
     )
@@ -44,7 +44,9 @@ def render(config: Config) -> dict[str, int]:
 
 def main(config: Config) -> None:
     frames = render(config)
-    directory = absolute(config.output or config.input) if config.output or config.input else home("generated")
+    directory = (
+        make_absolute(config.output or config.input) if config.output or config.input else home_path("generated")
+    )
     bare = [name for name, count in frames.items() if not count]
     print(f"{sum(frames.values())} frames of {len(frames)} scenes in {directory}/streets/{config.run}")
     if bare:

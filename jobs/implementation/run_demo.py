@@ -19,7 +19,7 @@ from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Town
 from jobs.run_demo import Config
 from jobs.sample_scenes import Config as SampleConfig
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
@@ -55,7 +55,7 @@ def show_released(config: Config) -> None:
     sample(
         SampleConfig(
             model=RELEASED,
-            output=home("released"),
+            output=home_path("released"),
             num_scenes=config.num_released_scenes,
             seed=config.seed,
             sampler="dpm++",
@@ -63,30 +63,30 @@ def show_released(config: Config) -> None:
             num_glb=1,
         )
     )
-    scenes = read_scenes(home("released"), "generated-samples")
+    scenes = read_scenes(home_path("released"), "generated-samples")
     sheet = arrange_contact_sheet([render_3d(scene, 480, 360) for scene in scenes], columns=4)
-    path = home("released.png")
+    path = home_path("released.png")
     storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
     print(f"pictures: {os.path.relpath(path)}; the next stages train such a model")
 
 
 def main(config: Config) -> None:
-    os.environ["PRITTI_HOME"] = absolute(config.output)
+    os.environ["PRITTI_HOME"] = make_absolute(config.output)
     os.environ.pop("MLFLOW_TRACKING_URI", None)  # all files are kept under the output directory
-    stages = Stages(home("stages.json"), total=9 if config.num_released_scenes else 8)
+    stages = Stages(home_path("stages.json"), total=9 if config.num_released_scenes else 8)
     start_ray(training=True)
     if config.num_released_scenes:
         stages.run("sample scenes of the released model", lambda: show_released(config))
     run_training_stages(config, stages)
     scores = run_generation_stages(config, stages)
-    report = home("report.html")
+    report = home_path("report.html")
     stages.run("write the report", lambda: write_demo_report(report, config, scores, stages.seconds))
     print(f"\nreport: {os.path.relpath(report)}")
 
 
 def run_training_stages(config: Config, stages: Stages) -> None:
     """Preprocess the town, train the layout VAE, encode latents, train the diffusion transformer."""
-    data = home("datasets", "town")
+    data = home_path("datasets", "town")
     town = Town(output=data, num_train=config.num_train, num_test=config.num_test, seed=config.seed)
     stages.run("preprocess the town", lambda: preprocess_scenes.main(town))
     lvae = LVAEConfig(
@@ -98,7 +98,7 @@ def run_training_stages(config: Config, stages: Stages) -> None:
         seed=config.seed,
     )
     stages.run("train the layout VAE", lambda: train_lvae.train(lvae))
-    latents = EncodeConfig(dataset=data, lvae=lvae_directory(config), num_actors=config.num_actors)
+    latents = EncodeConfig(dataset=data, lvae=find_lvae_directory(config), num_actors=config.num_actors)
     stages.run("encode latents", lambda: encode(latents))
     dit = DiTConfig(
         config.preset,
@@ -113,7 +113,7 @@ def run_training_stages(config: Config, stages: Stages) -> None:
 
 def run_generation_stages(config: Config, stages: Stages) -> dict:
     """Sample scenes, outpaint one, evaluate; return the scores."""
-    model = home("models", f"pritti-{config.preset}")
+    model = home_path("models", f"pritti-{config.preset}")
     sampling = SampleConfig(
         model=model,
         num_scenes=config.num_scenes,
@@ -133,16 +133,16 @@ def run_generation_stages(config: Config, stages: Stages) -> dict:
     )
     stages.run("outpaint a scene", lambda: outpaint(outpainting))
     evaluation = EvaluateConfig(
-        real=home("datasets", "town"),
-        generated=home("generated"),
+        real=home_path("datasets", "town"),
+        generated=home_path("generated"),
         run="samples",
-        lvae=lvae_directory(config),
+        lvae=find_lvae_directory(config),
         max_reconstructed_scenes=config.num_test,
         num_actors=config.num_actors,
     )
     return stages.run("evaluate", lambda: evaluate(evaluation))
 
 
-def lvae_directory(config: Config) -> str:
+def find_lvae_directory(config: Config) -> str:
     """Return the directory of the trained layout VAE."""
-    return home("models", f"lvae-{config.preset}")
+    return home_path("models", f"lvae-{config.preset}")

@@ -6,8 +6,8 @@ from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
 from jobs.implementation.checks import check_sample_scenes
 from jobs.sample_scenes import Config
-from jobs.support.cli import absolute, home
-from jobs.support.model_directories import model_label_kind, pipeline_directory
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
 from models.labels import LABELS
 from pipelines.generation.sample import SampleRequest, sample_scenes
@@ -19,14 +19,14 @@ from pipelines.schema.tables import read_scenes
 def sample(config: Config) -> str:
     """Generate scenes and return the dataset directory."""
     check_sample_scenes(config)
-    model = pipeline_directory(config.model)
-    output = absolute(config.output) if config.output else home("generated")
+    model = find_pipeline_directory(config.model)
+    output = make_absolute(config.output) if config.output else home_path("generated")
     request = SampleRequest(
         model=model,
         output=output,
         run=config.run,
         num_scenes=config.num_scenes,
-        labels=config.labels or LABELS[model_label_kind(model)],
+        labels=config.labels or LABELS[read_label_kind(model)],
         seed=config.seed,
         num_inference_steps=config.num_inference_steps,
         guidance_scale=config.guidance_scale,

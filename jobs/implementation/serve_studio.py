@@ -9,8 +9,8 @@ import time
 from ray import serve as ray_serve
 
 from jobs.serve_studio import Config
-from jobs.support.cli import absolute, home
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards
@@ -18,7 +18,7 @@ from pipelines.studio.serve import make_deployment
 from pipelines.studio.session import LOOPBACK
 
 
-def serve(config: Config) -> str:
+def serve_studio(config: Config) -> str:
     """Start the studio and return its address.
 
     Raises:
@@ -26,12 +26,12 @@ def serve(config: Config) -> str:
     """
     if not 0 <= config.port < 2**16:
         raise ValueError(f"--port is {config.port}, expected 0 to 65535")
-    model = pipeline_directory(config.model)
-    tables = [absolute(table) for table in config.datasets]
+    model = find_pipeline_directory(config.model)
+    tables = [make_absolute(table) for table in config.datasets]
     for table in tables:
         find_shards(table)
-    if not config.datasets and storage.exists(home("generated", "scenes")):
-        tables = [home("generated")]
+    if not config.datasets and storage.exists(home_path("generated", "scenes")):
+        tables = [home_path("generated")]
     require_free_port(config.host, config.port)
     local = config.host in LOOPBACK
     token = config.token or ("" if local else secrets.token_urlsafe(24))
@@ -60,6 +60,6 @@ def require_free_port(host: str, port: int) -> None:
 
 
 def main(config: Config) -> None:
-    print(f"studio: {serve(config)}", flush=True)
+    print(f"studio: {serve_studio(config)}", flush=True)
     while True:
         time.sleep(3600)

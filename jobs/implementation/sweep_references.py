@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.sweep_references import Config
@@ -25,15 +25,17 @@ from pipelines.schema.scene_subset import SceneSubset, list_label_pairs, read_de
 
 def run_sweep(config: Config) -> list[dict]:
     """Score all reference sets, write all files, and return a row per reference set and k."""
-    dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
-    output = absolute(config.output) if config.output else home("evaluations", "sweep")
+    dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
+    output = make_absolute(config.output) if config.output else home_path("evaluations", "sweep")
     source = f"generated-{config.run}" if config.run else None
     sides = {
         "real": SceneSubset(dataset.root, dataset.source, config.real_split),
-        "generated": SceneSubset(absolute(config.generated) if config.generated else home("generated"), source),
+        "generated": SceneSubset(
+            make_absolute(config.generated) if config.generated else home_path("generated"), source
+        ),
     }
     parts = {name: side.shards() for name, side in sides.items()}
-    looks = FeatureConfig(config.supersample, config.inception and absolute(config.inception))
+    looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))
     start_ray()
     features = {}
     with Progress() as bar:

@@ -7,8 +7,8 @@ from itertools import product
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import absolute, home, require_positive
-from jobs.support.model_directories import model_label_kind, pipeline_directory
+from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.sweep_samplers import Config
@@ -37,7 +37,7 @@ from pipelines.schema.tables import read_scenes
 
 def sweep_samplers(config: Config) -> list[dict]:
     """Generate and score every setting, write all files, and return a row per setting."""
-    model = pipeline_directory(config.model)
+    model = find_pipeline_directory(config.model)
     require_positive(config, "num_actors", "batch_size")
     if config.num_scenes < 5 or config.num_examples < 0:
         raise ValueError(
@@ -52,11 +52,11 @@ def sweep_samplers(config: Config) -> list[dict]:
         Diffusion().select_timesteps(steps)
     for scaling in config.noise_scalings:
         check_noise_scaling(scaling)
-    dataset = Dataset.open(absolute(config.real) if config.real else home("datasets", "town"))
-    output = absolute(config.output) if config.output else home("evaluations", "samplers")
+    dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
+    output = make_absolute(config.output) if config.output else home_path("evaluations", "samplers")
     real = SceneSubset(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
     count = sum(len(rows) for _, rows in real.shards())
-    labels = LABELS[model_label_kind(model)]
+    labels = LABELS[read_label_kind(model)]
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import absolute, home, require_positive
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from jobs.support.terminal import print_table
@@ -31,14 +31,14 @@ from pipelines.schema.tables import read_scenes
 def sweep_seams(config: Config) -> list[dict]:
     """Outpaint and measure every setting, write all files, and return a row per setting."""
     require_positive(config, "num_actors", "batch_size")
-    model = pipeline_directory(config.model)
+    model = find_pipeline_directory(config.model)
     if not config.settings:
         raise ValueError("--settings is empty: expected five numbers per setting")
 
     for setting in config.settings:
         RePaintConfig(*setting).transitions()  # raises for an invalid setting before hours of valid ones
         Diffusion().select_timesteps(setting[0])
-    output = absolute(config.output) if config.output else home("evaluations", "sweep-seams")
+    output = make_absolute(config.output) if config.output else home_path("evaluations", "sweep-seams")
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
     rows, pictures = [], []

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from jobs.encode_latents import Config as EncodeConfig
-from jobs.implementation.checks import makes_smoke_inputs, require_latents, training_dataset_root
+from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs, require_latents
 from jobs.implementation.encode_latents import encode
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.implementation.train_lvae import train as train_lvae
 from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
-from jobs.support.cli import absolute, home
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, publish_directory
@@ -46,21 +46,21 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         The training run, and a function that completes its output directory to a pipeline.
     """
     row = resolve_preset(config)
-    root = training_dataset_root(config, LVAE_PRESETS[row.lvae].source)
-    if makes_smoke_inputs(config):
+    root = find_training_dataset(config, LVAE_PRESETS[row.lvae].source)
+    if needs_smoke_inputs(config):
         make_smoke_dataset(root)
         make_smoke_latents(root)
     dataset = Dataset.open(root)
-    latents_root = absolute(config.latents) if config.latents else root
+    latents_root = make_absolute(config.latents) if config.latents else root
     require_latents(latents_root, root)
     latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
-    architecture = dit_architecture(config, row, latents, load_encoder(latents, latents_root))
+    architecture = make_dit_architecture(config, row, latents, load_encoder(latents, latents_root))
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.normalisation if start else {}
-    settings = optimizer_settings(config, row)
-    identity = run_identity(config, row, settings, latents, root, start)
+    settings = make_optimizer_config(config, row)
+    identity = make_run_identity(config, row, settings, latents, root, start)
     name = config.name or f"dit-{config.preset}"
-    record = trainer.guard_run_name(name, home("runs"), identity)
+    record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     timestep_sampling = parse_timestep_sampling(config)
@@ -68,7 +68,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     training = TrainingRun(
         name=name,
-        storage_path=home("runs"),
+        storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, timestep_sampling),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
         reader=LatentReader(latents_root, config.label_kind),
@@ -90,7 +90,7 @@ def parse_timestep_sampling(config: Config) -> TimestepSampling:
 def make_smoke_latents(root: str) -> None:
     """Encode the smoke dataset with the smoke layout VAE, which is trained if it is missing."""
     start_ray(training=True)
-    lvae = home("models", "lvae-smoke")
+    lvae = home_path("models", "lvae-smoke")
     if not storage.exists(storage.join_uri(lvae, "config.json")):
         train_lvae(LVAEConfig(preset="smoke"))
     encode(EncodeConfig(dataset=root, lvae=lvae))
@@ -122,7 +122,7 @@ def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
     return lvae
 
 
-def optimizer_settings(config: Config, row: DiTPreset) -> OptimizerConfig:
+def make_optimizer_config(config: Config, row: DiTPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
         OptimizerConfig(
@@ -141,7 +141,7 @@ def optimizer_settings(config: Config, row: DiTPreset) -> OptimizerConfig:
     )
 
 
-def dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: LayoutVAE) -> dict:
+def make_dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: LayoutVAE) -> dict:
     """Return the keyword arguments of DiT: the preset's, and those that follow from latents and labels."""
     channels, size, _ = latents["shape"]
     return row.architecture() | {
@@ -155,11 +155,11 @@ def dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: Layout
     }
 
 
-def run_identity(
+def make_run_identity(
     config: Config, row: DiTPreset, settings: OptimizerConfig, latents: dict, root: str, start: Start | None
 ) -> dict:
     """Return the options that a resumed run must share with the run that it continues."""
-    identity = trainer.run_identity(
+    identity = trainer.make_run_identity(
         settings,
         stage="dit",
         preset=config.preset,
@@ -180,7 +180,9 @@ def run_identity(
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
     training, complete = prepare(config)
-    output = absolute(config.output) if config.output else home("models", f"pritti-{config.name or config.preset}")
+    output = (
+        make_absolute(config.output) if config.output else home_path("models", f"pritti-{config.name or config.preset}")
+    )
     trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
     return complete(output)
 
@@ -201,7 +203,7 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
     Raises:
         ValueError: It was trained on latents of another layout VAE, or its architecture differs.
     """
-    directory = pipeline_directory(model)
+    directory = find_pipeline_directory(model)
     pipeline = load_pipeline(directory)
     if digest_weights(pipeline.lvae) != lvae_digest:
         raise ValueError(

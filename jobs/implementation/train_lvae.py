@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from jobs.implementation.checks import makes_smoke_inputs, training_dataset_root
+from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
-from jobs.support.cli import absolute, home
-from jobs.support.model_directories import pipeline_directory
+from jobs.support.cli import home_path, make_absolute
+from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.tracking import Tracker
-from jobs.support.trainer import TrainingRun, as_tensors, publish_directory
+from jobs.support.trainer import TrainingRun, convert_to_tensors, publish_directory
 from jobs.train_lvae import Config
 from models.augment import Augmentation
 from models.batch import LayoutBatch
@@ -41,29 +41,29 @@ START_SCENES, START_SHARDS = 96, 16  # training scenes from which the model is i
 def prepare(config: Config) -> TrainingRun:
     """Return the training run of the options; generate the smoke preset's dataset if it is missing."""
     row = resolve_preset(config)
-    root = training_dataset_root(config, row.source)
-    if makes_smoke_inputs(config):
+    root = find_training_dataset(config, row.source)
+    if needs_smoke_inputs(config):
         make_smoke_dataset(root)
     dataset = Dataset.open(root)
     spec = dataset.spec.with_resolution(row.raster_px)
-    settings = optimizer_settings(config, row)
+    settings = make_optimizer_config(config, row)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
     augment = Augmentation(config.flip, *((1.0, np.radians(2.5)) if config.jitter else (0.0, 0.0)), config.seed)
-    identity = run_identity(config, row, settings, spec, root, augment)
+    identity = make_run_identity(config, row, settings, spec, root, augment)
     name = config.name or f"lvae-{config.preset}"
     kept = None
     if config.train_object_decoder_of:
         kept = load_kept_weights(config.train_object_decoder_of, row.architecture(), spec)
         identity |= {"start_from": kept.digest}
         require_replaceable(name, kept)
-    record = trainer.guard_run_name(name, home("runs"), identity)
+    record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-lvae", name, identity | {"architecture": row.architecture()}, record)
     execution = ExecutionConfig(config.gradient_accumulation_steps, config.precision, config.compile)
     sample = sample_layouts(shards, counts, spec)
     return TrainingRun(
         name=name,
-        storage_path=home("runs"),
+        storage_path=home_path("runs"),
         build=partial(
             build,
             row.architecture(),
@@ -98,7 +98,7 @@ def resolve_preset(config: Config) -> LVAEPreset:
     return row
 
 
-def optimizer_settings(config: Config, row: LVAEPreset) -> OptimizerConfig:
+def make_optimizer_config(config: Config, row: LVAEPreset) -> OptimizerConfig:
     """Return the optimizer settings of the preset with the options that override them."""
     return trainer.override_settings(
         OptimizerConfig(
@@ -117,11 +117,11 @@ def optimizer_settings(config: Config, row: LVAEPreset) -> OptimizerConfig:
     )
 
 
-def run_identity(
+def make_run_identity(
     config: Config, row: LVAEPreset, settings: OptimizerConfig, spec: LayoutSpec, root: str, augment: Augmentation
 ) -> dict:
     """Return the options that a resumed run must share with the run that it continues."""
-    identity = trainer.run_identity(
+    identity = trainer.make_run_identity(
         settings,
         stage="lvae",
         preset=config.preset,
@@ -141,7 +141,7 @@ def run_identity(
 def train(config: Config) -> str:
     """Train; return the directory of the model, or of the pipeline with --train-object-decoder-of."""
     training = prepare(config)
-    output = absolute(config.output) if config.output else home("models", training.name)
+    output = make_absolute(config.output) if config.output else home_path("models", training.name)
     trainer.fit(training, config.num_workers, output)
     if config.train_object_decoder_of:
         return write_updated_pipeline(config.train_object_decoder_of, output, training)
@@ -163,7 +163,7 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     Raises:
         ValueError: Its encoders or its layout differ from this run's.
     """
-    pipeline = load_pipeline(pipeline_directory(model))
+    pipeline = load_pipeline(find_pipeline_directory(model))
     lvae = pipeline.lvae
     for (key, built), (_, wanted) in zip(list_kept_options(lvae.config), list_kept_options(architecture), strict=True):
         if built != wanted:
@@ -194,7 +194,7 @@ def require_replaceable(name: str, kept: Kept) -> None:
     Raises:
         ValueError: It would.
     """
-    place = home("models", f"pritti-{name}")
+    place = home_path("models", f"pritti-{name}")
     if not storage.exists(storage.join_uri(place, "model_index.json")):
         return
     there = load_pipeline(place)
@@ -209,13 +209,13 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
         ValueError: The pipeline has changed since the training started.
     """
 
-    pipeline = load_pipeline(pipeline_directory(model))
+    pipeline = load_pipeline(find_pipeline_directory(model))
     if digest_weights(pipeline.lvae) != training.identity["start_from"]:
         raise ValueError(
             f"--train-object-decoder-of {model} was replaced during training; the trained layout VAE is in {lvae}"
         )
     pipeline.register_modules(lvae=load_lvae(lvae))
-    output = home("models", f"pritti-{training.name}")
+    output = home_path("models", f"pritti-{training.name}")
     with tempfile.TemporaryDirectory() as directory:
         pipeline.save_pretrained(directory)
         publish_directory(directory, output)
@@ -247,7 +247,7 @@ def build(
     """Return the Trainer of stage 1, with the same initial weights on every worker."""
     torch.manual_seed(settings.seed)
     model = LayoutVAE(layout=layout, **architecture)
-    model.init_from_data(LayoutBatch.from_compact(as_tensors(sample)))
+    model.init_from_data(LayoutBatch.from_compact(convert_to_tensors(sample)))
     if kept:
         model.freeze_all_but_object_decoder(kept.state)
     return make_lvae_trainer(model, settings, kl_weight, device, wrap, execution, latent_noise)

@@ -33,7 +33,7 @@ SHOWN = 4
 
 
 @lru_cache(maxsize=2)
-def held_out_scenes(root: str, source: str, count: int) -> tuple[Scene, ...]:
+def load_held_out_scenes(root: str, source: str, count: int) -> tuple[Scene, ...]:
     """Return the first test scenes of a dataset, or training scenes if there is no test split."""
     try:
         return tuple(read_scenes(root, source, "test", count))
@@ -60,7 +60,7 @@ class ReconstructionCheck:
         """
         model, scenes = (
             cast(LayoutVAE, trainer.ema_model().eval()),
-            list(held_out_scenes(self.root, self.source, self.count)),
+            list(load_held_out_scenes(self.root, self.source, self.count)),
         )
         spec, sums, losses, rebuilt, matches = model.spec, [], [], [], []
         for start in range(0, len(scenes), self.batch):
@@ -106,7 +106,7 @@ class SamplingCheck:
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the validation loss, with the same noise each time, and pictures of SHOWN generated scenes."""
         dit, device = cast(DiT, trainer.ema_model().eval()), trainer.device
-        arrays = held_out_latents(self.root, self.source, self.latents, self.label, self.count)
+        arrays = load_held_out_latents(self.root, self.source, self.latents, self.label, self.count)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
         generators = [make_keyed_generator(1, k) for k in range(len(arrays["label"]))]
         loss = float(trainer.loss(dit, arrays, generators)["loss"])
@@ -124,8 +124,8 @@ class SamplingCheck:
             for v, d in ((dit.config.shift, 0.0), (dit.config.scale, 1.0))
         )
         dit.train()
-        lvae = cached_lvae(self.lvae).to(device)
-        identity = held_out_scenes(self.root, self.source, 1)[0]
+        lvae = load_cached_lvae(self.lvae).to(device)
+        identity = load_held_out_scenes(self.root, self.source, 1)[0]
         scenes = [decode_layout(x, lvae.spec, identity) for x in lvae.decode(latents * scale + shift).layouts()]
         return {"validation_loss": loss}, {
             "samples": arrange_contact_sheet([render_bev(s) for s in scenes], columns=SHOWN)
@@ -133,13 +133,13 @@ class SamplingCheck:
 
 
 @lru_cache(maxsize=1)
-def cached_lvae(directory: str) -> LayoutVAE:
+def load_cached_lvae(directory: str) -> LayoutVAE:
     """Return a layout VAE, which is loaded once per process."""
     return load_lvae(directory)
 
 
 @lru_cache(maxsize=1)
-def held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
+def load_held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
     """Return the first latents of the test split, or of the training split if there is none, with their labels."""
     try:
         shards = find_shards(root, source=source, split="test")

@@ -36,7 +36,7 @@ def set_ray_environment() -> None:
         os.environ.setdefault(name, value)
 
 
-def home(*parts: str) -> str:
+def home_path(*parts: str) -> str:
     """Return a path under $PRITTI_HOME (default ~/pritti; may be a URI).
 
     The path is absolute because a submitted Ray job runs in a copy of the working directory.
@@ -46,7 +46,7 @@ def home(*parts: str) -> str:
     return "/".join([base, *parts])
 
 
-def absolute(path: str) -> str:
+def make_absolute(path: str) -> str:
     """Return an absolute path or URI, so that workers in other working directories find it."""
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
@@ -62,7 +62,7 @@ def require_positive(config: object, *names: str) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
 
 
-def root_cause(error: BaseException) -> BaseException:
+def find_root_cause(error: BaseException) -> BaseException:
     """Return the exception that the user should read: Ray wraps a worker's error several times.
 
     The outermost ValueError or OSError that is not a wrapper comes from this package and names the file and the remedy;
@@ -103,7 +103,7 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
     except KeyboardInterrupt:
         sys.exit("interrupted; run the same command again to resume")
     except Exception as error:
-        cause = root_cause(error)
+        cause = find_root_cause(error)
         if isinstance(cause, (ValueError, OSError)):
             exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # Ray's remark on how to retry
         raise

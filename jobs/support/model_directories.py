@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from models.labels import require_labels
 from models.pretrained import INDEX_NAME, find_pipeline_path
 from pipelines.runtime import storage
@@ -17,15 +17,15 @@ def require_model_labels(model: str, labels: Iterable[str]) -> None:
     Raises:
         ValueError: The pipeline does not know a label.
     """
-    require_labels(model_label_kind(model), labels)
+    require_labels(read_label_kind(model), labels)
 
 
-def model_label_kind(model: str) -> str:
+def read_label_kind(model: str) -> str:
     """Return the kind of label that the pipeline in a directory is conditioned on."""
     return storage.read_json(storage.join_uri(model, "dit/config.json"))["label"]
 
 
-def pipeline_directory(model: str) -> str:
+def find_pipeline_directory(model: str) -> str:
     """Return the directory that --model names; pipelines in MLflow are downloaded first.
 
     Without a name: $PRITTI_HOME/models/pritti-town, or the only pipeline trained there, or the released weights.
@@ -34,15 +34,15 @@ def pipeline_directory(model: str) -> str:
         ValueError: There is no such pipeline, or no name and several trained pipelines.
     """
     if not model:
-        found = [path.removesuffix(f"/{INDEX_NAME}") for path in storage.list_files(home("models"), INDEX_NAME)]
-        if (town := home("models", "pritti-town")) in found:
+        found = [path.removesuffix(f"/{INDEX_NAME}") for path in storage.list_files(home_path("models"), INDEX_NAME)]
+        if (town := home_path("models", "pritti-town")) in found:
             return town
         if len(found) > 1:
             raise ValueError(
                 f"--model is missing and several were trained here; name one of: {', '.join(sorted(found))}"
             )
         return found[0] if found else find_pipeline_path("town")
-    for directory in (absolute(model), home("zoo", model)):
+    for directory in (make_absolute(model), home_path("zoo", model)):
         if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
     if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mlflow.exceptions import MlflowException
 
-from jobs.support.cli import home
-from jobs.support.tracking import client, hide_credentials, tracking_uri
+from jobs.support.cli import home_path
+from jobs.support.tracking import find_tracking_uri, hide_credentials, make_client
 from models.pretrained import CHECKSUMS_NAME, INDEX_NAME, compute_checksums
 
 EXPERIMENT = "pritti-zoo"
@@ -19,7 +19,7 @@ PIPELINE = "pipeline"  # artifact directory of a publishing run
 
 def register_version(name: str, run_id: str) -> str:
     """Register the pipeline of a publishing run as the next version of a model; return models:/NAME/VERSION."""
-    api = client(tracking_uri())
+    api = make_client(find_tracking_uri())
     try:
         api.get_registered_model(name)
     except MlflowException:
@@ -38,17 +38,17 @@ def download_pipeline(reference: str) -> str:
     Raises:
         ValueError: MLflow does not know the reference, or the files do not match the published checksums.
     """
-    api = client(tracking_uri())
+    api = make_client(find_tracking_uri())
     try:
         run_id = reference
         if reference.startswith("models:/"):
             name, _, version = reference.removeprefix("models:/").rpartition("/")
             run_id = str(api.get_model_version(name, version).run_id)
-        directory = os.path.join(home("registry"), run_id)
+        directory = os.path.join(home_path("registry"), run_id)
         if os.path.exists(os.path.join(directory, INDEX_NAME)):
             return directory
-        os.makedirs(home("registry"), exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home("registry")) as staging:
+        os.makedirs(home_path("registry"), exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=home_path("registry")) as staging:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             if compute_checksums(whole) != json.loads(Path(whole, CHECKSUMS_NAME).read_text()):
                 raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS_NAME}; publish it again")
@@ -56,7 +56,7 @@ def download_pipeline(reference: str) -> str:
                 os.rename(whole, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(
-            f"{reference}: no published pipeline in {hide_credentials(tracking_uri())} "
+            f"{reference}: no published pipeline in {hide_credentials(find_tracking_uri())} "
             f"({hide_credentials(str(error))}); publish one with jobs/publish_model.py"
         ) from error
     return directory

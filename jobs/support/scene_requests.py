@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jobs.support.cli import absolute, home
+from jobs.support.cli import home_path, make_absolute
 from jobs.support.options import RePaintOptions, SceneOptions
 from models.sampling.repaint import RePaintConfig
 from pipelines.schema.scene_subset import SceneSubset
@@ -12,11 +12,11 @@ from pipelines.schema.scene_subset import SceneSubset
 
 def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the first scenes that the options name."""
-    directory = absolute(options.input) if options.input else home("generated")
+    directory = make_absolute(options.input) if options.input else home_path("generated")
     return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
 
 
-def repaint_settings(options: RePaintOptions) -> RePaintConfig:
+def make_repaint_config(options: RePaintOptions) -> RePaintConfig:
     """Return the paper's or the guided settings, with every setting that an option overrides."""
     given = {
         "num_inference_steps": options.num_inference_steps,

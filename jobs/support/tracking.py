@@ -10,13 +10,13 @@ from pathlib import Path
 
 from PIL import Image
 
-from jobs.support.cli import home
+from jobs.support.cli import home_path
 from pipelines.runtime import provenance, storage
 
 
-def tracking_uri() -> str:
+def find_tracking_uri() -> str:
     """Return $MLFLOW_TRACKING_URI, or the URI of an sqlite file under $PRITTI_HOME."""
-    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home('mlflow.db')}"
+    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{home_path('mlflow.db')}"
 
 
 def hide_credentials(uri: str) -> str:
@@ -24,7 +24,7 @@ def hide_credentials(uri: str) -> str:
     return re.sub(r"//[^/@]*@", "//", uri)
 
 
-def client(uri: str):
+def make_client(uri: str):
     """Return an MLflow client without log noise and telemetry."""
     os.environ.setdefault("DO_NOT_TRACK", "true")
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -47,7 +47,7 @@ class Tracker:
 
     @property
     def client(self):
-        self._client = self._client or client(self.uri)
+        self._client = self._client or make_client(self.uri)
         return self._client
 
     @classmethod
@@ -56,16 +56,16 @@ class Tracker:
 
         Call this once, in the driver: two processes that create the database concurrently break it.
         """
-        uri = tracking_uri()
+        uri = find_tracking_uri()
         if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
-            client(uri).update_run(known["run_id"], status="RUNNING")
+            make_client(uri).update_run(known["run_id"], status="RUNNING")
             return cls(uri, known["run_id"])
         if uri.startswith("sqlite:///"):
             Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
-        api = client(uri)
+        api = make_client(uri)
         found = api.get_experiment_by_name(experiment)
         if found is None:
-            artifacts = home("mlartifacts") if uri.startswith("sqlite:") else None
+            artifacts = home_path("mlartifacts") if uri.startswith("sqlite:") else None
             experiment_id = api.create_experiment(experiment, artifact_location=artifacts)
         else:
             experiment_id = found.experiment_id

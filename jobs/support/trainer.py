@@ -22,7 +22,7 @@ import torch
 from ray import cloudpickle
 from ray.train import Checkpoint, CheckpointConfig, FailureConfig, RunConfig, ScalingConfig
 
-from jobs.support.cli import root_cause
+from jobs.support.cli import find_root_cause
 from jobs.support.ray_session import run_packed, start_ray
 from jobs.support.tracking import Tracker
 from models.training import NonFiniteLossError, OptimizerConfig, Trainer
@@ -56,7 +56,7 @@ class TrainingRun:
     validate: Callable[[Trainer], tuple[dict[str, float], dict[str, np.ndarray]]] | None = None
 
 
-def as_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     return {
         name: torch.from_numpy(np.array(value))  # a copy: Ray's are read-only
         for name, value in batch.items()
@@ -83,7 +83,7 @@ def train_worker(run: TrainingRun, threads: int) -> None:
     for batch, seconds in feed:
         waited += seconds
         try:
-            losses = trainer.step(as_tensors(batch), positions)
+            losses = trainer.step(convert_to_tensors(batch), positions)
         except NonFiniteLossError as error:
             raise ValueError(with_scene_ids(error, run.stream)) from error
         step, last = trainer.steps_done, trainer.steps_done == run.settings.steps
@@ -162,7 +162,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
         ValueError: The cluster cannot hold that many workers, or a loss is not finite.
     """
     start_ray(training=True)
-    scaling = scaling_for(num_workers, run.stream.batch_size)
+    scaling = make_scaling_config(num_workers, run.stream.batch_size)
     threads = max(1, int(ray.cluster_resources()["CPU"]) // num_workers)
     work = partial(train_worker, run, threads)
     packed = cloudpickle.dumps(work)  # pyright: ignore[reportPrivateImportUsage]
@@ -185,8 +185,8 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     except Exception as error:
         run.tracker.finish("FAILED")
         for failure in getattr(error, "worker_failures", {}).values():
-            if isinstance(root_cause(failure), ValueError):
-                raise root_cause(failure) from error
+            if isinstance(find_root_cause(failure), ValueError):
+                raise find_root_cause(failure) from error
         raise
     if result.checkpoint is None:
         raise ValueError(f"run {run.name!r} ended without a checkpoint; give more --steps")
@@ -197,7 +197,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     return output
 
 
-def scaling_for(num_workers: int, batch_size: int) -> ScalingConfig:
+def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
     """Return the scaling of workers that fit the cluster and leave CPUs for reading.
 
     Raises:
@@ -266,6 +266,6 @@ def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerCon
     return replace(settings, **changes)
 
 
-def run_identity(settings: OptimizerConfig, **more: Any) -> dict:
+def make_run_identity(settings: OptimizerConfig, **more: Any) -> dict:
     """Return the options that determine a run's weights: its optimizer settings and `more`."""
     return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()} | more

@@ -121,7 +121,7 @@ class StudyConfig:
     learning_rate: float = 5e-4
     weight_decay: float = 5e-4
 
-    def optimisation(self, count: int) -> OptimizerConfig:
+    def make_optimizer_config(self, count: int) -> OptimizerConfig:
         """The layout VAE's schedule for `count` samples: the rate falls to a tenth along a cosine."""
         return OptimizerConfig(
             steps=self.epochs * -(-count // self.batch_size),
@@ -162,7 +162,7 @@ def train_autoencoder(
     model = OneObjectAutoencoder(code.shape[1])
     with torch.no_grad():
         model.decoder.init_from_data(compute_clamped_logit(code.mean(dim=0))[None], torch.ones(1))
-    schedule = settings.optimisation(len(code))
+    schedule = settings.make_optimizer_config(len(code))
     optimiser = torch.optim.AdamW(
         model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
     )

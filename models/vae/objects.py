@@ -126,7 +126,7 @@ class ObjectEncoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch n features"], real: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch moments h w"]:
-        features, real, category = self.without_padding(features, real)
+        features, real, category = self.drop_padding(features, real)
         batch = len(features)
         moments, rows, cols = self.grid.shape
         category = self.category(category)  # (b, n, 10)
@@ -140,7 +140,7 @@ class ObjectEncoder(nn.Module):
         row, col = find_grid_cells(features[..., :3], rows, cols)
         if self.shortcut is not None:
             mean, logvar = x.chunk(2, dim=-1)
-            x = torch.cat([mean + self.shortcut(self.seen_from_cell(features, row, col, category)), logvar], dim=-1)
+            x = torch.cat([mean + self.shortcut(self.encode_in_cell(features, row, col, category)), logvar], dim=-1)
         x = x * real[..., None]
         cell = row * cols + col  # (b, n)
         total = x.new_zeros(batch, rows * cols, moments).scatter_add_(1, cell[..., None].expand(-1, -1, moments), x)
@@ -148,13 +148,13 @@ class ObjectEncoder(nn.Module):
         mean = total / count.clamp(min=1)[..., None]
         return self.grid + mean.transpose(1, 2).unflatten(2, (rows, cols))
 
-    def seen_from_cell(self, features: Tensor, row: Tensor, col: Tensor, category: Tensor) -> Tensor:
+    def encode_in_cell(self, features: Tensor, row: Tensor, col: Tensor, category: Tensor) -> Tensor:
         """(b, n, 19): centre from the middle of its cell, in cells; the rest of the features in [-2, 2]; category."""
         _, rows, cols = self.grid.shape
         down, right = (1 - features[..., 0]) * rows - row - 0.5, (1 - features[..., 1]) * cols - col - 0.5
         return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, category], dim=-1)
 
-    def without_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def drop_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features, padding flags and categories with real primitives first, cut to the fullest scene of the batch.
 
         Masked slots change nothing but cost as much as real ones: half of the paper's 514 are empty on average.

@@ -42,7 +42,7 @@ class EditRequest:
         """Return the run's shard of that number, for the edited scenes of the given shard."""
         return Shard(self.output, self.source, given.split, number)
 
-    def claim(self, selection: SceneSubset) -> None:
+    def guard(self, selection: SceneSubset) -> None:
         """Bind the source to these edits of these scenes (run_guard.py)."""
         chosen = {
             "input": selection.root,
@@ -116,7 +116,7 @@ def edit_scenes(
     for edit in request.edits:
         edit.check()
     parts = selection.shards()
-    request.claim(selection)
+    request.guard(selection)
     rows = ray.data.from_items([{"shard": k} for k in range(len(parts))], override_num_blocks=len(parts))
     found = []
     for row in map_rows(rows, lambda row: write_edited(row, request, parts)).iter_rows():

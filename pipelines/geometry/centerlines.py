@@ -54,7 +54,7 @@ class RoadNetwork:
     roads: tuple[Road, ...]
     nodes_m: np.ndarray  # (n, 3)
 
-    def leaving(self, node: int) -> list[Road]:
+    def list_leaving(self, node: int) -> list[Road]:
         """Return the roads at a node, each directed away from it."""
         return [r for road in self.roads for r in (road, road.reverse()) if r.start == node]
 
@@ -89,7 +89,7 @@ def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
     number = {node: k for k, node in enumerate(nodes)} | {None: -1}
     roads = [replace(road, start=number[a], end=number[b]) for road, (a, b) in zip(roads, ends, strict=True)]
     network = RoadNetwork(tuple(roads), np.zeros((len(nodes), 3)))
-    meeting = [np.mean([road.xyz_m[0] for road in network.leaving(k)], axis=0) for k in range(len(nodes))]
+    meeting = [np.mean([road.xyz_m[0] for road in network.list_leaving(k)], axis=0) for k in range(len(nodes))]
     return replace(network, nodes_m=np.reshape(meeting, (-1, 3)))
 
 
@@ -307,7 +307,7 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
     here = min(starts, key=lambda r: float(np.hypot(*(r.xyz_m[0, :2] - start_m))))
     ways, driven = [here], {here.number}
     while here.end >= 0:
-        onward = [road for road in network.leaving(here.end) if road.number not in driven]
+        onward = [road for road in network.list_leaving(here.end) if road.number not in driven]
         if not onward:
             break
         here = max(

@@ -22,7 +22,7 @@ class Camera:
     camera_from_scene: np.ndarray  # (3, 3) rotation
     view: Grid  # the pixels, in the camera frame
 
-    def turned(self, points_m: np.ndarray) -> np.ndarray:
+    def turn(self, points_m: np.ndarray) -> np.ndarray:
         """Scene points (..., 3) in the camera frame."""
         return points_m @ self.camera_from_scene.T
 
@@ -107,7 +107,7 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
     half = camera.camera_from_scene @ (scene.rotation[primitive] * (scene.size_m[primitive, None, :] / 2.0))
     lower = np.linalg.cholesky(half @ half.transpose(0, 2, 1))
-    x, y, z = camera.turned(scene.center_m[primitive].astype(np.float64)).T
+    x, y, z = camera.turn(scene.center_m[primitive].astype(np.float64)).T
     row_middle = (view.front_m - x) / view.resolution_m - 0.5
     col_middle = (view.left_m - y) / view.resolution_m - 0.5
 

@@ -65,7 +65,7 @@ class ReferenceLine:
 def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
     """A line for each road, cut short where a junction begins."""
     clear_m = [
-        CLEAR * max(float(np.median(road.width_m)) for road in network.leaving(node)) / 2
+        CLEAR * max(float(np.median(road.width_m)) for road in network.list_leaving(node)) / 2
         for node in range(len(network.nodes_m))
     ]
     return [

@@ -120,9 +120,9 @@ class Mixed(nn.Module):
             for names in steps:
                 y = torch.cat([self.get_submodule(name)(y) for name in names], dim=1)
             branches.append(y)
-        return torch.cat([*branches, self._pooled(x)], dim=1)
+        return torch.cat([*branches, self._pool(x)], dim=1)
 
-    def _pooled(self, x: Tensor) -> Tensor:
+    def _pool(self, x: Tensor) -> Tensor:
         if self.reduce:
             return F.max_pool2d(x, 3, stride=2)
         if self.max_pool:

@@ -35,7 +35,7 @@ class Lens:
     cx: float = 682.049453
     cy: float = 238.769549
 
-    def resized(self, width: int, height: int) -> Lens:
+    def resize(self, width: int, height: int) -> Lens:
         """Return the lens of the same view with another number of pixels."""
         x, y = width / self.width, height / self.height
         centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
@@ -60,7 +60,7 @@ class StreetCamera:
         cos, sin = np.cos(pitch_rad), np.sin(pitch_rad)
         pitched = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
         rotation = CAMERA_FROM_LEVEL @ pitched @ level_from_scene
-        return StreetCamera(lens or Lens().resized(704, 188), np.asarray(position_m, float), rotation)
+        return StreetCamera(lens or Lens().resize(704, 188), np.asarray(position_m, float), rotation)
 
     def local(self, points_m: np.ndarray) -> np.ndarray:
         """Transform scene points (..., 3) to the camera frame."""

@@ -79,7 +79,7 @@ def _join_faces(*parts: Faces) -> Faces:
 
 def _cast_surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> Surfaces:
     """The nearest surface at each pixel: a face, an ellipsoid, or the table beneath everything."""
-    turned = camera.turned(faces.corners_m)
+    turned = camera.turn(faces.corners_m)
     seen = find_facing_sides(turned)
     (depth,), (hit,) = cast_rays_down(turned[seen], camera.view)
     depth = np.where(hit < 0, _compute_table_depth(camera, table_z_m), depth)
@@ -166,7 +166,7 @@ def _compute_ellipsoid_normals(
 
 def _find_top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
     """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf where there is none."""
-    turned = camera.turned(solid.corners_m)
+    turned = camera.turn(solid.corners_m)
     (flat,), _ = cast_rays_down(turned[find_facing_sides(turned)], camera.view)
     return np.maximum(flat, cast_ellipsoids(scene, camera)[0]).astype(np.float32)
 

@@ -12,7 +12,7 @@ from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_h
 
 HIDDEN = ("stage", "dataset", "lvae")  # options of a run that are paths and digests, reported elsewhere
 
-Points = tuple[Sequence[float], Sequence[float]]
+Points = Sequence[Sequence[float]]  # steps and values
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class TrainingRecord:
         return asdict(self) | {"options": known, "data": self.data or dict(data)}
 
     def chart(self) -> Chart:
-        return Chart(f"{self.stage}: losses", self.curves, "training step", "loss", log_y=True)
+        series = {name: (steps, values) for name, (steps, values) in self.curves.items()}
+        return Chart(f"{self.stage}: losses", series, "training step", "loss", log_y=True)
 
     def rows(self) -> Iterator[tuple[str, str]]:
         if self.parameters is not None:

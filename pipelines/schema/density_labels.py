@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ def classify_density(
     count: np.ndarray | Sequence[float] | float,
     volume_m3: np.ndarray | Sequence[float] | float,
     thresholds: DensityThresholds,
-) -> np.ndarray:
+) -> Any:
     """(n,) str: low if count and volume lie below their p25, high if both lie above their p75, else medium."""
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)

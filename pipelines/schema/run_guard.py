@@ -74,6 +74,5 @@ def compare_options(recorded: Mapping[str, object], options: Mapping[str, object
     if recorded == asked:
         return ""
     name = next(key for key in sorted(recorded | asked) if recorded.get(key) != asked.get(key))
-    values = [side.get(name) for side in (recorded, asked)]
-    values = [value if isinstance(value, str) else json.dumps(value) for value in values]
+    values = [json.dumps(side.get(name)) for side in (recorded, asked)]
     return "{}={}, asked for {}".format(name, *values) if max(map(len, values)) < 80 else f"other {name}"

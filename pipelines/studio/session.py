@@ -167,7 +167,7 @@ class Studio:
         self.desks: OrderedDict[str, Session] = OrderedDict()
         self.busy, self.waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
-    def desk(self, visitor: str) -> Session:
+    def open_session(self, visitor: str) -> Session:
         """A visitor's desk; of too many the one longest unused goes."""
         with self.lock:
             desk = self.desks.pop(visitor, None) or Session()
@@ -351,7 +351,7 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
         visitor = request.cookies.get("studio")
         if not visitor or len(visitor) > 64:
             raise HTTPException(400, "no cookie; open the studio's page first")
-        return studio().desk(visitor)
+        return studio().open_session(visitor)
 
     def answered(request: Request, act: Callable[[Session], None]) -> dict:
         desk = desk_of(request)

@@ -165,12 +165,12 @@ def slowed(function: Callable, seconds: float) -> Callable:
 def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatch, seed):
     (tasks, undisturbed), quota = (
         shards,
-        {"_read_drive_or_reason": 1, "Map(write)": 3, "training_statistics": 1, "Map(move)": 2},
+        {"_read_drive_or_reason": 1, "Map(write)": 3, "compute_training_statistics": 1, "Map(move)": 2},
     )
     for name, seconds in (
         ("_read_drive_or_reason", 0.6),
         ("write_shard", 0.2),
-        ("training_statistics", 0.6),
+        ("compute_training_statistics", 0.6),
         ("label_scenes", 0.2),
     ):
         monkeypatch.setattr(ingest, name, slowed(getattr(ingest, name), seconds))

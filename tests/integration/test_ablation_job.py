@@ -68,7 +68,7 @@ def test_encoding_study_writes_table_and_figure_and_resumes(empty_home, capsys):
 def test_variant_differs_from_preset_only_in_its_switch(empty_home):
     from jobs.ablate_lvae import Augmentation, Branches, Decoders
     from jobs.implementation.ablate_lvae import prepare_variant
-    from jobs.support.trainer import as_tensors
+    from jobs.support.trainer import convert_to_tensors
     from pipelines.training.data_loader import read_samples
 
     for config, variant, switch in (
@@ -86,7 +86,7 @@ def test_variant_differs_from_preset_only_in_its_switch(empty_home):
         assert run.stream.batch_size == row.batch_size
         wanted = LayoutVAEConfig(**override_options(row.architecture(), switch.architecture))
         assert {name: trainer.model.config[name] for name in asdict(wanted)} == asdict(wanted)
-        batch = as_tensors(read_samples(run.stream, run.reader, 0, 1, row.batch_size, 0, 1))
+        batch = convert_to_tensors(read_samples(run.stream, run.reader, 0, 1, row.batch_size, 0, 1))
         assert torch.isfinite(trainer.step(batch, range(row.batch_size))["loss"])
 
 

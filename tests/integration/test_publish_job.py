@@ -36,7 +36,7 @@ def evaluated(smoke) -> Path:
 def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     from jobs.implementation.publish_model import publish
     from jobs.publish_model import Config
-    from jobs.support.model_directories import pipeline_directory
+    from jobs.support.model_directories import find_pipeline_directory
     from pipelines.generation.sample import load_pipeline
 
     output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
@@ -54,7 +54,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
     trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
     for name in ("tiny", reference, run_id):
-        again = load_pipeline(pipeline_directory(name)).dit.state_dict()
+        again = load_pipeline(find_pipeline_directory(name)).dit.state_dict()
         assert {name: value.tolist() for name, value in again.items()} == trained
     kept = smoke / "registry" / run_id
     assert (
@@ -66,7 +66,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
     damaged.write_text(damaged.read_text() + " ")
     with pytest.raises(ValueError, match=r"models:/tiny/2: its files are not those of its checksums.json"):
-        pipeline_directory(second[1])
+        find_pipeline_directory(second[1])
     assert not (smoke / "registry" / second[2]).exists()
     assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
 
@@ -109,7 +109,7 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatc
 
     first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
-    monkeypatch.setattr("jobs.implementation.publish_model.home", lambda *parts: str(tmp_path.joinpath(*parts)))
+    monkeypatch.setattr("jobs.implementation.publish_model.home_path", lambda *parts: str(tmp_path.joinpath(*parts)))
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
         evaluation=str(evaluated),
@@ -128,9 +128,9 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatc
 def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     import torch
 
-    from jobs.implementation.publish_model import history
+    from jobs.implementation.publish_model import read_history
     from jobs.implementation.train_dit import prepare
-    from jobs.support.trainer import as_tensors, tag_weights
+    from jobs.support.trainer import convert_to_tensors, tag_weights
     from jobs.train_dit import Config
     from pipelines.generation.sample import load_pipeline
     from pipelines.training.data_loader import iterate_batches
@@ -147,9 +147,9 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     assert digest_weights(trainer.model) == digest_weights(first) == run.identity["start_from"]
     assert [run.settings.at(step)[0] for step in (0, 1)] == [pytest.approx(1e-3), pytest.approx(1e-5)]
     for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
-        trainer.step(as_tensors(batch), range(run.stream.batch_size))
+        trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))
     tag_weights(run.tracker, trainer.ema_model(), trainer.steps_done)
-    told = history("pritti-dit", "Transformer", trainer.ema_model())
+    told = read_history("pritti-dit", "Transformer", trainer.ema_model())
     assert [(run.name, run.stage, run.steps) for run in told] == [
         ("dit", "Transformer", 8),
         ("dit-2", "Transformer, run 2", 2),
@@ -165,8 +165,8 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
 
 
 def test_pipeline_directory_rejects_unknown_model(smoke, tmp_path):
-    from jobs.support.model_directories import pipeline_directory
+    from jobs.support.model_directories import find_pipeline_directory
 
     for name in ("nobody", "models:/nobody/1", "0" * 32, str(tmp_path)):
         with pytest.raises(ValueError, match=r"no PrITTI pipeline|no published pipeline"):
-            pipeline_directory(name)
+            find_pipeline_directory(name)

@@ -101,7 +101,7 @@ def test_studio_rejects_foreign_pages_and_hosts(studio_url):
 
 
 def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
-    from jobs.implementation.serve_studio import serve
+    from jobs.implementation.serve_studio import serve_studio
     from jobs.serve_studio import Config
 
     with socket.socket() as listener:
@@ -109,8 +109,8 @@ def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
         listener.listen()
         port = listener.getsockname()[1]
         with pytest.raises(ValueError, match=rf"--port {port}: .*choose another --port"):
-            serve(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=port))
+            serve_studio(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=port))
     with pytest.raises(ValueError, match="no PrITTI pipeline here"):
-        serve(Config(str(tmp_path)))
+        serve_studio(Config(str(tmp_path)))
     with pytest.raises(ValueError, match="no scenes there"):
-        serve(Config(str(studio_files / "model"), (str(tmp_path),)))
+        serve_studio(Config(str(studio_files / "model"), (str(tmp_path),)))

@@ -46,9 +46,9 @@ def test_encode_latents_match_lvae_and_scene_order(home):
 
 
 def test_train_logs_run_and_model_to_mlflow(home):
-    from jobs.support.tracking import client
+    from jobs.support.tracking import make_client
 
-    api = client(f"sqlite:///{home}/mlflow.db")
+    api = make_client(f"sqlite:///{home}/mlflow.db")
     for experiment in ("pritti-lvae", "pritti-dit"):
         run = api.search_runs([api.get_experiment_by_name(experiment).experiment_id])[0]
         assert run.info.status == "FINISHED" and run.data.params["preset"] == "smoke"

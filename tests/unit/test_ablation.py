@@ -269,9 +269,9 @@ def test_ground_study_shrinks_networks_at_equal_latents():
 
 
 def test_variant_names_are_valid_for_files_and_mlflow():
-    from jobs.implementation.ablate_lvae import slug
+    from jobs.implementation.ablate_lvae import make_slug
 
-    names = [slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
+    names = [make_slug(name) for study in (BRANCHES, DECODERS, GROUND, AUGMENTATIONS) for name in study]
     assert all(re.fullmatch(r"[\w-]+", name) for name in names) and len(set(names)) == len(names) > 12
 
 
@@ -284,5 +284,5 @@ def test_study_without_trials_releases_its_directory(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "cells-seed0.json").write_text("{}")
     guard_study(str(tmp_path), {"dataset": "/somewhere"})
-    with pytest.raises(ValueError, match="holds a study with dataset=/somewhere, asked for /nowhere"):
+    with pytest.raises(ValueError, match='holds a study with dataset="/somewhere", asked for "/nowhere"'):
         guard_study(str(tmp_path), {"dataset": "/nowhere"})

@@ -15,19 +15,19 @@ def test_tracking_hides_password_of_uri():
 
 
 def test_pipeline_directory_default_is_only_trained_or_released(tmp_path, monkeypatch):
-    from jobs.support.model_directories import pipeline_directory
+    from jobs.support.model_directories import find_pipeline_directory
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path))
-    assert pipeline_directory("") == find_pipeline_path("town")
+    assert find_pipeline_directory("") == find_pipeline_path("town")
     for name, expected in (("demo", "pritti-demo"), ("smoke", None), ("town", "pritti-town")):
         directory = tmp_path / f"models/pritti-{name}"
         directory.mkdir(parents=True)
         (directory / "model_index.json").write_text("{}")
         if expected:
-            assert pipeline_directory("") == str(tmp_path / "models" / expected)
+            assert find_pipeline_directory("") == str(tmp_path / "models" / expected)
             continue
         with pytest.raises(ValueError, match=r"several were trained here; name one of: .*pritti-demo, .*pritti-smoke"):
-            pipeline_directory("")
+            find_pipeline_directory("")
 
 
 def test_provenance_command_hides_machine_paths(monkeypatch):

@@ -130,7 +130,7 @@ def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
 
 def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch):
     from jobs.support.scores import publish_scores
-    from jobs.support.tracking import client, tracking_uri
+    from jobs.support.tracking import find_tracking_uri, make_client
 
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
@@ -142,7 +142,7 @@ def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch)
     rows = {row["metric"]: row for row in pq.read_table(f"{output}/metrics.parquet").to_pylist()}
     assert rows["reconstruction.ap3d"] == {"metric": "reconstruction.ap3d", "value": 0.75, "low": 0.1, "high": 0.9}
     assert rows["reconstruction.many.7"]["value"] == 0.5 and len(rows) == 1201
-    api = client(tracking_uri())
+    api = make_client(find_tracking_uri())
     (run,) = api.search_runs([api.get_experiment_by_name("pritti-evaluation").experiment_id])
     assert run.data.metrics["reconstruction.ap3d"] == 0.75 and len(run.data.metrics) == 1203
     assert run.data.metrics["reconstruction.ap3d.high"] == 0.9

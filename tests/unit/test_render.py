@@ -175,7 +175,7 @@ def test_camera_does_not_mirror_and_frames_grid():
         camera = make_oblique_camera(grid, 640, 480, azimuth, elevation)
         assert np.isclose(np.linalg.det(camera.camera_from_scene), 1)
         corners = [[x, y, z] for x in (0, 64) for y in (-32, 32) for z in (-2, 11)]
-        x, y, _ = camera.turned(np.array(corners)).T
+        x, y, _ = camera.turn(np.array(corners)).T
         assert camera.view.contains(x, y).all()
     with pytest.raises(ValueError, match="elevation_deg is 0"):
         make_oblique_camera(grid, 640, 480, 30, 0)
@@ -188,7 +188,7 @@ def test_oblique_view_ellipsoids_match_their_meshes():
     _, hit = cast_ellipsoids(scene, camera)
     corners, _, primitive = triangulate_scene(scene)
     corners, primitive = corners[primitive >= 0], primitive[primitive >= 0]
-    turned = camera.turned(corners)
+    turned = camera.turn(corners)
     mesh = trimesh.Trimesh(turned.reshape(-1, 3), np.arange(3 * len(turned)).reshape(-1, 3), process=False)
     x, y = np.meshgrid(camera.view.x_m(), camera.view.y_m(), indexing="ij")
     origins = np.stack([x, y, np.full_like(x, 500)], axis=-1).reshape(-1, 3)

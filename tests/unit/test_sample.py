@@ -8,11 +8,13 @@ from pipelines.schema.tables import read_scenes
 
 
 def test_sampler_repairs_sampled_scenes(tmp_path):
-    from jobs.support.model_directories import pipeline_directory
+    from jobs.support.model_directories import find_pipeline_directory
     from pipelines.generation.sample import Sampler, SampleRequest
     from pipelines.metrics.validity import SLAB_OFFSET_M, find_faults
 
-    request = SampleRequest(pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++")
+    request = SampleRequest(
+        find_pipeline_directory("town"), str(tmp_path), "plain", 4, ("low", "high"), 0, 10, 1.0, "dpm++"
+    )
     scenes, number = [], []
     for one in (request, replace(request, run="repaired", repair=True)):
         Sampler(one, batch_size=4)({"id": 0})

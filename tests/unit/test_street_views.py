@@ -19,7 +19,7 @@ from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, shade_view
 from pipelines.schema.palette import CATEGORY_IDS, EMPTY
 
-SMALL = Lens().resized(176, 47)
+SMALL = Lens().resize(176, 47)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_street_view_clips_at_near_plane():
 
 
 def test_street_view_at_half_resolution_shows_same_view():
-    full, half = Lens(), Lens().resized(704, 188)
+    full, half = Lens(), Lens().resize(704, 188)
     assert half.fx == pytest.approx(full.fx / 2)
     for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # the borders of the picture have the same directions
         there = ((corner[0] + 0.5) / 2 - 0.5 - half.cx) / half.fx, ((corner[1] + 0.5) / 2 - 0.5 - half.cy) / half.fy
@@ -165,8 +165,8 @@ def test_centerlines_split_at_side_street():
     network = extract_road_network(scene_of_roads([STRAIGHT, SIDE], 6.5))
     assert len(network.roads) == 3 and len(network.nodes_m) == 1
     assert np.linalg.norm(network.nodes_m[0, :2] - [30, 3]) < 1.5
-    assert len(network.leaving(0)) == 3 and sorted(r.start + r.end for r in network.roads) == [-1, -1, -1]
-    for road in network.leaving(0):
+    assert len(network.list_leaving(0)) == 3 and sorted(r.start + r.end for r in network.roads) == [-1, -1, -1]
+    for road in network.list_leaving(0):
         assert road.end == -1 and off_m(road.xyz_m[:, :2], [STRAIGHT, SIDE]).max() < 1.2
 
 
@@ -174,7 +174,7 @@ def test_centerlines_have_one_node_per_crossing_without_spurs():
     across = np.array([[34.0, -60.0], [34.0, 60.0]])
     scene = scene_of_roads([STRAIGHT, across], 7.0)
     network = extract_road_network(scene)
-    assert len(network.roads) == 4 and len(network.nodes_m) == 1 and len(network.leaving(0)) == 4
+    assert len(network.roads) == 4 and len(network.nodes_m) == 1 and len(network.list_leaving(0)) == 4
     rough = scene.occupied.copy()
     rng = np.random.default_rng(0)
     rough[0] &= rng.random(rough[0].shape) > 0.02  # pinholes

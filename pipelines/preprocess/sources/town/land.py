@@ -31,17 +31,17 @@ class Land:
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[cos, -sin], [sin, cos]])
 
-    def _bent(self, uv: np.ndarray) -> np.ndarray:
+    def _bend(self, uv: np.ndarray) -> np.ndarray:
         x = uv[..., 0] + _draw_waves(self.bend_u, uv[..., 1])
         return np.stack([x, uv[..., 1] + _draw_waves(self.bend_v, x)], axis=-1)
 
     def xy(self, uv: np.ndarray) -> np.ndarray:
         """(..., 2) world x, y of board points (..., 2)."""
-        return self._bent(np.asarray(uv, np.float64)) @ self._turn().T + self.origin_m[:2]
+        return self._bend(np.asarray(uv, np.float64)) @ self._turn().T + self.origin_m[:2]
 
     def direction(self, uv: np.ndarray, along: np.ndarray) -> np.ndarray:
         """(..., 2) unit world direction of the board direction `along` (..., 2) at `uv`."""
-        bent = self._bent(uv)
+        bent = self._bend(uv)
         dx = along[..., 0] + _compute_slopes(self.bend_u, uv[..., 1]) * along[..., 1]
         dy = along[..., 1] + _compute_slopes(self.bend_v, bent[..., 0]) * dx
         world = np.stack([dx, dy], axis=-1) @ self._turn().T
