@@ -22,7 +22,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jobs.support.cli import home_path, make_absolute, run
+from jobs.support.cli import resolve_path, run
 from jobs.support.options import SceneOptions
 
 
@@ -38,7 +38,7 @@ class EditOptions(SceneOptions):
     """Number of scenes shown on the page, before and after."""
 
     def output_directory(self) -> str:
-        return make_absolute(self.output) if self.output else home_path("edited", self.run)
+        return resolve_path(self.output, "edited", self.run)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.support.cli import home_path, make_absolute, run
+from jobs.support.cli import resolve_path, run
 from jobs.support.options import RePaintOptions
 
 
@@ -44,7 +44,7 @@ class Config(RePaintOptions):
     """Number of scenes shown on the page."""
 
     def output_directory(self) -> str:
-        return make_absolute(self.output) if self.output else home_path("inpainted")
+        return resolve_path(self.output, "inpainted")
 
 
 if __name__ == "__main__":

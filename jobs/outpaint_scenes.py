@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jobs.support.cli import home_path, make_absolute, run
+from jobs.support.cli import resolve_path, run
 from jobs.support.options import RePaintOptions
 
 
@@ -48,7 +48,7 @@ class Config(RePaintOptions):
     """Blocks of a scene per batch; changes blocks only by rounding."""
 
     def output_directory(self) -> str:
-        return make_absolute(self.output) if self.output else home_path("outpainted")
+        return resolve_path(self.output, "outpainted")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Scene, networks and their maths: torch, numpy, scipy and diffusers, nothing of Ray."""
+"""Scene, networks and their maths, with torch, numpy and scipy; no Ray. diffusers is imported on first use only."""
 
 from importlib import import_module
 
@@ -6,7 +6,7 @@ _HOME = {"LayoutVAE": "models.lvae", "DiT": "models.dit", "PrITTIPipeline": "mod
 
 
 def __getattr__(name: str):
-    """Load the heavy classes on first use; diffusers finds pipeline components here by name."""
+    """Import the heavy classes on first use."""
     if name in _HOME:
         return getattr(import_module(_HOME[name]), name)
     raise AttributeError(f"module 'models' has no attribute {name!r}")

@@ -26,7 +26,7 @@ class LayoutBatch:
 
     @classmethod
     def from_compact(cls, arrays: dict[str, Tensor]) -> LayoutBatch:
-        """From stacked arrays of `tensors.compact_layout`, unpacked on whatever device they are on."""
+        """From stacked arrays of `tensors.encode_layout`, unpacked on whatever device they are on."""
         return cls(
             height=arrays["height"].to(torch.float32) / 65535,
             occupied=arrays["occupied"].to(torch.float32),

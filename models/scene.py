@@ -157,7 +157,7 @@ UNSET = np.zeros(0)  # replaced by the default that fits the number of primitive
 class Scene:
     """One scene. n primitives, G ground classes on an H x W grid; metres, radians, scene frame.
 
-    `size_m` holds full extents along the columns of `rotation`; both are canonical (`canonical_boxes`).
+    `size_m` holds full extents along the columns of `rotation`; both are canonical (`canonicalize_boxes`).
     `heading_rad` is NaN where the direction of travel is unknown (the scatter matrix loses 180 degrees).
     `height_m` is 0 where `occupied` is False. `world_from_imu` (3, 4) is the dataset's own full pose, if any.
     """

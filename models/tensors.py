@@ -94,7 +94,7 @@ def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
 
 def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
-    """height and occupied of `compact_layout`."""
+    """height and occupied of `encode_layout`."""
     height_m, occupied = select_ground_classes(scene, spec.ground_classes)
     height = np.zeros(height_m.shape, np.uint16)
     height[occupied] = encode_height(height_m[occupied], spec)
@@ -112,7 +112,7 @@ def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
 def encode_primitives(
     category: np.ndarray, center_m: np.ndarray, parameters: np.ndarray, spec: LayoutSpec
 ) -> dict[str, np.ndarray]:
-    """features and real of `compact_layout` from categories (n,), centres (n, 3) and Cholesky parameters (n, 6)."""
+    """features and real of `encode_layout` from categories (n,), centres (n, 3) and Cholesky parameters (n, 6)."""
     features = np.zeros((spec.num_slots, FEATURES), np.float32)
     real = np.zeros(spec.num_slots, bool)
     slots, primitives = assign_slots(category, center_m, spec)
@@ -171,7 +171,7 @@ def decode_layout(
 
 
 def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields) -> Scene:
-    """An empty generated Scene to hand to `scene_from_layout` as its identity."""
+    """An empty generated Scene to hand to `decode_layout` as its identity."""
     shape = (len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
     return Scene(
         scene_id=scene_id,

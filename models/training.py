@@ -108,7 +108,7 @@ def sample_corruption(
 def make_layout_loss(
     spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
 ) -> LossFunction:
-    """Stage 1: compact layouts (tensors.compact_layout) -> the parts of the LVAE objective."""
+    """Stage 1: compact layouts (tensors.encode_layout) -> the parts of the LVAE objective."""
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from jobs.ablate_lvae import Augmentation, Branches, Decoders, Encoding, Ground
 from jobs.implementation.train_lvae import prepare
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.support.tracking import Tracker
@@ -51,7 +51,7 @@ RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in st
 
 def compare_encodings(config: Encoding) -> str:
     """Train missing trials, write the tables, figures and page, and return the directory."""
-    output = make_absolute(config.output) if config.output else home_path("ablations", "encoding")
+    output = resolve_path(config.output, "ablations", "encoding")
     settings = StudyConfig(config.epochs, config.batch_size, config.learning_rate)
     trials = plan_trials(config)
     guard_study(output, asdict(settings) | {"test": config.num_test_boxes})
@@ -123,7 +123,7 @@ def write_encoding_report(
 
 def compare_variants(config: Branches) -> str:
     """Train and score missing variants, write the table, curves and page, and return the directory."""
-    output = make_absolute(config.output) if config.output else home_path("ablations", config.name)
+    output = resolve_path(config.output, "ablations", config.name)
     if config.minutes <= 0 or config.num_seeds < 1:
         raise ValueError(f"--minutes is {config.minutes}, --num-seeds {config.num_seeds}: expected more than 0")
     find_preset(LVAE_PRESETS, config.preset)

@@ -14,7 +14,7 @@ from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
 from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
-from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, require_model_labels
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
@@ -68,7 +68,7 @@ def require_latents(latents_root: str, dataset_root: str) -> None:
 
 
 def check_encode_latents(config: EncodeConfig) -> None:
-    Dataset.open(make_absolute(config.dataset) if config.dataset else home_path("datasets", "town"))
+    Dataset.open(resolve_path(config.dataset, "datasets", "town"))
 
 
 def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.encode_latents import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from pipelines.schema.dataset import Dataset
 from pipelines.training.latents import encode_latents
@@ -13,8 +13,8 @@ from pipelines.training.latents import encode_latents
 
 def encode(config: Config) -> dict:
     """Encode the scenes of a dataset and return the content of latents.json."""
-    dataset = Dataset.open(make_absolute(config.dataset) if config.dataset else home_path("datasets", "town"))
-    lvae = make_absolute(config.lvae) if config.lvae else home_path("models", "lvae-town")
+    dataset = Dataset.open(resolve_path(config.dataset, "datasets", "town"))
+    lvae = resolve_path(config.lvae, "models", "lvae-town")
     output = make_absolute(config.output) if config.output else dataset.root
     start_ray()
     with Progress() as bar:

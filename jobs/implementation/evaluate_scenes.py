@@ -10,7 +10,7 @@ from rich.table import Table
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
@@ -33,10 +33,10 @@ def evaluate(config: Config) -> dict:
     check_evaluate_scenes(config)
     dataset: Dataset | None = None
     if config.lvae or not config.real.endswith(".npz"):
-        dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
+        dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
     named = config.run or config.generated_source or not config.lvae
     wanted = config.generated or (home_path("generated") if named else "")
-    output = make_absolute(config.output) if config.output else home_path("evaluations", config.run or "latest")
+    output = resolve_path(config.output, "evaluations", config.run or "latest")
     scores: dict = {}
     sides = select_sides(config, dataset) if wanted else {}
     start_ray()
@@ -107,7 +107,7 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
         ValueError: The pictures of the sides differ in size.
     """
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
-    generated = make_absolute(config.generated) if config.generated else home_path("generated")
+    generated = resolve_path(config.generated, "generated")
     labels: Pick = "balanced" if config.balance_labels else "spread"
     sides, counts, sizes = {}, {}, {}
     for name, path in (("real", make_absolute(config.real) if config.real else ""), ("generated", generated)):

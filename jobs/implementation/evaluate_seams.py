@@ -7,7 +7,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_seams import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.evaluate import convert_estimates
@@ -28,12 +28,12 @@ SHOWN = 6
 
 def evaluate_seams(config: Config) -> dict:
     """Measure seams, write all files, and return the ratios of both sides."""
-    output = make_absolute(config.output) if config.output else home_path("evaluations", "seams")
+    output = resolve_path(config.output, "evaluations", "seams")
     source = f"generated-{config.run}" if config.run else None
     sides = {
         "generated": (
             SceneSubset(
-                make_absolute(config.generated) if config.generated else home_path("outpainted"),
+                resolve_path(config.generated, "outpainted"),
                 source,
                 None,
                 config.max_scenes,
@@ -42,7 +42,7 @@ def evaluate_seams(config: Config) -> dict:
         ),
         "real": (
             SceneSubset(
-                make_absolute(config.real) if config.real else home_path("datasets", "town"),
+                resolve_path(config.real, "datasets", "town"),
                 None,
                 config.real_split,
                 config.max_scenes,

@@ -7,7 +7,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from jobs.evaluate_voxels import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.voxel_reconstruction import group_files_by_scene, list_true_scenes, pair_files, score_voxels
@@ -32,7 +32,7 @@ def evaluate(config: Config) -> dict:
         shown = bar.add_task("score voxels", total=len(pairs))
         scores, scenes = score_voxels(pairs, grid, axes, truth_axes, lambda: bar.advance(shown))
     scores["left_out"] = {"truths": len(truth) - len(pairs), "reconstructions": len(rebuilt) - len(pairs)}
-    output = make_absolute(config.output) if config.output else home_path("evaluations", "voxels")
+    output = resolve_path(config.output, "evaluations", "voxels")
     storage.write_parquet(scenes, storage.join_uri(output, "voxels.parquet"))
     tags = {
         "truth": make_absolute(config.ground_truth),

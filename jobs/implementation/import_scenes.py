@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.import_scenes import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from pipelines.io.mesh_import import AUTHORS_AXES
 from pipelines.io.voxel_import import VOXEL_AXES
@@ -24,7 +24,7 @@ def import_scenes(config: Config) -> tuple[str, dict]:
     axes = config.axes or {"glb": AUTHORS_AXES, "npz": VOXEL_AXES}[config.format]
     compute_scene_from_axes(axes)
     base, files = find_files(make_absolute(config.files), f".{config.format}")
-    output = make_absolute(config.output) if config.output else home_path("imported", config.name)
+    output = resolve_path(config.output, "imported", config.name)
     request = ImportRequest(base, files, config.format, axes, output, config.name)
     start_ray()
     with Progress() as bar:

@@ -6,7 +6,7 @@ import numpy as np
 from rich.progress import Progress
 
 from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
-from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.value_names import SHEET_PICKS
 from pipelines.io.mesh_export import export_glb
@@ -28,7 +28,7 @@ from pipelines.runtime import storage
 
 def find_dataset_directory(config: DatasetOptions) -> str:
     """Return --dataset or its default."""
-    return make_absolute(config.dataset) if config.dataset else home_path("datasets", "town")
+    return resolve_path(config.dataset, "datasets", "town")
 
 
 def make_output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> str:

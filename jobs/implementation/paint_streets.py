@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.paint_streets import Config
-from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.cli import make_absolute, require_positive, resolve_path
 from jobs.support.ray_session import start_ray
 from pipelines.rendering.controlnet import PhotoRequest, list_drives, paint_streets
 from pipelines.runtime import storage
@@ -20,7 +20,7 @@ def paint(config: Config) -> tuple[str, int]:
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
         if not storage.list_files(make_absolute(value), ".json"):
             raise ValueError(f"{name} {value}: no model here; give a local directory in diffusers' layout")
-    streets = make_absolute(config.streets) if config.streets else home_path("generated", "streets", "drive")
+    streets = resolve_path(config.streets, "generated", "streets", "drive")
     directories = list_drives(streets)
     request = PhotoRequest(
         diffusion=make_absolute(config.diffusion),

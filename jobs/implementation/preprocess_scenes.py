@@ -8,7 +8,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from jobs.implementation.checks import check_preprocess_scenes
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from models.layout import PAPER_SLOTS
 from pipelines.preprocess import sharding
@@ -43,7 +43,7 @@ def main(config: Town | Kitti360 | Av2 | Own) -> None:
     check_preprocess_scenes(config)
     options, shards = make_recorded_options(config), plan_shards(config)
     source = options["source"]
-    output = make_absolute(config.output) if config.output else home_path("datasets", source)
+    output = resolve_path(config.output, "datasets", source)
     skip = getattr(config, "skip_unreadable", False)
     slots = PAPER_SLOTS if options.get("slots") == "paper" else None
     start_ray()

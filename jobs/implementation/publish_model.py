@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from jobs.publish_model import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.registry import EXPERIMENT, PIPELINE, register_version
 from jobs.support.tracking import Tracker, find_tracking_uri, hide_credentials, make_client
@@ -44,7 +44,7 @@ def publish(config: Config) -> list[str]:
     """
     pipeline = load_pipeline(find_pipeline_directory(config.model))
     weights = [digest_weights(pipeline.lvae), digest_weights(pipeline.dit)]
-    directory = make_absolute(config.evaluation) if config.evaluation else home_path("evaluations", "latest")
+    directory = resolve_path(config.evaluation, "evaluations", "latest")
     about, scores = read_evaluation(directory, weights)
     as_judged = {"existence_threshold": about["sampling"].get("existence_threshold", EXISTENCE_THRESHOLD)}
     if about["sampling"]["sampler"] != "ddpm":
@@ -58,7 +58,7 @@ def publish(config: Config) -> list[str]:
     for *_, last in stages:
         require_data(last, about["real"], facts, directory)
     trainings = [training for stage in stages for training in stage]
-    output = make_absolute(config.output) if config.output else home_path("zoo", config.name)
+    output = resolve_path(config.output, "zoo", config.name)
     entry = {"trainings": trainings, "facts": facts, "scores": scores, "about": about}
     with tempfile.TemporaryDirectory() as staging:
         version = write_entry(staging, config.name, pipeline, "-".join(weights), **entry)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.progress import Progress
 
 from jobs.render_streets import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
 from pipelines.rendering.pinhole import Lens
@@ -44,9 +44,7 @@ def render(config: Config) -> dict[str, int]:
 
 def main(config: Config) -> None:
     frames = render(config)
-    directory = (
-        make_absolute(config.output or config.input) if config.output or config.input else home_path("generated")
-    )
+    directory = resolve_path(config.output or config.input, "generated")
     bare = [name for name, count in frames.items() if not count]
     print(f"{sum(frames.values())} frames of {len(frames)} scenes in {directory}/streets/{config.run}")
     if bare:

@@ -6,7 +6,7 @@ from rich.progress import MofNCompleteColumn, Progress, TaskProgressColumn
 
 from jobs.implementation.checks import check_sample_scenes
 from jobs.sample_scenes import Config
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
 from models.labels import LABELS
@@ -20,7 +20,7 @@ def sample(config: Config) -> str:
     """Generate scenes and return the dataset directory."""
     check_sample_scenes(config)
     model = find_pipeline_directory(config.model)
-    output = make_absolute(config.output) if config.output else home_path("generated")
+    output = resolve_path(config.output, "generated")
     request = SampleRequest(
         model=model,
         output=output,

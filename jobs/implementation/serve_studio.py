@@ -14,8 +14,8 @@ from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from pipelines.runtime import storage
 from pipelines.schema.tables import find_shards
+from pipelines.studio.api import LOOPBACK
 from pipelines.studio.serve import make_deployment
-from pipelines.studio.session import LOOPBACK
 
 
 def serve_studio(config: Config) -> str:

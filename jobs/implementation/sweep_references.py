@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
 from jobs.sweep_references import Config
@@ -25,14 +25,12 @@ from pipelines.schema.scene_subset import SceneSubset, list_label_pairs, read_de
 
 def run_sweep(config: Config) -> list[dict]:
     """Score all reference sets, write all files, and return a row per reference set and k."""
-    dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
-    output = make_absolute(config.output) if config.output else home_path("evaluations", "sweep")
+    dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
+    output = resolve_path(config.output, "evaluations", "sweep")
     source = f"generated-{config.run}" if config.run else None
     sides = {
         "real": SceneSubset(dataset.root, dataset.source, config.real_split),
-        "generated": SceneSubset(
-            make_absolute(config.generated) if config.generated else home_path("generated"), source
-        ),
+        "generated": SceneSubset(resolve_path(config.generated, "generated"), source),
     }
     parts = {name: side.shards() for name, side in sides.items()}
     looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))

@@ -7,7 +7,7 @@ from itertools import product
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.cli import require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
 from jobs.support.terminal import print_table
@@ -52,8 +52,8 @@ def sweep_samplers(config: Config) -> list[dict]:
         Diffusion().select_timesteps(steps)
     for scaling in config.noise_scalings:
         check_noise_scaling(scaling)
-    dataset = Dataset.open(make_absolute(config.real) if config.real else home_path("datasets", "town"))
-    output = make_absolute(config.output) if config.output else home_path("evaluations", "samplers")
+    dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
+    output = resolve_path(config.output, "evaluations", "samplers")
     real = SceneSubset(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
     count = sum(len(rows) for _, rows in real.shards())
     labels = LABELS[read_label_kind(model)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 from rich.progress import Progress
 
-from jobs.support.cli import home_path, make_absolute, require_positive
+from jobs.support.cli import require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.scene_requests import select_scenes
@@ -38,7 +38,7 @@ def sweep_seams(config: Config) -> list[dict]:
     for setting in config.settings:
         RePaintConfig(*setting).transitions()  # raises for an invalid setting before hours of valid ones
         Diffusion().select_timesteps(setting[0])
-    output = make_absolute(config.output) if config.output else home_path("evaluations", "sweep-seams")
+    output = resolve_path(config.output, "evaluations", "sweep-seams")
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
     rows, pictures = [], []

@@ -17,7 +17,7 @@ from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.implementation.train_lvae import train as train_lvae
 from jobs.support import trainer
 from jobs.support.callbacks import SamplingCheck
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.ray_session import start_ray
 from jobs.support.tracking import Tracker
@@ -180,9 +180,7 @@ def make_run_identity(
 def train(config: Config) -> str:
     """Train and return the pipeline's directory."""
     training, complete = prepare(config)
-    output = (
-        make_absolute(config.output) if config.output else home_path("models", f"pritti-{config.name or config.preset}")
-    )
+    output = resolve_path(config.output, "models", f"pritti-{config.name or config.preset}")
     trainer.fit(training, config.num_workers, storage.join_uri(output, "dit"))
     return complete(output)
 

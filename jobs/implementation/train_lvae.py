@@ -16,7 +16,7 @@ from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.support import trainer
 from jobs.support.callbacks import ReconstructionCheck
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import home_path, resolve_path
 from jobs.support.model_directories import find_pipeline_directory
 from jobs.support.tracking import Tracker
 from jobs.support.trainer import TrainingRun, convert_to_tensors, publish_directory
@@ -141,7 +141,7 @@ def make_run_identity(
 def train(config: Config) -> str:
     """Train; return the directory of the model, or of the pipeline with --train-object-decoder-of."""
     training = prepare(config)
-    output = make_absolute(config.output) if config.output else home_path("models", training.name)
+    output = resolve_path(config.output, "models", training.name)
     trainer.fit(training, config.num_workers, output)
     if config.train_object_decoder_of:
         return write_updated_pipeline(config.train_object_decoder_of, output, training)

@@ -51,6 +51,11 @@ def make_absolute(path: str) -> str:
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
+def resolve_path(path: str, *default: str) -> str:
+    """Return the absolute path of an option, or the default under $PRITTI_HOME if the option is empty."""
+    return make_absolute(path) if path else home_path(*default)
+
+
 def require_positive(config: object, *names: str) -> None:
     """Check integer options.
 

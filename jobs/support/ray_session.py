@@ -25,7 +25,7 @@ def start_ray(training: bool = False) -> None:
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False
-    context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `root_cause`
+    context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `find_root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
     logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # Ray's bars are off, the jobs' are on
     for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # these errors are raised here as well

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jobs.support.cli import home_path, make_absolute
+from jobs.support.cli import resolve_path
 from jobs.support.options import RePaintOptions, SceneOptions
 from models.sampling.repaint import RePaintConfig
 from pipelines.schema.scene_subset import SceneSubset
@@ -12,7 +12,7 @@ from pipelines.schema.scene_subset import SceneSubset
 
 def select_scenes(options: SceneOptions) -> SceneSubset:
     """Return the first scenes that the options name."""
-    directory = make_absolute(options.input) if options.input else home_path("generated")
+    directory = resolve_path(options.input, "generated")
     return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
 
 

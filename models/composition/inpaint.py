@@ -37,7 +37,7 @@ def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m:
 
 
 def select_polygon(grid: Grid, corners_m: Sequence[Any] | np.ndarray) -> np.ndarray:
-    """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`polygon_contains`)."""
+    """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`contains_points`)."""
     return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
 

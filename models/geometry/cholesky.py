@@ -33,7 +33,7 @@ def decode_cholesky_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     Any six finite numbers give a box: S = L L^T is positive semi-definite whatever L is, extents below 1 cm are
     clamped to 1 cm, and one column is flipped where the eigenvectors come out left-handed. Extents are ascending;
-    `scene.canonical_boxes` puts them in order.
+    `scene.canonicalize_boxes` puts them in order.
     """
     parameters = np.asarray(parameters, np.float64)
     lower = np.zeros((*parameters.shape[:-1], 3, 3))

@@ -13,7 +13,7 @@ and a small change of the box should be a small change of the code:
   Both are polynomials that do not notice which axis is first or which way it points, so equal boxes have equal codes
   and the code is as smooth as the box. T is unchanged by exactly the 24 symmetries of a cube, so it gives the
   three axes whatever the extents, cubes included; S then gives the extent along each. One code per box, one box per
-  code, continuous both ways: for every rotation, not for yaw alone (tests/test_ablation.py).
+  code, continuous both ways: for every rotation, not for yaw alone (tests/unit/test_ablation.py).
 
 T is symmetric; of its 15 entries the trace part never changes, since the v_j are orthonormal. What remains is
 traceless and has nine entries: the spherical harmonics of degree four. They represent cross frames in hexahedral
@@ -42,7 +42,7 @@ from models.geometry.cholesky import (
 )
 
 TRACE_PART = 3 / 5  # the mean over the unit sphere of sum_j (v_j . x)^4
-STARTS, ROUNDS = 4, 12  # of the search for the frame: tests/test_ablation.py
+STARTS, ROUNDS = 4, 12  # of the search for the frame: tests/unit/test_ablation.py
 
 
 class Encoding(NamedTuple):

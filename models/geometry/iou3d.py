@@ -241,7 +241,7 @@ def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n, m) IoU3D of every ellipsoid of a with every one of b, sampled as in `ellipsoid_iou3d_pairs`."""
+    """(n, m) IoU3D of every ellipsoid of a with every one of b, sampled as in `compute_ellipsoid_iou3d_pairs`."""
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
     i, j = find_overlapping_bounds(a, b)
     matrix[i, j] = compute_ellipsoid_iou3d_pairs(a.take(i), b.take(j))

@@ -19,8 +19,8 @@ HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell
 class GroundEncoder(nn.Module):
     """Raster maps [H; B] -> mean and log-variance of the ground latent, stacked along the channels.
 
-    With `shortcut`, the mean is the network's plus a linear map of the cell's `smooth_maps`, solved in closed form
-    (`init_from_data`). Not in the paper.
+    With `shortcut`, the mean is the network's plus a linear map of the cell's `compute_smooth_maps`, solved in closed
+    form (`init_from_data`). Not in the paper.
     """
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
@@ -76,9 +76,10 @@ def init_from_data(
 ) -> None:
     """Initialise outputs to their means; with shortcuts, initialise to the best linear autoencoder.
 
-    The shortcuts become the principal components of a cell's `smooth_maps`, scaled to unit variance, with distances
-    read as logits; the networks' outputs start at zero. On the town at 256 pixels the initial ground IoU is 99.4 %
-    (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights on the objects' channels become zero.
+    The shortcuts become the principal components of a cell's `compute_smooth_maps`, scaled to unit variance, with
+    distances read as logits; the networks' outputs start at zero. On the town at 256 pixels the initial ground IoU is
+    99.4 % (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights on the objects' channels
+    become zero.
     """
     count = occupied.sum(dim=(0, 2, 3)).clamp(min=1)
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count

@@ -53,7 +53,7 @@ class SampleRequest(Request):
     sampler: str = "ddpm"
     noise_scaling: float | None = None  # None: the model's own
     existence_threshold: float | None = None  # None: the model's own
-    repair: bool = False  # onto the ground and apart, nothing taken out (scenes/edit.py)
+    repair: bool = False  # onto the ground and apart, nothing taken out (pipelines/editing/edit.py)
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:

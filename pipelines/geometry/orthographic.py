@@ -94,7 +94,7 @@ class _Chords(NamedTuple):
     primitive: np.ndarray  # (m,) index into the scene
     row_start: np.ndarray  # (m,) flat index of the row's first pixel
     least_m: np.ndarray  # (m,) less than the depth of any hit
-    terms: tuple[np.ndarray, ...]  # (m,) each, of `_depth_m`
+    terms: tuple[np.ndarray, ...]  # (m,) each, of `_compute_depth_m`
 
 
 def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:

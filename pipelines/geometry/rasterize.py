@@ -105,7 +105,7 @@ def cast_rays_down(
 
 
 def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
-    """(num_layers, H, W) float32 of `cast_down`: the heights alone, in half the memory and less time."""
+    """(num_layers, H, W) float32 of `cast_rays_down`: the heights alone, in half the memory and less time."""
     pixel, layer_start, value = find_hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
     np.maximum.at(height.reshape(-1), layer_start + pixel, value.astype(np.float32))

@@ -83,7 +83,7 @@ def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def triangulate_ground(scene: Scene) -> Triangles:
-    """The triangles of `ground_mesh`."""
+    """The triangles of `build_ground_mesh`."""
     vertices, triangles, class_id = build_ground_mesh(scene)
     return Triangles(vertices[triangles], class_id[triangles[:, 0]], np.full(len(triangles), GROUND))
 

@@ -90,7 +90,7 @@ def export_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
 
 
 def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
-    """Writes `scene_voxels_npz`."""
+    """Writes `export_voxels_npz`."""
     content = export_voxels_npz(scene, grid)
     storage.write_whole(uri, lambda stream: stream.write(content))
 

@@ -61,7 +61,7 @@ CHAINS_7 = {
 
 
 class InceptionFeatures(NamedTuple):
-    """Of n pictures: Tensors out of the network, float32 arrays out of `inception_features`."""
+    """Of n pictures: Tensors out of the network, float32 arrays out of `compute_inception_features`."""
 
     pool3: Tensor | np.ndarray  # (n, 2048): FID, precision and recall
     spatial: Tensor | np.ndarray  # (n, 2023), row, column, channel: ADM's sFID, first 7 channels of mixed_6/conv
@@ -269,7 +269,7 @@ def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128,
 
 @torch.inference_mode()
 def compute_random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
-    """(n, 480) float32 features of uint8 pictures (n, height, width, 3) under `random_network(seed)`.
+    """(n, 480) float32 features of uint8 pictures (n, height, width, 3) under `make_random_network(seed)`.
 
     The mean over the picture after each convolution (32 + 64 + 128 + 256): coarse and fine structure alike.
     """

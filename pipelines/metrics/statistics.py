@@ -12,14 +12,14 @@ EXTENTS = ("length_m", "width_m", "height_m")
 
 
 def list_statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
-    """Columns of `layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share."""
+    """Columns of `compute_layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share."""
     counts = [f"num_{category}" for category in CATEGORIES]
     extents = [f"{category}_{extent}" for category in CATEGORIES for extent in EXTENTS]
     return (*counts, *extents, *(f"{name}_share" for name in ground_classes))
 
 
 def compute_layout_statistics(scene: Scene) -> np.ndarray:
-    """(11 + 33 + G,) float64, columns as in `statistic_names(scene.ground_classes)`.
+    """(11 + 33 + G,) float64, columns as in `list_statistic_names(scene.ground_classes)`.
 
     Counts; mean extents in metres, NaN for an absent category; share of the scene's pixels per ground class (classes
     may overlap).

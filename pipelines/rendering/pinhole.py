@@ -144,7 +144,7 @@ def _make_rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _project_to_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
-    """Triangles (t, 3, 3) in the camera frame, z > 0, on the grid of `_pixels`; their height is 1 / z."""
+    """Triangles (t, 3, 3) in the camera frame, z > 0, on the grid of `_list_pixels`; their height is 1 / z."""
     x, y, z = np.moveaxis(corners, -1, 0)
     u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
     return np.stack([-v - 0.5, -u - 0.5, 1 / z], axis=-1)

@@ -213,7 +213,7 @@ LEGEND_X = PRIMITIVES_X + SMALL + GAP
 def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
     """One scene in every view with its names, labels and counts: (H, W, 3) uint8, and where each picture lies.
 
-    Pictures: bev, 3d, ground, heights, primitives. The first is `bev_picture` as it is.
+    Pictures: bev, 3d, ground, heights, primitives. The first is `render_bev` as it is.
     """
     bare = replace(scene, height_m=np.zeros_like(scene.height_m), occupied=np.zeros_like(scene.occupied))
     heights, span_m = draw_heights(scene, SMALL)

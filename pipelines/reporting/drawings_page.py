@@ -28,7 +28,7 @@ class DrawingsSection:
 
 
 def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
-    """`report_html` with drawings among the sections."""
+    """`render_report_html` with drawings among the sections."""
     plain = [
         Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
         for index, section in enumerate(sections)

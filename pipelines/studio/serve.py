@@ -1,4 +1,4 @@
-"""The studio as a Ray Serve application: one replica, which holds the model and every visitor's desk."""
+"""The studio as a Ray Serve application: one replica, which holds the model and every visitor's session."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import ray.serve
 from fastapi import FastAPI
 from ray.serve import Application
 
-from pipelines.studio.session import Studio, build_studio_app
+from pipelines.studio.api import build_studio_app
+from pipelines.studio.session import Studio
 
 REQUESTS = 32  # concurrent requests; as many more wait, and the others are refused with a request to try again
 
 
 def make_deployment(
-    model: str, tables: list[str], token: str, hosts: tuple[str, ...], threads: int | None
+    model: str, datasets: list[str], token: str, hosts: tuple[str, ...], threads: int | None
 ) -> Application:
-    """What ray.serve.run takes. The studio is made when the replica starts."""
+    """The application for ray.serve.run. The studio is loaded when the replica starts."""
 
     def app() -> FastAPI:
         import torch
 
         if threads:
             torch.set_num_threads(threads)
-        studio = Studio(model, tables)
+        studio = Studio(model, datasets)
         return build_studio_app(lambda: studio, token, hosts)
 
     @ray.serve.deployment(

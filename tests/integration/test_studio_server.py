@@ -52,7 +52,7 @@ def test_studio_reports_progress_and_cancels(studio_url):
     first = session.get(f"{studio_url}api/state").json()["scene"]
     post(session, studio_url, "generate", {"steps": 1000, "sampler": "ddpm"})
     busy = post(session, studio_url, "edit", {"edits": [{"edit": "remove", "select": {"primitives": [0]}}]})
-    assert busy.status_code == 409 and "is at work" in busy.json()["detail"]
+    assert busy.status_code == 409 and "is still running" in busy.json()["detail"]
     assert post(session, studio_url, "generate", {}).status_code == 429
     post(session, studio_url, "cancel", {})
     work = finished(session, studio_url)

@@ -196,7 +196,7 @@ def test_ap3d_truncates_per_scene_and_category():
 
 def test_ap3d_score_threshold_equals_dropping_detections():
     truths, predictions = random_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as returned by scene_from_layout
+    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as returned by decode_layout
     got = scores(truths, predictions, min_score=0.375)
     assert got == scores(truths, dropped)
     assert list(got.at_threshold) == [f"{t:.2f}" for t in THRESHOLDS]

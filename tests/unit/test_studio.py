@@ -76,7 +76,8 @@ def test_studio_requires_its_token(studio_files):
     """The same interface without Ray, on any host name."""
     from starlette.testclient import TestClient
 
-    from pipelines.studio.session import Studio, build_studio_app
+    from pipelines.studio.api import build_studio_app
+    from pipelines.studio.session import Studio
 
     studio = Studio(str(studio_files / "model"), [])
     client = TestClient(build_studio_app(lambda: studio, "secret", ()), base_url="http://studio.example")

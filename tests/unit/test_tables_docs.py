@@ -1,6 +1,6 @@
 """docs/tables.md: every block runs, every answer is right, the column lists are the schemas'; files explain themselves.
 
-python tests/test_tables_docs.py      writes the lists of columns and categories into the page
+python tests/unit/test_tables_docs.py      writes the lists of columns and categories into the page
 """
 
 import json
@@ -192,7 +192,7 @@ def answers(root) -> dict[str, pd.DataFrame]:
 
 def test_tables_page_lists_equal_schemas():
     page = PAGE.read_text()
-    assert page == with_lists(page), "run python tests/test_tables_docs.py"
+    assert page == with_lists(page), "run python tests/unit/test_tables_docs.py"
 
 
 @pytest.mark.parametrize("question", QUESTIONS)

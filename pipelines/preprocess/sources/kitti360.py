@@ -26,7 +26,7 @@ from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 
 SOURCE = "kitti360"
 
-# Label -> category, the paper's Tab. "object categories". Labels are compared by `_plain`: without case,
+# Label -> category, the paper's Tab. "object categories". Labels are compared by `_convert_to_plain`: without case,
 # blanks and underscores, so the XML's "trafficSign" and the development kit's "traffic sign" are one.
 CATEGORY_LABELS = {
     "vegetation_cuboid": ("vegetation",),  # vegetation_ellipsoid if it is a sphere mesh

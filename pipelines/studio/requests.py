@@ -1,0 +1,52 @@
+"""What a visitor of the studio can ask for, with the limits of every value."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.composition.extend import Side
+from models.composition.inpaint import Contents
+from models.sampling.repaint import RePaintConfig
+
+
+class StudioRequest(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class OpenRequest(StudioRequest):
+    scene_id: str = Field(max_length=200)
+
+
+class SamplingRequest(StudioRequest):
+    label: str = Field("", max_length=40)  # "": the scene's own, or the first
+    seed: int = Field(0, ge=0, lt=2**31)
+    steps: int = Field(20, ge=1, le=1000)
+
+
+class GenerateRequest(SamplingRequest):
+    sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "dpm++"
+
+
+class RepaintRequest(SamplingRequest):
+    jump_length: int = Field(1, ge=1, le=100)
+    resamplings: int = Field(1, ge=1, le=20)
+    pseudoinverse_guidance: float = Field(1.0, ge=0, le=10)
+    eta: float = Field(0.0, ge=0, le=1)
+
+    def repaint(self) -> RePaintConfig:
+        return RePaintConfig(self.steps, self.jump_length, self.resamplings, self.pseudoinverse_guidance, self.eta)
+
+
+class InpaintRequest(RepaintRequest):
+    polygon_m: list[tuple[float, float]] = Field(min_length=3, max_length=500)
+    contents: Contents = "both"
+
+
+class ExtendRequest(RepaintRequest):
+    side: Side
+
+
+class EditsRequest(StudioRequest):
+    edits: list[dict] = Field(min_length=1, max_length=100)
