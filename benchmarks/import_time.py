@@ -1,6 +1,6 @@
 """CPU seconds from the start of a process until it can work: the interpreter alone, a loaded pipeline, Ray workers.
 
-    python benchmarks/import_time.py                    half a minute
+    python benchmarks/import_time.py                    a minute
 
 A Ray worker's seconds include Ray's own start. torch is listed as the unit: its import differs between machines too.
 """
