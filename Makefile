@@ -3,9 +3,9 @@
 #   make demo        train, sample and report with the demo preset
 #   make lint        ruff (rules and format) and pyright
 #   make test-fast   tests/unit: no Ray, no browser, about a minute
-#   make test        all tests but slow ones
+#   make test        all tests but slow ones, with line coverage
 #   make test-slow   long checks, marked slow
-#   make coverage    tests/unit with line coverage
+#   make coverage    lines that the last make test did not run, without those in Ray's processes
 PYTHON ?= python3
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2
@@ -21,8 +21,8 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # All processes of Ray import the same modules: without bytecode on disk each compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-TESTS := test test-fast test-slow coverage
-.PHONY: demo lint $(TESTS) browser clean
+TESTS := test test-fast test-slow
+.PHONY: demo lint $(TESTS) coverage browser clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
 
@@ -40,13 +40,15 @@ test-fast: .venv/ready
 	$(PYTEST) tests/unit
 
 test: .venv/ready browser
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow" --cov --cov-report=
+	@echo "line coverage: $$($(BIN)/coverage report --format=total) % (make coverage lists the lines missed)"
 
 test-slow: .venv/ready
 	$(PYTEST) -m slow
 
 coverage: .venv/ready
-	$(PYTEST) tests/unit --cov
+	@test -f .coverage || { echo "run make test first; it measures the coverage"; exit 1; }
+	$(BIN)/coverage report
 
 # CI needs a browser, as skipped browser tests fail there. Elsewhere this does nothing.
 browser:

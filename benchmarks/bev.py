@@ -16,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import tyro
-from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from common import DENSE_SEEDS, describe_machine, format_ratios, spread, time_interleaved
 
 from models.scene import ELLIPSOID, Grid, Scene
 from pipelines.preprocess.sources.town.generator import generate_town
@@ -29,7 +29,7 @@ SCENES = 32
 PICTURES, CORES = 50_000, 2  # pictures of an evaluation on the paper's scale
 
 
-def plain(scene: Scene, supersample: int) -> np.ndarray:
+def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
     """`render_bev` at one pixel per raster pixel, written in the obvious way."""
     grid = scene.grid
     fine = Grid(
@@ -74,7 +74,7 @@ def plain(scene: Scene, supersample: int) -> np.ndarray:
 
 
 def main(dataset: str = "") -> None:
-    print(where())
+    print(describe_machine())
     if dataset:
         chosen = SceneSubset(dataset, limit=SCENES).shards()
         scenes = [scene for shard, rows in chosen for scene in shard.scenes(rows)]
@@ -89,10 +89,12 @@ def main(dataset: str = "") -> None:
         f"{np.mean([s.occupied.any(axis=(1, 2)).sum() for s in scenes]):.1f} ground classes each"
     )
     for supersample in (1, 2):
-        differ = [(plain(s, supersample) != render_bev(s, supersample=supersample)).any(axis=-1) for s in scenes]
-        seconds = interleaved(
+        differ = [
+            (render_plainly(s, supersample) != render_bev(s, supersample=supersample)).any(axis=-1) for s in scenes
+        ]
+        seconds = time_interleaved(
             {
-                "plain": lambda _, k=supersample: [plain(s, k) for s in scenes],
+                "plain": lambda _, k=supersample: [render_plainly(s, k) for s in scenes],
                 "ours": lambda _, k=supersample: [render_bev(s, supersample=k) for s in scenes],
             },
             ROUNDS,
@@ -101,7 +103,8 @@ def main(dataset: str = "") -> None:
         minutes = [ms / 1e3 * PICTURES / CORES / 60 for ms in per_scene["ours"]]
         print(
             f"supersampling {supersample}: plain {spread(per_scene['plain'], 1, 1)} ms, "
-            f"ours {spread(per_scene['ours'])} ms a scene and core: {ratios(seconds['plain'], seconds['ours'])}; "
+            f"ours {spread(per_scene['ours'])} ms a scene and core: "
+            f"{format_ratios(seconds['plain'], seconds['ours'])}; "
             f"{PICTURES:,} pictures on {CORES} cores {spread(minutes, 1, 1)} minutes; "
             f"{np.sum(differ)} of {np.size(differ)} pixels differ"
         )

@@ -17,13 +17,13 @@ from pipelines.runtime import provenance
 DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop
 
 
-def where() -> str:
+def describe_machine() -> str:
     """Describe the machine, versions and commit in one line."""
     machine, versions, commit = provenance.describe_machine(), provenance.list_versions(), provenance.find_commit()
     return f"{machine}, {versions}, numpy {np.__version__}, commit {commit}"
 
 
-def interleaved(
+def time_interleaved(
     ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, list[float]]:
     """Time each way once per round, in turn, so that a busy machine slows all of them.
@@ -45,7 +45,7 @@ def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
-def ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
+def format_ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
     """Format the ratios of `slow` to `fast`, round by round."""
     return spread([a / b for a, b in zip(slow, fast, strict=True)], digits=digits) + " x"
 

@@ -19,7 +19,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 import tyro
-from common import interleaved, ratios, spread, where
+from common import describe_machine, format_ratios, spread, time_interleaved
 from diffusers import DiTTransformer2DModel
 from plain_dit import PlainDiT
 
@@ -37,7 +37,7 @@ class Config:
     threads: int = 2
 
 
-def products(dit: DiT, batch: int) -> Callable[[], None]:
+def make_matrix_products(dit: DiT, batch: int) -> Callable[[], None]:
     """Return a function that runs only the matrix products of a step: a lower bound of its time on this machine."""
     c, tokens = dit.config, (dit.config.size // dit.config.patch) ** 2
     wide, deep = torch.randn(batch * tokens, c.width), torch.randn(batch * tokens, 4 * c.width)
@@ -65,7 +65,7 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
     print(f"{name}, batch {batch}: all modulations of 250 steps: {time.perf_counter() - start:.2f} s, once")
     for same in (plain, prepared):
         assert torch.allclose(same(latent, at[9], label), ours(latent, at[9], label), atol=1e-3)
-    gemm, doubled = products(ours, batch), with_guidance(ours, ours.null_label, 1.0 + 1e-9)
+    gemm, doubled = make_matrix_products(ours, batch), with_guidance(ours, ours.null_label, 1.0 + 1e-9)
     ways = {
         "ours": lambda k: prepared(latent, at[k], label),
         "ours, modulations in the step": lambda k: ours(latent, at[k], label),
@@ -76,16 +76,16 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
     }
     for way in ways.values():
         way(0)
-    seconds = interleaved(ways, rounds, time.perf_counter)
+    seconds = time_interleaved(ways, rounds, time.perf_counter)
     for way, found in seconds.items():
         print(f"{name}, batch {batch}, {way}: {spread(found, 1e3, 0)} ms")
     for way in list(ways)[1:]:
-        print(f"{name}, batch {batch}: ours takes {ratios(seconds['ours'], seconds[way], 2)} {way}")
+        print(f"{name}, batch {batch}: ours takes {format_ratios(seconds['ours'], seconds[way], 2)} {way}")
 
 
 def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
-    print(where(), f"{config.threads} threads")
+    print(describe_machine(), f"{config.threads} threads")
     torch.manual_seed(0)
     ours = DiT(**DIT_PRESETS[config.preset].architecture()).eval().requires_grad_(False)
     for parameter in ours.parameters():  # with the initial zeros, most of the network would have no effect

@@ -16,7 +16,7 @@ import time
 import numpy as np
 import scipy.linalg
 import torch
-from common import interleaved, ratios, spread, where
+from common import describe_machine, format_ratios, spread, time_interleaved
 
 from pipelines.metrics.frechet import Moments, compute_frechet_distance, compute_moments
 from pipelines.metrics.neighbours import compute_neighbourhoods, prepare_features
@@ -25,7 +25,7 @@ DIMENSIONS = 2048
 ROUNDS = 3
 
 
-def features(count: int, seed: int, falling: bool) -> np.ndarray:
+def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
     """(count, 2048) float32; `falling`: mean squares along a random basis fall as 1 / rank^2, and features are >= 0."""
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((count, DIMENSIONS), dtype=np.float32)
@@ -36,7 +36,7 @@ def features(count: int, seed: int, falling: bool) -> np.ndarray:
     return np.maximum(0.1 + 0.001 * seed + (values * strength) @ mix, 0)
 
 
-def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
+def compute_adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
     """Compute precision and recall as ADM's evaluator does.
 
     Distances are |x|^2 - 2 x.y + |y|^2 in float16, and whole rows are sorted to find the radius.
@@ -54,21 +54,21 @@ def adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) ->
     return float(precision), float(recall)
 
 
-def adm_frechet(a: Moments, b: Moments) -> float:
+def compute_adm_frechet(a: Moments, b: Moments) -> float:
     """Compute the Frechet distance with a general matrix square root, as ADM does."""
     root = scipy.linalg.sqrtm(a.covariance @ b.covariance).real
     return float(np.square(a.mean - b.mean).sum() + np.trace(a.covariance + b.covariance - 2 * root))
 
 
-def peak_gib() -> float:
+def read_peak_gib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def against_adm() -> None:
-    real, generated = (features(1000, seed, True) for seed in (0, 1))
-    found = interleaved(
+def compare_with_adm() -> None:
+    real, generated = (make_features(1000, seed, True) for seed in (0, 1))
+    found = time_interleaved(
         {
-            "ADM": lambda _: adm_precision_recall(real, generated),
+            "ADM": lambda _: compute_adm_precision_recall(real, generated),
             "ours": lambda _: compute_neighbourhoods(real, generated),
         },
         ROUNDS,
@@ -76,27 +76,27 @@ def against_adm() -> None:
     )
     print(
         f"precision and recall, 1,000 a side: ADM {spread(found['ADM'])} s, ours {spread(found['ours'])} s: "
-        f"{ratios(*found.values())}"
+        f"{format_ratios(*found.values())}"
     )
-    theirs, ours = adm_precision_recall(real, generated), compute_neighbourhoods(real, generated)[0]
+    theirs, ours = compute_adm_precision_recall(real, generated), compute_neighbourhoods(real, generated)[0]
     print(f"  ADM {theirs[0]:.4f} {theirs[1]:.4f}, ours, exact, {ours.precision:.4f} {ours.recall:.4f}")
-    a, b = compute_moments(features(5000, 0, True)), compute_moments(features(5000, 1, True))
-    found = interleaved(
-        {"sqrtm": lambda _: adm_frechet(a, b), "eigenvalues": lambda _: compute_frechet_distance(a, b)},
+    a, b = compute_moments(make_features(5000, 0, True)), compute_moments(make_features(5000, 1, True))
+    found = time_interleaved(
+        {"sqrtm": lambda _: compute_adm_frechet(a, b), "eigenvalues": lambda _: compute_frechet_distance(a, b)},
         ROUNDS,
         time.perf_counter,
     )
     print(
         f"FID from moments: sqrtm {spread(found['sqrtm'])} s, eigenvalues {spread(found['eigenvalues'])} s: "
-        f"{ratios(*found.values())}"
+        f"{format_ratios(*found.values())}"
     )
-    print(f"  relative difference {abs(adm_frechet(a, b) / compute_frechet_distance(a, b) - 1):.1e}")
+    print(f"  relative difference {abs(compute_adm_frechet(a, b) / compute_frechet_distance(a, b) - 1):.1e}")
 
 
-def alone(count: int) -> None:
+def time_scores(count: int) -> None:
     for name, falling in (("falling spectrum", True), ("isotropic", False)):
-        real, generated = (features(count, seed, falling) for seed in (0, 1))
-        before, seconds = peak_gib(), []
+        real, generated = (make_features(count, seed, falling) for seed in (0, 1))
+        before, seconds = read_peak_gib(), []
         for _ in range(ROUNDS):
             start = time.perf_counter()
             found = compute_neighbourhoods(real, generated)[0]
@@ -104,22 +104,22 @@ def alone(count: int) -> None:
         axes = prepare_features(real, generated, (3,))[0].left.shape[1] - 3
         print(
             f"precision and recall, {count:,} a side, {name} ({axes} axes): {spread(seconds)} s, "
-            f"{peak_gib() - before:.2f} GiB above the features; {found.precision:.4f} {found.recall:.4f}"
+            f"{read_peak_gib() - before:.2f} GiB above the features; {found.precision:.4f} {found.recall:.4f}"
         )
 
 
-def over_ray(count: int) -> None:
+def time_scores_over_ray(count: int) -> None:
     import ray
 
     from pipelines.evaluation.evaluate import map_neighbourhoods
 
     ray.init(address="local", logging_level="WARNING")
-    real, generated = (features(count, seed, True) for seed in (0, 1))
+    real, generated = (make_features(count, seed, True) for seed in (0, 1))
     start = time.perf_counter()
     found = map_neighbourhoods(real, generated, (3,))[0]
     print(
         f"precision and recall, {count:,} a side over Ray: {time.perf_counter() - start:.0f} s, driver's peak "
-        f"{peak_gib():.1f} GiB; {found.precision:.4f} {found.recall:.4f}"
+        f"{read_peak_gib():.1f} GiB; {found.precision:.4f} {found.recall:.4f}"
     )
 
 
@@ -127,12 +127,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=int, help="a side, over Ray")
     count = parser.parse_args().samples
-    print(where())
+    print(describe_machine())
     if count:
-        over_ray(count)
+        time_scores_over_ray(count)
     else:
-        against_adm()
-        alone(10_000)
+        compare_with_adm()
+        time_scores(10_000)
 
 
 if __name__ == "__main__":

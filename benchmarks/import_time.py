@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import ray
 import tyro
-from common import where
+from common import describe_machine
 
 PROCESSES = {
     "import torch": "import torch",
@@ -61,7 +61,7 @@ def measure_worker(modules: list[str]) -> float:
 
 
 def main(config: Config) -> None:
-    print(where())
+    print(describe_machine())
     seconds: dict[str, list[float]] = {}
     ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     for _ in range(config.rounds):  # in turn, so that a busy machine slows all alike

@@ -16,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests/unit"))
 
 import numpy as np
-from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from common import DENSE_SEEDS, describe_machine, format_ratios, spread, time_interleaved
 from scipy.spatial.transform import Rotation
 from test_iou3d import TOLERANCE, disturbed, halfspace_iou, manifold_iou, pairs, random_boxes, sphere_lens
 
@@ -38,14 +38,14 @@ PAPER_OBJECTS = 514
 
 
 def main() -> None:
-    print(where())
-    overlapping_pairs()
-    whole_scenes()
-    errors()
-    ellipsoids()
+    print(describe_machine())
+    time_overlapping_pairs()
+    time_whole_scenes()
+    print_errors()
+    print_ellipsoid_errors()
 
 
-def overlapping_pairs() -> None:
+def time_overlapping_pairs() -> None:
     """Time overlapping boxes of any rotation: ours against manifold3d, per pair."""
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
@@ -56,16 +56,16 @@ def overlapping_pairs() -> None:
         "ours": lambda _: compute_iou3d_pairs(a, b),
         "manifold3d": lambda _: manifold_iou(a.take(few), b.take(few)),
     }
-    seconds = interleaved(ways, ROUNDS)
+    seconds = time_interleaved(ways, ROUNDS)
     ours, theirs = ([s / n for s in seconds[name]] for name, n in (("ours", len(kept)), ("manifold3d", len(few))))
     rates = [[1e-3 / s for s in per_pair] for per_pair in (ours, theirs)]
     print(
         f"{len(kept)} overlapping pairs, thousand pairs/s/core: ours {spread(rates[0], 1, 0)}, "
-        f"manifold3d {spread(rates[1])}: {ratios(theirs, ours, 0)}"
+        f"manifold3d {spread(rates[1])}: {format_ratios(theirs, ours, 0)}"
     )
 
 
-def whole_scenes() -> None:
+def time_whole_scenes() -> None:
     """Time all pairs of predicted and true boxes of a scene; bounds cull most of them, in AP3D also categories."""
     rng = np.random.default_rng(1)
     scenes = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
@@ -81,7 +81,7 @@ def whole_scenes() -> None:
             survive = sum(
                 int(mask[find_overlapping_bounds(a, b)].sum()) for (a, b, _), mask in zip(sides, masks, strict=True)
             )
-            seconds = interleaved(
+            seconds = time_interleaved(
                 {
                     kind: lambda _, s=sides, w=masks: [
                         compute_iou3d_matrix(a, b, m) for (a, b, _), m in zip(s, w, strict=True)
@@ -97,7 +97,7 @@ def whole_scenes() -> None:
             )
 
 
-def errors() -> None:
+def print_errors() -> None:
     """Print errors against manifold3d, or against half-space intersection where manifold3d is off the tolerance."""
     print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
     total = wrong = 0
@@ -114,20 +114,20 @@ def errors() -> None:
     print(f"{wrong} of {total} pairs off by more than {TOLERANCE:g}")
 
 
-def ellipsoids() -> None:
+def print_ellipsoid_errors() -> None:
     """Print errors against the closed form of spheres; stretching both makes ellipsoids and keeps the IoU."""
     rng, n = np.random.default_rng(2), 2_000
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
     lens = sphere_lens(*radius, distance)
     exact = lens / (4 / 3 * np.pi * (radius**3).sum(axis=0) - lens)
     stretch, turn = np.exp(rng.uniform(-1, 1, (n, 3))), Rotation.random(n, rng=rng).as_matrix()
-    center = np.stack([np.zeros((n, 3)), distance[:, None] * directions(rng, n)])
+    center = np.stack([np.zeros((n, 3)), distance[:, None] * draw_directions(rng, n)])
     sides = [
         Boxes(np.einsum("nij,nj->ni", turn, c * stretch), turn, 2 * r[:, None] * stretch)
         for c, r in zip(center, radius, strict=True)
     ]
     error = compute_ellipsoid_iou3d_pairs(*sides) - exact
-    seconds = interleaved({"ours": lambda _: compute_ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
+    seconds = time_interleaved({"ours": lambda _: compute_ellipsoid_iou3d_pairs(*sides)}, ROUNDS)["ours"]
     print(
         f"ellipsoids, sampled: largest error {np.abs(error).max():.4f}, "
         f"root mean square {np.sqrt(np.mean(error**2)):.5f}; "
@@ -139,7 +139,7 @@ def ellipsoids() -> None:
     print(f"ellipsoids of dense towns: {', '.join(map(str, survive))} pairs a scene survive their bounds")
 
 
-def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+def draw_directions(rng: np.random.Generator, n: int) -> np.ndarray:
     at = rng.normal(size=(n, 3))
     return at / np.linalg.norm(at, axis=1, keepdims=True)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
-from common import where
+from common import describe_machine
 
 from models.lvae import LayoutVAE
 from models.scene import CATEGORIES, Scene
@@ -42,7 +42,7 @@ class Config:
     seed: int = 0
 
 
-def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
+def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
     """Decode posterior means with noise of the given number of deviations; ids and labels are kept."""
     generator = torch.Generator().manual_seed(seed)
     made = []
@@ -54,7 +54,7 @@ def decoded(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> li
     return made
 
 
-def said(scenes: list[Scene], dataset: Dataset) -> str:
+def format_counts(scenes: list[Scene], dataset: Dataset) -> str:
     """Format mean counts of the categories and the validity of scenes."""
     offset_m = find_slab_offset_m(dataset.spec.surface)
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
@@ -72,12 +72,15 @@ def main(config: Config) -> None:
     scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
     if not scenes:
         raise SystemExit(f"{config.dataset} holds no scenes of split {config.split!r}")
-    print(where(), f"{len(scenes)} scenes")
-    print("as they are:", said(scenes, dataset))
+    print(describe_machine(), f"{len(scenes)} scenes")
+    print("as they are:", format_counts(scenes, dataset))
     for directory in config.lvae:
         lvae = load_lvae(directory)
         for noise in config.noise:
-            print(f"{directory}, noise {noise}:", said(decoded(lvae, scenes, noise, config.seed), dataset))
+            print(
+                f"{directory}, noise {noise}:",
+                format_counts(decode_with_noise(lvae, scenes, noise, config.seed), dataset),
+            )
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import plain
 import torch
 import tyro
-from common import ratios, spread, where
-from matching import town_batch
+from common import describe_machine, format_ratios, spread
+from matching import make_town_batch
 
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
@@ -33,7 +33,7 @@ class Config:
     threads: int = 2
 
 
-def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch.Tensor) -> dict[str, float]:
+def time_step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch.Tensor) -> dict[str, float]:
     """Run one step and return the seconds of its parts, and its loss."""
     clock = time.perf_counter()
     seconds = {}
@@ -48,13 +48,13 @@ def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch
     lap("forward")
     matching = losses.match_primitives
 
-    def timed(*args):
+    def match_timed(*args):
         lap("losses")
         result = matching(*args)
         lap("matching")
         return result
 
-    losses.match_primitives = timed
+    losses.match_primitives = match_timed
     try:
         total = compute_lvae_loss(output, posterior, batch, model.spec).total
     finally:
@@ -70,12 +70,12 @@ def step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch
 
 def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
-    print(where(), f"{config.threads} threads")
+    print(describe_machine(), f"{config.threads} threads")
     for name in config.presets:
         row = find_preset(LVAE_PRESETS, name)
         batch_size = 2 if name == "kitti360" else row.batch_size
         spec = LayoutSpec().with_resolution(row.raster_px)
-        batch = town_batch(spec, max(4, batch_size))
+        batch = make_town_batch(spec, max(4, batch_size))
         batch = type(batch)(*(getattr(batch, field)[:batch_size] for field in batch.__dataclass_fields__))
         models = {}
         for way, decoder in (("as it is", row.model.objects.decoder), ("ours", "detr"), ("plain", "detr")):
@@ -89,8 +89,8 @@ def main(config: Config) -> None:
         rounds: dict[str, list[dict[str, float]]] = {way: [] for way in models}
         for k in range(config.rounds + 1):
             for way, trained in models.items():
-                with plain.in_place_of_ours() if way == "plain" else contextlib.nullcontext():
-                    rounds[way].append(step(*trained, batch, noise))
+                with plain.replace_ours() if way == "plain" else contextlib.nullcontext():
+                    rounds[way].append(time_step(*trained, batch, noise))
             assert abs(rounds["ours"][k]["loss"] / rounds["plain"][k]["loss"] - 1) < 1e-3, "not the same objective"
         rounds = {way: found[1:] for way, found in rounds.items()}  # the first round warms up
         total = {
@@ -101,7 +101,7 @@ def main(config: Config) -> None:
                 f"{part} {spread([r[part] for r in found], 1e3, 0)}" for part in found[0] if part != "loss"
             )
             print(f"{name}, batch {batch_size}, {way}: step {spread(total[way], 1e3, 0)} ms: {parts}")
-        print(f"{name}: plain takes {ratios(total['plain'], total['ours'], 2)} the time of ours")
+        print(f"{name}: plain takes {format_ratios(total['plain'], total['ours'], 2)} the time of ours")
 
 
 if __name__ == "__main__":

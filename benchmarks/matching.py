@@ -13,7 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import plain
 import torch
-from common import interleaved, ratios, spread, where
+from common import describe_machine, format_ratios, spread, time_interleaved
 
 from models.layout import LayoutSpec
 from models.scene import Grid
@@ -24,7 +24,7 @@ from pipelines.preprocess.sources.town.generator import generate_town
 BATCH = 32
 
 
-def town_batch(spec: LayoutSpec, batch: int):
+def make_town_batch(spec: LayoutSpec, batch: int):
     """Return layouts of `batch` town scenes from several districts."""
     scenes = []
     for seed in range(4):
@@ -37,8 +37,8 @@ def town_batch(spec: LayoutSpec, batch: int):
 def main() -> None:
     torch.set_num_threads(1)
     spec = LayoutSpec()
-    truth = town_batch(spec.with_resolution(32), BATCH)
-    print(where())
+    truth = make_town_batch(spec.with_resolution(32), BATCH)
+    print(describe_machine())
     print(
         f"batch {BATCH}, {spec.num_slots} slots in {len(spec.slots)} categories, "
         f"{float(truth.real.sum(1).float().mean()):.0f} real primitives a scene"
@@ -47,7 +47,7 @@ def main() -> None:
     noise = torch.randn(truth.features.shape, generator=generator)
     for name, features in (
         ("untrained", torch.rand(truth.features.shape, generator=generator)),
-        ("trained (truth, shuffled, noise of 0.02)", shuffled(truth.features + 0.02 * noise, spec, generator)),
+        ("trained (truth, shuffled, noise of 0.02)", shuffle_slots(truth.features + 0.02 * noise, spec, generator)),
     ):
         logit = torch.randn(truth.real.shape, generator=generator)
         given = (features, logit, truth.features, truth.real, spec.slots, spec.slots, PAPER_WEIGHTS)
@@ -57,22 +57,22 @@ def main() -> None:
             "ours": lambda _, given=given, found=found: found.update(ours=match_primitives(*given)),
         }
         torch.set_num_threads(1)
-        seconds = interleaved(ways, 7)
-        cost = {k: plain.total_cost(*given[:4], a, *given[4:]) for k, a in found.items()}
+        seconds = time_interleaved(ways, 7)
+        cost = {k: plain.sum_cost(*given[:4], a, *given[4:]) for k, a in found.items()}
         difference = abs(cost["ours"] - cost["padded"]) / cost["padded"]
         print(
             f"{name}: padded {spread(seconds['padded'], 1e3, 0)} ms, ours {spread(seconds['ours'], 1e3, 1)} ms: "
-            f"{ratios(seconds['padded'], seconds['ours'])}; total costs differ by {difference:.1e}"
+            f"{format_ratios(seconds['padded'], seconds['ours'])}; total costs differ by {difference:.1e}"
         )
         torch.set_num_threads(os.cpu_count())
-        seconds = interleaved(ways, 7, time.perf_counter)
+        seconds = time_interleaved(ways, 7, time.perf_counter)
         print(
             f"  on all cores, by the clock: padded {spread(seconds['padded'], 1e3, 0)} ms, "
-            f"ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['padded'], seconds['ours'])}"
+            f"ours {spread(seconds['ours'], 1e3, 1)} ms: {format_ratios(seconds['padded'], seconds['ours'])}"
         )
 
 
-def shuffled(features: torch.Tensor, spec: LayoutSpec, generator: torch.Generator) -> torch.Tensor:
+def shuffle_slots(features: torch.Tensor, spec: LayoutSpec, generator: torch.Generator) -> torch.Tensor:
     """Permute slots within their categories."""
     groups = features.split(spec.slots, dim=1)
     return torch.cat([g[:, torch.randperm(g.shape[1], generator=generator)] for g in groups], dim=1)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import tyro
-from common import where
+from common import describe_machine
 
 from models.composition.outpaint import BlockComposer, BlockGrid, SceneBlock, find_ground_height
 from models.layout import LayoutSpec
@@ -36,11 +36,11 @@ class Config:
     """Directory of a trained layout VAE of the town."""
     seeds: tuple[int, ...] = tuple(range(10_000, 10_016))
     """Towns; none that training has seen."""
-    pairs: int = 4
+    make_pairs: int = 4
     """Of each town."""
 
 
-def pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
+def make_pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
     """Return scenes of a town and the scenes 32 m ahead, each in its own frame with the same heading and height."""
     drive, grid = generate_town(seed), Grid()
     large = replace(grid, front_m=grid.front_m + STEP_M, rows=grid.rows + round(STEP_M / grid.resolution_m))
@@ -60,7 +60,7 @@ def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str,
     def encode(scenes: Sequence[Scene]) -> torch.Tensor:
         return lvae.encode(make_layout_batch(list(scenes), spec)).mean
 
-    def decoded(latent: torch.Tensor) -> Scene:
+    def decode_latent(latent: torch.Tensor) -> Scene:
         return decode_layout(lvae.decode(latent[None]).layouts()[0], spec, empty)
 
     empty = make_empty_scene(second.scene_id, second.source, second.sequence, second.frame, spec)
@@ -71,18 +71,18 @@ def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str,
         condition = composer.condition_block((1, 0), blocks, empty, mode)
         truth = second.translate(0, 0, -condition.datum_m)
         latent = torch.where(condition.mask.bool(), encode([truth])[0], condition.latent)
-        found[mode] = compute_drift(truth, decoded(latent), condition.new_pixels)
+        found[mode] = compute_drift(truth, decode_latent(latent), condition.new_pixels)
         if mode == "reencode":
-            found["own latent"] = compute_drift(truth, decoded(encode([truth])[0]), condition.new_pixels)
+            found["own latent"] = compute_drift(truth, decode_latent(encode([truth])[0]), condition.new_pixels)
     return found
 
 
 def main(config: Config) -> None:
     lvae = load_lvae(config.lvae)
-    print(where())
+    print(describe_machine())
     sums: dict[str, list] = {}
     for seed in config.seeds:
-        for first, second in pairs(seed, config.pairs, lvae.spec):
+        for first, second in make_pairs(seed, config.pairs, lvae.spec):
             for way, found in compare(lvae, first, second).items():
                 sums.setdefault(way, []).append(found)
     print(f"{len(sums['copy'])} pairs of {len(config.seeds)} towns, known half of the second block")

@@ -18,7 +18,7 @@ from models.vae import losses
 from models.vae.objects import ObjectEncoder
 
 
-def square_cost(features, logit, truth, real, weights) -> torch.Tensor:
+def compute_square_cost(features, logit, truth, real, weights) -> torch.Tensor:
     """Compute the (n, n) costs of one sample and category, truth padded to n rows (supplement Eq. "match")."""
     n, missing = len(features), len(features) - len(truth)
     truth = F.pad(truth, (0, 0, 0, missing))
@@ -43,7 +43,9 @@ def match_primitives(features, logit, truth, real, slots, proposals, weights) ->
         for capacity, offered in zip(slots, proposals, strict=True):
             mine, theirs = slice(proposal, proposal + offered), slice(slot, slot + capacity)
             flags = real[sample, theirs]
-            cost = square_cost(features[sample, mine], logit[sample, mine], truth[sample, theirs], flags, weights)
+            cost = compute_square_cost(
+                features[sample, mine], logit[sample, mine], truth[sample, theirs], flags, weights
+            )
             rows, cols = linear_sum_assignment(cost.numpy())
             for row, col in zip(rows, cols, strict=True):
                 if row < capacity and flags[row]:
@@ -77,7 +79,7 @@ def compute_object_losses(features, logit, truth, real, assignment, spec: Layout
 
 
 @contextlib.contextmanager
-def in_place_of_ours():
+def replace_ours():
     """Context in which the objective and the object encoder are the plain ones."""
     kept = losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding
     losses.match_primitives, losses.compute_object_losses = match_primitives, compute_object_losses
@@ -92,14 +94,14 @@ def in_place_of_ours():
         losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding = kept
 
 
-def total_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:
+def sum_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:
     """Sum the cost of an assignment over all samples and categories, padding included, in float64."""
     total = 0.0
     for sample in range(len(features)):
         slot = proposal = 0
         for capacity, offered in zip(slots, proposals, strict=True):
             mine, theirs = slice(proposal, proposal + offered), slice(slot, slot + capacity)
-            cost = square_cost(
+            cost = compute_square_cost(
                 features[sample, mine].double(),
                 logit[sample, mine].double(),
                 truth[sample, theirs].double(),

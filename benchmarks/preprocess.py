@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import trimesh
 import tyro
-from common import interleaved, ratios, spread, where, with_dense_poses, write_raw
+from common import describe_machine, format_ratios, spread, time_interleaved, with_dense_poses, write_raw
 
 from models.scene import Grid
 from pipelines.preprocess import shard_writer
@@ -48,7 +48,7 @@ class Config:
     """Scenes to cast rays for."""
 
 
-def density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
+def measure_density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
     """Return the mean numbers of primitives and slabs in a crop."""
     primitives, slabs = [], []
     for k in poses:
@@ -78,7 +78,7 @@ def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
     return height.reshape(-1, grid.rows, grid.cols)
 
 
-def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
+def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
     """Measure CPU milliseconds per scene by stage: shards of 256 as pass 1 writes them."""
     spent = dict.fromkeys(("cut and rasterise", "to tables", "write Parquet"), 0.0)
     for number, start in enumerate(range(0, len(poses), 256)):
@@ -102,7 +102,7 @@ def speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, fl
     return {name: 1e3 * seconds / len(poses) for name, seconds in spent.items()}
 
 
-def agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
+def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
     """Return shares: of pixel and class decisions that agree with rays, of common pixels within 1 cm; worst metres."""
     same, within, worst = [], [], 0.0
     for index in indices:
@@ -117,7 +117,7 @@ def agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, flo
     return float(np.mean(same)), float(np.mean(within)), worst
 
 
-def stored_exactly(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
+def measure_storage_error(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
     """Return whether tables hold all masks exactly, and the largest height error in metres."""
     stored = Shard(out, "kitti360", "train", 0).scenes()[: len(poses)]
     masks, worst = True, 0.0
@@ -128,16 +128,16 @@ def stored_exactly(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tup
     return masks, worst
 
 
-def peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
+def measure_peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
     """In a process of its own: poses of a sequence, and its peak resident megabytes for reading it and one shard."""
     with tempfile.TemporaryDirectory() as folder:
         write_kitti360(with_dense_poses(generate_town(4), spacing_m), folder + "/raw")
-        child = multiprocessing.get_context("spawn").Process(target=_one_shard, args=(folder, results))
+        child = multiprocessing.get_context("spawn").Process(target=_write_one_shard, args=(folder, results))
         child.start()
         child.join()
 
 
-def _one_shard(folder: str, results: multiprocessing.Queue) -> None:
+def _write_one_shard(folder: str, results: multiprocessing.Queue) -> None:
     tasks = plan_kitti360(folder + "/raw", split=False)
     shard_writer.write_shard(tasks[0], folder + "/out", Grid())
     poses = sum(len(task.parts[0].poses) for task in tasks)
@@ -151,7 +151,7 @@ def main(config: Config) -> None:
     if not config.raw:
         write_raw(raw)
     sequence = kitti360.list_sequences(raw)[-1]
-    print(where())
+    print(describe_machine())
     xml = raw / f"data_3d_bboxes/train_full/2013_05_28_drive_{sequence}_sync.xml"
     clock = time.process_time()
     drive, report = kitti360.read_drive(raw, sequence)
@@ -162,13 +162,13 @@ def main(config: Config) -> None:
         f"{megabytes / parse:.1f} MB/s"
     )
     poses = np.linspace(0, len(drive) - 1, min(config.scenes, len(drive))).astype(int)
-    primitives, slabs = density(drive, poses[:: max(1, len(poses) // 50)], grid)
+    primitives, slabs = measure_density(drive, poses[:: max(1, len(poses) // 50)], grid)
     print(
         f"density   {primitives:.0f} primitives and {slabs:.0f} slabs "
         f"in a crop of {grid.rows} x {grid.cols} x {len(drive.ground_classes)}"
     )
     with tempfile.TemporaryDirectory() as out:
-        rounds = [speed(drive, poses, grid, f"{out}/{k}") for k in range(3)]
+        rounds = [measure_speed(drive, poses, grid, f"{out}/{k}") for k in range(3)]
         for stage in rounds[0]:
             print(f"speed     {stage}: {spread([r[stage] for r in rounds])} ms per scene")
         reading = 1e3 * parse / len(drive)
@@ -182,7 +182,7 @@ def main(config: Config) -> None:
         some = poses[:: max(1, len(poses) // config.rays)][: config.rays]
         near, shard = drive.at(poses[:256], grid), np.arange(min(256, len(poses)))
         order = np.random.default_rng(0).permutation(shard)
-        seconds = interleaved(
+        seconds = time_interleaved(
             {
                 "rays": lambda k: cast_rays(near, int(order[k]), grid),
                 "ours": lambda k: [
@@ -194,15 +194,15 @@ def main(config: Config) -> None:
         seconds["ours"] = [value / BATCH for value in seconds["ours"]]
         print(
             f"rays      trimesh with embree {spread(seconds['rays'], 1e3, 0)} ms, "
-            f"ours {spread(seconds['ours'], 1e3, 1)} ms: {ratios(seconds['rays'], seconds['ours'])}"
+            f"ours {spread(seconds['ours'], 1e3, 1)} ms: {format_ratios(seconds['rays'], seconds['ours'])}"
         )
-        same, within, worst = agreement(drive, some, grid)
+        same, within, worst = measure_agreement(drive, some, grid)
         print(
             f"rays      agreement {100 * same:.4f} % of pixel and class decisions, "
             f"{100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)"
         )
 
-        masks, worst = stored_exactly(drive, poses[:64], grid, f"{out}/0")
+        masks, worst = measure_storage_error(drive, poses[:64], grid, f"{out}/0")
         sizes = {
             name: sum(p.stat().st_size for p in Path(out, "0", name).rglob("*.parquet")) / len(poses) / 1e3
             for name in ("scenes", "primitives", "rasters")
@@ -234,7 +234,7 @@ def main(config: Config) -> None:
 
     results = multiprocessing.get_context("spawn").Queue()
     for spacing_m in (10.0, 0.5):
-        peak_memory(spacing_m, results)
+        measure_peak_memory(spacing_m, results)
         count, peak = results.get()
         print(
             f"memory    sequence of {count} poses: peak {peak:.0f} MB in the process that reads it and writes a shard"

@@ -25,7 +25,7 @@ from pathlib import Path
 import ray
 import ray.data
 import tyro
-from common import DENSE_SEEDS, spread, where, write_raw
+from common import DENSE_SEEDS, describe_machine, spread, write_raw
 
 from pipelines.preprocess.ingest import ingest_drives
 from pipelines.preprocess.sharding import ShardTask, plan_kitti360
@@ -54,7 +54,7 @@ class Run:
     manifest_bytes: int  # of manifests that return to the driver
 
 
-def timed(tasks: list[ShardTask]) -> Run:
+def time_ingest(tasks: list[ShardTask]) -> Run:
     """Time one ingest on the running Ray cluster."""
     received = []
     with tempfile.TemporaryDirectory() as out:
@@ -67,23 +67,23 @@ def timed(tasks: list[ShardTask]) -> Run:
     return Run(sum(result.scenes.values()), len(tasks), seconds, driver, sum(received))
 
 
-def warm_up(tasks: list[ShardTask]) -> None:
+def warm_up_workers(tasks: list[ShardTask]) -> None:
     """Make the workers import their modules before the clock starts."""
-    timed(tasks[:2])
+    time_ingest(tasks[:2])
 
 
 def start(**options) -> None:
     ray.init(logging_level="ERROR", log_to_driver=False, object_store_memory=500 * 2**20, **options)
-    quiet()
+    silence_ray_data()
 
 
-def quiet() -> None:
+def silence_ray_data() -> None:
     ray.data.DataContext.get_current().enable_progress_bars = False
     logging.getLogger("ray.data").setLevel(logging.ERROR)
 
 
 def main(config: Config) -> None:
-    print(where())
+    print(describe_machine())
     raw = Path(tempfile.gettempdir()) / f"pritti-benchmark-raw-{config.spacing_m:g}"
     write_raw(raw, DENSE_SEEDS, config.spacing_m)
     tasks = plan_kitti360(str(raw), split=False)
@@ -93,8 +93,8 @@ def main(config: Config) -> None:
     for _ in range(config.rounds):
         for workers in runs:
             start(address="local", num_cpus=workers)
-            warm_up(tasks)
-            runs[workers].append(timed(tasks))
+            warm_up_workers(tasks)
+            runs[workers].append(time_ingest(tasks))
             ray.shutdown()
     for workers, found in runs.items():
         rate = spread([r.scenes / r.seconds for r in found], digits=0)
@@ -113,9 +113,9 @@ def main(config: Config) -> None:
         for _ in range(nodes - 1):
             cluster.add_node(num_cpus=1, object_store_memory=150 * 2**20)
         ray.init(address=cluster.address, logging_level="ERROR", log_to_driver=False)
-        quiet()
-        warm_up(tasks)
-        run = timed(tasks)
+        silence_ray_data()
+        warm_up_workers(tasks)
+        run = time_ingest(tasks)
         per_scene_ms, per_shard_ms = 1e3 * run.driver_seconds / run.scenes, 1e3 * run.driver_seconds / run.shards
         print(
             f"{nodes} nodes: driver {per_scene_ms:.2f} ms of CPU per scene ({per_shard_ms:.0f} ms per shard), "

@@ -22,7 +22,7 @@ DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of 
 STEPS = (10, 20, 25, 50)
 
 
-def kept(solver: SchedulerMixin, steps: int, deviation: float) -> float:
+def measure_kept_deviation(solver: SchedulerMixin, steps: int, deviation: float) -> float:
     """Return the deviation of the samples over that of the data."""
     alpha_bar = Diffusion().alpha_bar
 
@@ -52,7 +52,10 @@ def main() -> None:
     print(f"{'steps':>5}  {'deviation of the data':40}", *(f"{deviation:6}" for deviation in DEVIATIONS))
     for steps in STEPS:
         for name, solver in ways.items():
-            print(f"{steps:5}  {name:40}", *(f"{kept(solver, steps, deviation):6.2f}" for deviation in DEVIATIONS))
+            print(
+                f"{steps:5}  {name:40}",
+                *(f"{measure_kept_deviation(solver, steps, deviation):6.2f}" for deviation in DEVIATIONS),
+            )
 
 
 if __name__ == "__main__":

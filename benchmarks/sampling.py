@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import torch
 import tyro
-from common import spread, where
+from common import describe_machine, spread
 
 from models.dit import DiT
 from models.labels import LABELS
@@ -42,7 +42,7 @@ class Config:
     rounds: int = 3
 
 
-def untrained(preset: str) -> PrITTIPipeline:
+def build_untrained_pipeline(preset: str) -> PrITTIPipeline:
     row = DIT_PRESETS[preset]
     vae = LVAE_PRESETS[row.lvae]
     torch.manual_seed(0)
@@ -54,16 +54,16 @@ def untrained(preset: str) -> PrITTIPipeline:
     return pipeline
 
 
-def peak_mib() -> float:
+def read_peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts it in KiB
 
 
 def main(config: Config) -> None:
-    pipeline = load_pipeline(config.model) if config.model else untrained(config.preset)
-    print(where(), f"latents {pipeline.lvae.latent_shape}")
+    pipeline = load_pipeline(config.model) if config.model else build_untrained_pipeline(config.preset)
+    print(describe_machine(), f"latents {pipeline.lvae.latent_shape}")
     known = LABELS[pipeline.dit.config.label]
     labels = [known[k % len(known)] for k in range(config.batch)]
-    loaded_mib = peak_mib()
+    loaded_mib = read_peak_mib()
     seconds: dict[str, list[float]] = {"sampling": [], "decoding": [], "writing": []}
     clock = time.process_time
     for number in range(config.rounds + 1):
@@ -83,7 +83,7 @@ def main(config: Config) -> None:
         print(f"{name}: {spread(found, 1e3, 1)} ms a scene")
     after = [(d + w) / s for s, d, w in zip(*seconds.values(), strict=True)]
     print(f"after sampling / sampling, {config.steps} steps: {spread(after, 100, 1)} %; {len(scenes[0])} primitives")
-    print(f"memory: {peak_mib():.0f} MiB at most, {loaded_mib:.0f} of it before the first scene")
+    print(f"memory: {read_peak_mib():.0f} MiB at most, {loaded_mib:.0f} of it before the first scene")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import trimesh
 import tyro
-from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from common import DENSE_SEEDS, describe_machine, format_ratios, spread, time_interleaved
 
 from models.scene import Scene
 from pipelines.geometry.centerlines import extract_road_network, plan_drive
@@ -48,7 +48,7 @@ def cast(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
     return pictures
 
 
-def look(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
+def render_class_ids(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
     renderer = StreetRenderer(scene)
     return [renderer.view(camera).class_id for camera in cameras]
 
@@ -63,7 +63,7 @@ def write(scene: Scene, cameras: list[StreetCamera]) -> None:
 
 
 def main() -> None:
-    print(where())
+    print(describe_machine())
     request, chosen = StreetRequest("", "", 1.0, 1.55, 0.0, Lens().resize(704, 188), 0.25, FRAMES), []
     for seed in DENSE_SEEDS:
         scene = generate_town(seed).scene(20)
@@ -75,16 +75,18 @@ def main() -> None:
         f"{frames} frames of {request.lens.width} x {request.lens.height}"
     )
     same = [
-        a == b for scene, cameras in chosen for a, b in zip(cast(scene, cameras), look(scene, cameras), strict=True)
+        a == b
+        for scene, cameras in chosen
+        for a, b in zip(cast(scene, cameras), render_class_ids(scene, cameras), strict=True)
     ]
-    ways = {"embree": cast, "ours": look, "ours, shaded and written": write}
-    seconds = interleaved(
+    ways = {"embree": cast, "ours": render_class_ids, "ours, shaded and written": write}
+    seconds = time_interleaved(
         {name: lambda _, way=way: [way(*one) for one in chosen] for name, way in ways.items()}, ROUNDS
     )
     for name, values in seconds.items():
         print(f"{name}: {spread([1e3 * value / frames for value in values], 1, 0)} ms a frame")
     print(
-        f"embree / ours: {ratios(seconds['embree'], seconds['ours'])}; "
+        f"embree / ours: {format_ratios(seconds['embree'], seconds['ours'])}; "
         f"{100 * np.mean(same):.2f} % of pixels of one class (facets differ from ellipsoids at their rims)"
     )
 

@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from dataclasses import replace
 
 import numpy as np
-from common import DENSE_SEEDS, interleaved, ratios, spread, where
+from common import DENSE_SEEDS, describe_machine, format_ratios, spread, time_interleaved
 from scipy.spatial.transform import Rotation
 
 from models.scene import CATEGORY_INDEX, ELLIPSOID, Scene
@@ -27,7 +27,7 @@ ROUNDS = 7
 PAPER_OBJECTS = 514
 
 
-def plain(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
+def voxelize_plainly(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
     """`voxelize` written in the obvious way."""
     out = np.zeros(voxels.shape, np.uint8)
     grid = voxels.columns
@@ -53,13 +53,13 @@ def plain(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
     return out
 
 
-def tilted(scene: Scene, rng: np.random.Generator) -> Scene:
+def tilt_primitives(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with every primitive tilted by a few degrees, as decoded ones are."""
     axis = rng.normal(size=(len(scene), 3))
     return replace(scene, rotation=(Rotation.from_rotvec(0.05 * axis).as_matrix() @ scene.rotation).astype(np.float32))
 
 
-def crowded(scenes: list[Scene]) -> Scene:
+def merge_scenes(scenes: list[Scene]) -> Scene:
     """Return one scene with the primitives of several, as many as the paper has slots."""
     joined = {
         name: np.concatenate([getattr(s, name) for s in scenes])
@@ -69,19 +69,19 @@ def crowded(scenes: list[Scene]) -> Scene:
 
 
 def main() -> None:
-    print(where())
+    print(describe_machine())
     rng, voxels = np.random.default_rng(0), VoxelGrid()
     dense = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
-    leaning = [tilted(scene, rng) for scene in dense]
+    leaning = [tilt_primitives(scene, rng) for scene in dense]
     for name, scenes in (
         ("dense towns", dense),
         ("the same, leaning", leaning),
-        (f"{PAPER_OBJECTS} primitives, several towns in one place", [crowded(leaning)]),
+        (f"{PAPER_OBJECTS} primitives, several towns in one place", [merge_scenes(leaning)]),
     ):
-        differ = sum(int((voxelize(s, voxels) != plain(s, voxels)).sum()) for s in scenes)
-        seconds = interleaved(
+        differ = sum(int((voxelize(s, voxels) != voxelize_plainly(s, voxels)).sum()) for s in scenes)
+        seconds = time_interleaved(
             {
-                "plain": lambda _, scenes=scenes: [plain(s, voxels) for s in scenes],
+                "plain": lambda _, scenes=scenes: [voxelize_plainly(s, voxels) for s in scenes],
                 "ours": lambda _, scenes=scenes: [voxelize(s, voxels) for s in scenes],
             },
             ROUNDS,
@@ -91,10 +91,10 @@ def main() -> None:
         print(
             f"{name} ({', '.join(str(len(s)) for s in scenes)} primitives, {100 * filled:.0f} % filled): "
             f"plain {spread(per_scene['plain'], 1, 0)} ms, ours {spread(per_scene['ours'], 1, 1)} ms a scene and core: "
-            f"{ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ"
+            f"{format_ratios(seconds['plain'], seconds['ours'])}; {differ} voxels differ"
         )
     truth, found = voxelize(dense[0], voxels), voxelize(leaning[0], voxels)
-    confusion = interleaved({"confusion": lambda _: compute_voxel_confusion(truth, found)}, ROUNDS)["confusion"]
+    confusion = time_interleaved({"confusion": lambda _: compute_voxel_confusion(truth, found)}, ROUNDS)["confusion"]
     print(f"confusion matrix of two grids: {spread(confusion, 1e3, 1)} ms")
 
 

@@ -22,7 +22,7 @@ SEED = 0
 FRAMES = 3
 
 
-def street_views(scene: Scene) -> list[np.ndarray]:
+def draw_street_views(scene: Scene) -> list[np.ndarray]:
     """Views along the road through a scene, evenly spread."""
     lens = Lens().resize(WIDTH, FRAME)
     request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
@@ -31,7 +31,7 @@ def street_views(scene: Scene) -> list[np.ndarray]:
     return [shade_view(renderer.view(cameras[k])) for k in np.linspace(0, 0.6 * len(cameras), FRAMES).astype(int)]
 
 
-def stacked(pictures: list[np.ndarray], axis: int) -> np.ndarray:
+def stack_pictures(pictures: list[np.ndarray], axis: int) -> np.ndarray:
     """Pictures beside (axis 1) or below each other (axis 0), with white between."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP
@@ -47,10 +47,10 @@ def main() -> None:
         pipeline.use_sampler("dpm++")
         made[label] = pipeline.generate([label], seed=SEED, num_inference_steps=20)[0]
     larger = pipeline.outpaint(made["medium"], "medium", seed=SEED, repaint=RePaintConfig.guided())
-    above = stacked([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
-    views = stacked(street_views(larger), 0)
-    below = stacked([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
-    Path(__file__).with_name("hero.png").write_bytes(encode_png(stacked([above, below], 0)))
+    above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
+    views = stack_pictures(draw_street_views(larger), 0)
+    below = stack_pictures([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
+    Path(__file__).with_name("hero.png").write_bytes(encode_png(stack_pictures([above, below], 0)))
 
 
 if __name__ == "__main__":

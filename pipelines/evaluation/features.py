@@ -85,11 +85,11 @@ def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.nd
         rows["statistics"].append(statistics.compute_layout_statistics(scene))
         rows["histograms"].append(distributions.compute_scene_histograms(scene))
         rows["validity"].append(validity.compute_scene_validity(scene, slab_offset_m).ravel())
-        rows["fidelity"].append(compute_label_fidelity(scene, dataset).ravel())
+        rows["fidelity"].append(judge_labels(scene, dataset).ravel())
     return {name: np.stack(values) for name, values in rows.items()}
 
 
-def compute_label_fidelity(scene: Scene, dataset: Dataset | None) -> np.ndarray:
+def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
     """(3, 2) label fidelity; zeros, which mean not judged, for a scene without labels or without a dataset."""
     if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
         return np.zeros((len(validity.LABEL_MEASURES), 2))

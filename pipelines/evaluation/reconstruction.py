@@ -18,7 +18,7 @@ import torch
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, decode_layout, make_layout_batch, resample_scene_ground
-from pipelines.evaluation.features import READER_CPUS, compute_label_fidelity
+from pipelines.evaluation.features import READER_CPUS, judge_labels
 from pipelines.geometry.voxels import NUM_CLASSES, OutsideCounts, VoxelGrid, count_outside, voxelize
 from pipelines.metrics.reconstruction import (
     MAX_DETECTIONS,
@@ -180,7 +180,7 @@ def make_scene_record(
         confusion=compute_voxel_confusion(true_voxels, voxelize(rebuilt, voxels)),
         outside=count_outside(truth, voxels),
         memory=measure_memory_bytes(make_layout_batch([truth], spec), latent, true_voxels),
-        labels=compute_label_fidelity(rebuilt, dataset),
+        labels=judge_labels(rebuilt, dataset),
     )
 
 

@@ -37,7 +37,7 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
     height_m, ground_class = scene.surface()
     total = np.zeros((len(MEASURES), 2, 2))
     corners_m = compute_footprint_ranges(scene)
-    doubles = find_overlapping_pairs(scene)
+    doubles = find_doubled_objects(scene)
     for axis, seams, count in ((0, rows, grid.rows), (1, cols, grid.cols)):
         if bad := [line for line in seams if not 0 < line < count]:
             raise ValueError(f"scene {scene.scene_id}: seam before pixel {bad[0]}, expected 1 to {count - 1}")
@@ -98,8 +98,8 @@ def compute_footprint_ranges(scene: Scene) -> np.ndarray:
     return np.stack([scene.center_m[:, :2] - reach, scene.center_m[:, :2] + reach], axis=2)
 
 
-def find_overlapping_pairs(scene: Scene) -> np.ndarray:
-    """(p, 2) objects of one category whose IoU3D is above DOUBLE_IOU3D."""
+def find_doubled_objects(scene: Scene) -> np.ndarray:
+    """(p, 2) indices of objects of one category whose IoU3D is above DOUBLE_IOU3D."""
     boxes = extract_boxes(scene)
     iou = np.triu(compute_iou3d_matrix(boxes, boxes), 1)
     iou[scene.category[:, None] != scene.category] = 0

@@ -15,7 +15,7 @@ from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
 from pipelines.editing.edit import serialize_edits
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.opendrive import export_opendrive
-from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRequest, OpenRequest
+from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRegionRequest, OpenRequest
 from pipelines.studio.session import Session, Studio, StudioBusyError
 
 MAX_BODY_BYTES = 256 * 1024  # of a request
@@ -163,7 +163,7 @@ def make_session_router(studio: Callable[[], Studio]) -> APIRouter:
         return apply(request, lambda session: studio().generate(session, wanted), busy_status=429)
 
     @router.post("/api/inpaint")
-    def inpaint(request: Request, wanted: InpaintRequest) -> dict:
+    def inpaint(request: Request, wanted: InpaintRegionRequest) -> dict:
         return apply(request, lambda session: studio().inpaint(session, wanted), busy_status=429)
 
     @router.post("/api/extend")

@@ -39,7 +39,7 @@ class RepaintRequest(SamplingRequest):
         return RePaintConfig(self.steps, self.jump_length, self.resamplings, self.pseudoinverse_guidance, self.eta)
 
 
-class InpaintRequest(RepaintRequest):
+class InpaintRegionRequest(RepaintRequest):
     polygon_m: list[tuple[float, float]] = Field(min_length=3, max_length=500)
     contents: Contents = "both"
 

@@ -22,7 +22,13 @@ from pipelines.io.web_export import export_web_scene
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.scene_index import Catalogue
-from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRequest, SamplingRequest
+from pipelines.studio.requests import (
+    EditsRequest,
+    ExtendRequest,
+    GenerateRequest,
+    InpaintRegionRequest,
+    SamplingRequest,
+)
 
 MAX_SESSIONS, MAX_HISTORY, MAX_WAITING = 16, 50, 4
 MAX_SIDE_M = 512.0  # of a scene that is extended
@@ -196,7 +202,7 @@ class Studio:
 
         self.start_task(session, f"generate {label}, seed {request.seed}", request.steps, make)
 
-    def inpaint(self, session: Session, request: InpaintRequest) -> None:
+    def inpaint(self, session: Session, request: InpaintRegionRequest) -> None:
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         region = select_polygon(scene.grid, request.polygon_m)
         if not region.any():
