@@ -32,7 +32,7 @@ def draw_street_views(scene: Scene) -> list[np.ndarray]:
 
 
 def stack_pictures(pictures: list[np.ndarray], axis: int) -> np.ndarray:
-    """Pictures beside (axis 1) or below each other (axis 0), with white between."""
+    """Stack pictures from left to right (axis 1) or from top to bottom (axis 0), with white between them."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP
     white = np.full(shape, 255, np.uint8)

@@ -1,7 +1,7 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids: adaLN-Zero blocks, one timestep and one
 label embedding shared by all of them (paper, supplement B.3).
 
-diffusers' own `DiTTransformer2DModel` embeds timestep and label anew in every block, which is 8 % larger and drops
+diffusers' own `DiTTransformer2DModel` embeds timestep and label again in every block, which is 8 % larger and drops
 labels for guidance independently per block, so that its unconditional branch is never trained. Here one embedding
 and one mask per sample serve the whole network.
 """
@@ -61,7 +61,7 @@ class DiTBlock(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"]
     ) -> Float[Tensor, "batch n d"]:
-        """`modulation` is what the layer of that name makes of the condition."""
+        """`modulation` is the output of the layer of that name for the condition."""
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
         width = x.shape[-1:]
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)

@@ -122,5 +122,5 @@ class LayoutSpec:
         name = next(key for key in mine if mine[key] != theirs[key])
         raise ValueError(
             f"{what} has another LayoutSpec: {name} is {theirs[name]}, expected {mine[name]}; "
-            "use the dataset or checkpoint that belongs to it, or train anew"
+            "use the dataset or checkpoint that belongs to it, or train again"
         )

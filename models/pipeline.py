@@ -482,9 +482,9 @@ class PrITTIPipeline:
             label: Class of all blocks, or of each block (steps ahead, steps left).
             seed, index: Seed of the run and index of the scene within it.
             overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
-            mode: "copy" gives each block the shifted latent, as the paper does; "reencode" decodes what is known, moves
-                it into the block's frame and height datum and encodes it again. Object latents hold absolute centres,
-                which a copy does not change.
+            mode: "copy" gives each block the shifted latent, as the paper does; "reencode" decodes the known part,
+                moves it into the block's frame and height datum and encodes it again. Object latents hold absolute
+                centres, which a copy does not change.
             num_blocks: Blocks ahead, behind, left and right. One to every side is the paper's outpainting.
             repaint, guidance_scale, callback_on_step_end: As for `inpaint`.
             side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"), instead of

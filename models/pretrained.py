@@ -1,4 +1,4 @@
-"""Weights that come with the package: a pipeline's directory each, models/weights/<name>, with its card beside it."""
+"""Weights that come with the package: one pipeline directory each, models/weights/<name>, with a model card in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 WEIGHTS = Path(__file__).parent / "weights"
 INDEX_NAME = "model_index.json"  # makes a directory a pipeline's
 CHECKSUMS_NAME = "checksums.json"
-TRAINING_NAME = "training.json"  # what the card says of training, for those who go on from these weights
+TRAINING_NAME = "training.json"  # training facts of the model card, for runs that start from these weights
 
 
 def list_released() -> list[str]:

@@ -116,7 +116,7 @@ def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.nda
 
     rotation (n, 3, 3), columns = the box's axes in the scene frame; size_m (n, 3), full extents along them.
     Returns rotation (n, 3, 3), right-handed with columns (length, width, height), and size_m (n, 3) = (l, w, h).
-    A mirrored input (determinant < 0) comes out right-handed: a box is its own mirror image.
+    A mirrored input (determinant < 0) becomes right-handed: a box is its own mirror image.
     """
     rotation, size_m = np.asarray(rotation), np.asarray(size_m)
     if len(size_m) == 0:

@@ -145,7 +145,7 @@ def make_diffusion_loss(
 ) -> LossFunction:
     """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
 
-    Latents are sampled anew from the cached posterior; one label-dropout mask per sample.
+    Latents are sampled from the cached posterior at every step; one label-dropout mask per sample.
     """
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
@@ -170,7 +170,7 @@ def make_diffusion_loss(
 
 
 class Trainer:
-    """A model in training: `step` advances it, `save` and `load` make it stop and go on exactly.
+    """A model in training: `step` advances it; a run that resumes with `save` and `load` equals an uninterrupted one.
 
     `wrapped` is what is called (for instance the model under DistributedDataParallel); `model` is what is saved.
     """
@@ -279,7 +279,7 @@ class Trainer:
         return copy.to(self.device).eval()
 
     def save(self, directory: str | Path) -> None:
-        """Everything needed to go on exactly: safetensors and JSON, no pickles. `state.json` is written last."""
+        """Everything needed to resume exactly: safetensors and JSON, no pickles. `state.json` is written last."""
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
@@ -296,7 +296,7 @@ class Trainer:
         os.replace(temporary, directory / "state.json")
 
     def load(self, directory: str | Path) -> None:
-        """Go on from `save`. Raises ValueError if the checkpoint was made with other settings."""
+        """Resume from `save`. Raises ValueError if the checkpoint was made with other settings."""
         directory = Path(directory)
         state = json.loads((directory / "state.json").read_text())
         mine = json.loads(json.dumps(asdict(self.settings)))

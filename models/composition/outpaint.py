@@ -145,7 +145,7 @@ class SceneBlock:
 
 @dataclass(frozen=True, eq=False)
 class BlockCondition:
-    """What is known of a block before it is generated: as a Scene and as a latent (c, h, w); mask 1 = generate."""
+    """The known part of a block before it is generated: as a Scene and as a latent (c, h, w); mask 1 = generate."""
 
     known: Scene
     latent: Tensor

@@ -51,7 +51,7 @@ class CenteredBoxes(NamedTuple):
 
 @dataclass(frozen=True)
 class BoxDistribution:
-    """Ranges of what is drawn uniformly: length and height in metres, width as a share of the length."""
+    """Ranges of uniform draws: length and height in metres, width as a share of the length."""
 
     length_m: tuple[float, float]
     width_share: tuple[float, float]

@@ -17,7 +17,7 @@ EPSILON = 1e-6  # of every group normalisation
 
 
 class ResnetBlock(nn.Module):
-    """Two normalised 3 x 3 convolutions beside a skip connection, which is 1 x 1 if the number of channels changes."""
+    """Two normalised 3 x 3 convolutions next to a skip connection, which is 1 x 1 if the number of channels changes."""
 
     def __init__(self, in_channels: int, out_channels: int, norm_groups: int) -> None:
         super().__init__()

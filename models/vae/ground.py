@@ -121,7 +121,7 @@ def init_from_data(
 def compute_smooth_maps(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch maps rows cols"]:
-    """Raster maps as few numbers can carry them: heights that go on where nothing is occupied, distances for 0 and 1.
+    """Smooth raster maps: heights that continue where nothing is occupied, signed distances instead of 0 and 1.
 
     A border through a cell is a step in occupancy, which takes many linear components, and a plane in distance from
     the border, which takes three. Distances are in units of `reach`, within [-1, 1].

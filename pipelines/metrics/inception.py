@@ -253,7 +253,7 @@ def compute_inception_features(network: Inception, images: np.ndarray, batch_siz
 def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
     """A small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
 
-    For tests and for comparing sources where no Inception weights are at hand. Distances of its features are called
+    For tests and for comparing sources without Inception weights. Distances of its features are called
     `random_frechet` or the like, never FID. Weights come from numpy's legacy generator, whose stream is frozen.
     """
     random = np.random.RandomState(seed)

@@ -253,7 +253,7 @@ def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PairSums:
-    """What mean IoU3D is made of, summed over scenes; all (11,), one entry per category."""
+    """The sums from which mean IoU3D is computed, over scenes; all (11,), one entry per category."""
 
     truths: np.ndarray
     predictions: np.ndarray

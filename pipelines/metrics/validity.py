@@ -88,7 +88,7 @@ def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle:
     A missing label is not judged. Raises ValueError for a scene without any label.
     """
     if scene.vegetation_density is None and scene.vehicle_density is None:
-        raise ValueError(f"scene {scene.scene_id} bears no density label; label fidelity needs the one asked for")
+        raise ValueError(f"scene {scene.scene_id} has no density label; label fidelity needs the requested one")
     right = []
     for categories, thresholds, label in (
         (VEGETATION, vegetation, scene.vegetation_density),

@@ -1,4 +1,4 @@
-"""Which shards a dataset is made of: a plan is known before anything is cut, so runs resume and scale by shard."""
+"""The shards of a dataset, planned before any scene is cut, so that runs resume and scale by shard."""
 
 from __future__ import annotations
 

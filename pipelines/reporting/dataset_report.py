@@ -40,7 +40,7 @@ SPLITS = ("train", "test", "unused", "generated")
 
 @dataclass(frozen=True, eq=False)
 class DatasetFacts:
-    """What the page is made of."""
+    """Contents of the page."""
 
     catalogue: Catalogue
     grid_area_m2: np.ndarray  # (n,) of each scene

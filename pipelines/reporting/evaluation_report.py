@@ -49,7 +49,7 @@ VALIDITY = {
     "floating": "standing objects more than half a metre above the ground",
     "sunken": "standing objects more than half a metre below the ground",
     "over_unknown_ground": "standing objects over no ground at all",
-    "off_road_vehicles": "vehicles beside road and parking",
+    "off_road_vehicles": "vehicles off road and parking",
     "buildings_on_road": "buildings in the road",
     "road_connectivity": "road pixels that hang together in one piece",
 }

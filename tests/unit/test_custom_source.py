@@ -504,7 +504,7 @@ def test_custom_source_splits_are_as_given(tmp_path):
 BROKEN_SPLITS = {
     "cut off": ('{"a": "tr', "broken JSON"),
     "list": ("[]", "holds a list"),
-    "stranger": ('{"a": "train", "z": "test"}', "'z' is no folder beside it"),
+    "stranger": ('{"a": "train", "z": "test"}', "'z' is no folder next to it"),
     "forgotten": ("{}", "has no entry for the folder a"),
     "side": ('{"a": "val"}', "a is 'val', expected 'train' or 'test'"),
     "number": ('{"a": 1}', "a is 1"),
@@ -830,7 +830,7 @@ def test_custom_source_names_broken_file(tmp_path, name):
 def test_custom_source_names_missing_and_surplus_table(tmp_path, table):
     folder = write(street(), tmp_path) / "street"
     write({table: street()[table]}, tmp_path, parquet=True)
-    assert_refused(tmp_path, f"{table}.parquet", f"{table}.json lies beside it; keep one of the two")
+    assert_refused(tmp_path, f"{table}.parquet", f"{table}.json lies next to it; keep one of the two")
     (folder / f"{table}.json").unlink()
     (folder / f"{table}.parquet").unlink()
     assert_refused(tmp_path, f"{table}.parquet", f"missing, and so is {table}.json")

@@ -101,7 +101,7 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
     names = list_drives(root)
     for name, side in sides.items():
         if name not in names:
-            raise ValueError(f"{path}: {_show(name)} is no folder beside it; remove the entry or add the drive")
+            raise ValueError(f"{path}: {_show(name)} is no folder next to it; remove the entry or add the drive")
         if side not in (TRAIN, TEST):
             raise ValueError(f"{path}: {name} is {_show(side)}, expected {TRAIN!r} or {TEST!r}")
     for name in names:
@@ -269,7 +269,7 @@ def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequenc
         empty = "; if there are none, write [] into the .json" if name != "poses" else ""
         raise ValueError(f"{paths[0]}: missing, and so is {paths[1].name}; see docs/own_drives.md{empty}")
     if len(found) > 1:
-        raise ValueError(f"{paths[0]}: {paths[1].name} lies beside it; keep one of the two")
+        raise ValueError(f"{paths[0]}: {paths[1].name} lies next to it; keep one of the two")
     path = found[0]
     rows, columns = _load_parquet(path) if path.suffix == ".parquet" else _load_records(path)
     for column in columns:

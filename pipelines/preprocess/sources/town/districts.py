@@ -1,4 +1,4 @@
-"""The kinds of neighbourhood a town is made of, as data: what differs between districts and between their blocks."""
+"""The kinds of neighbourhood in a town, as data: the differences between districts and between their blocks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class District:
 
     house_scale: tuple[float, float, float]
     setback_m: float  # median from sidewalk to house
-    gap_m: tuple[float, float]  # free ground between houses beside driveways
+    gap_m: tuple[float, float]  # free ground between houses next to driveways
     garages: float
     terrain_front: float
     terrain_back: float
