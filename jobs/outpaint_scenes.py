@@ -41,7 +41,7 @@ class Config(RePaintOptions):
     overlap: float = 0.5
     """Overlap of neighbouring blocks, as a share of a block."""
     order: Literal["outward", "colours"] = "outward"
-    """From the scene outward (the paper), or concurrently by a four-colouring; the latter needs overlap < 0.5."""
+    """Order of blocks: from the scene outward (the paper), or concurrently by a four-colouring (--overlap < 0.5)."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
     """Known latents of a block: its neighbours re-encoded in its frame, or their shifted latents (the paper)."""
     batch_size: int = 4

@@ -16,7 +16,7 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
 
 def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """height_m (G, H, W) and occupied (G, H, W) of the named classes on a grid over the same ground (`resampled`)."""
+    """height_m and occupied (G, H, W) of the named classes on a grid over the same ground (`resample_ground`)."""
     return resample_ground(*select_ground_classes(scene, ground_classes), scene.grid, grid)
 
 

@@ -189,7 +189,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
                 raise find_root_cause(failure) from error
         raise
     if result.checkpoint is None:
-        raise ValueError(f"run {run.name!r} ended without a checkpoint; give more --steps")
+        raise ValueError(f"run {run.name!r} ended without a checkpoint; increase --steps")
     with result.checkpoint.as_directory() as directory:
         publish_directory(os.path.join(directory, "model"), output)
         run.tracker.artifacts(os.path.join(directory, "model"), "model")

@@ -31,7 +31,7 @@ def select_shown_images(
 ) -> ExamplePictures:
     """Evenly chosen pictures, generated ones nearest to real ones, and those with most faults.
 
-    `described` are the generated scenes; `memorised` is what `evaluate.memorisation` found.
+    `described` are the generated scenes; `memorised` is what `evaluate.compute_memorisation` found.
     """
     count = len(described["scene_id"])
     even = select_evenly(count, min(SHOWN, count))

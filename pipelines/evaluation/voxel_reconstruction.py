@@ -94,11 +94,11 @@ def pair_files(
     every, common = set().union(*sides.values()), set(truth).intersection(*sides.values())
     missing = {side: sorted(every - set(names)) for side, names in sides.items() if every - set(names)}
     if missing and not (partial and common):
-        told = "; ".join(
+        lacking = "; ".join(
             f"{side} lack {len(names)} of {len(every)} names: {', '.join(names[:SHOWN])}{' ...' * (len(names) > SHOWN)}"
             for side, names in missing.items()
         )
-        raise ValueError(f"{told}; name files by scene, or score what there is on all sides by --allow-missing")
+        raise ValueError(f"{lacking}; name files by scene id, or score the common scenes with --allow-missing")
     return [VoxelPair(name, truth[name], rebuilt[name], stored[name] if stored else "") for name in sorted(common)]
 
 

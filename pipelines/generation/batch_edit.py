@@ -128,14 +128,12 @@ def edit_scenes(
     shards = [request.shard(k, given) for k, (given, _) in enumerate(parts)]
     if not scenes:
         reason = shards[0].read("rejects")["reason"][0].as_py()
-        raise ValueError(f"none of the {rejects} scenes can be edited so; the first: {reason}")
+        raise ValueError(f"all {rejects} scenes were rejected; the first: {reason}")
     changes = pa.concat_tables([shard.read("edits") for shard in shards])
     if not len(changes):
         for table in TABLES:
             storage.delete_directory(storage.join_uri(request.output, table, f"source={request.source}"))
-        raise ValueError(
-            f"nothing is changed: no primitive in {scenes} scene(s) fits the selection; nothing is written"
-        )
+        raise ValueError(f"no primitive in {scenes} scene(s) matches the selection; nothing was written")
     table = _sum_changes(request.edits, changes)
     sections: list[Section] = [table]
     if pictures:

@@ -3,7 +3,7 @@
 The extras of our export (`mesh_export.export_glb`) identify it. Its nodes are the primitives: transforms give centre,
 rotation and size, and extras the rest. A scene that was edited in a mesh editor is therefore read with its changes.
 
-Any other mesh is read in the authors' form (FORMATS.md, section 4), with these assumptions:
+Any other mesh is read in the authors' form (docs/imports.md), with these assumptions:
 
 * x is forward, y right, z down, in metres, unless `axes` gives other directions. The frame includes pitch and roll of
   the authors' IMU.

@@ -1,6 +1,6 @@
 """Voxel grids of any method <-> .npz files, and their pictures from above.
 
-One scene per file: the array `voxels`, or the only one, of integer class ids, the authors' (FORMATS.md, section 4; our
+One scene per file: the array `voxels`, or the only one, of integer class ids, the authors' (docs/imports.md; our
 palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4 parking, 5 road, 6 vegetation_cuboid, 7 vegetation_ellipsoid,
 8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human, 12 construction_big, 13 construction_small, 14 pole,
 15 traffic_control, 16 object; 17, crossing, is ours. 256 x 256 x 32 over the 64 x 64 m of the crop, or 128 x 128 x 16,

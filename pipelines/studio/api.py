@@ -44,12 +44,12 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
 
 
 def refuse(request: Request, token: str, hosts: tuple[str, ...]) -> Response | None:
-    """The refusal of a request that may not be answered; None for one that may."""
+    """Return an error response if the request is not allowed, else None."""
     host = urlsplit(f"//{request.headers.get('host', '')}").hostname
     if hosts and host not in hosts:
         return Response("unknown host", 421)
     if request.method not in ("GET", "HEAD") and request.headers.get("x-studio") != "1":
-        return Response("not from the studio's page", 403)  # other pages cannot set a header of their own
+        return Response("not from the studio's page", 403)  # other pages cannot set a custom header
     chunked = "chunked" in request.headers.get("transfer-encoding", "")
     if chunked or int(request.headers.get("content-length") or 0) > MAX_BODY_BYTES:
         return Response("the request is too large", 413)
@@ -90,7 +90,7 @@ def serve_file(name: str, media_type: str) -> Callable[[], Response]:
 
 
 def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
-    """The page, its scripts, and what it shows before a scene is open."""
+    """Return the routes of the page, its scripts, the labels and the list of scenes."""
     router = APIRouter()
     for path, (name, media_type) in PAGE_FILES.items():
         router.get(path)(serve_file(name, media_type))
@@ -107,7 +107,7 @@ def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
 
 
 def make_session_router(studio: Callable[[], Studio]) -> APIRouter:
-    """What a visitor does with the scene of the session; every operation returns the session's new state."""
+    """Return the routes of a visitor's session. Every operation returns the session's new state."""
     router = APIRouter()
 
     def open_session(request: Request) -> Session:

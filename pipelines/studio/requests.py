@@ -20,7 +20,7 @@ class OpenRequest(StudioRequest):
 
 
 class SamplingRequest(StudioRequest):
-    label: str = Field("", max_length=40)  # "": the scene's own, or the first
+    label: str = Field("", max_length=40)  # "": the label of the scene, or the model's first
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
 

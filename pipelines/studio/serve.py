@@ -9,7 +9,7 @@ from ray.serve import Application
 from pipelines.studio.api import build_studio_app
 from pipelines.studio.session import Studio
 
-REQUESTS = 32  # concurrent requests; as many more wait, and the others are refused with a request to try again
+REQUESTS = 32  # concurrent requests; as many more may wait; further ones are refused
 
 
 def make_deployment(

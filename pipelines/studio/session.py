@@ -31,7 +31,7 @@ from pipelines.studio.requests import (
 )
 
 MAX_SESSIONS, MAX_HISTORY, MAX_WAITING = 16, 50, 4
-MAX_SIDE_M = 512.0  # of a scene that is extended
+MAX_SIDE_M = 512.0  # maximum side length of an extended scene
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
 
 
@@ -40,7 +40,7 @@ class Cancelled(Exception):
 
 
 class StudioBusyError(RuntimeError):
-    """The visitor's task or too many tasks of others are running."""
+    """The visitor already has a running task, or too many tasks are waiting."""
 
 
 @dataclass
@@ -129,7 +129,7 @@ class Studio:
         self.sampling, self.num_waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
     def open_session(self, visitor: str) -> Session:
-        """A visitor's session; of too many, the one unused for longest is dropped."""
+        """Return the visitor's session. Of more than MAX_SESSIONS, drop the least recently used idle one."""
         with self.lock:
             session = self.sessions.pop(visitor, None) or Session()
             self.sessions[visitor] = session
@@ -163,7 +163,7 @@ class Studio:
         with self.lock:
             session.require_idle()
             if self.num_waiting >= MAX_WAITING:
-                raise StudioBusyError("others are waiting already; try again in a minute")
+                raise StudioBusyError("too many tasks are waiting; try again in a minute")
             self.num_waiting += 1
             task = session.task = BackgroundTask(name, total)
 
@@ -206,7 +206,7 @@ class Studio:
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         region = select_polygon(scene.grid, request.polygon_m)
         if not region.any():
-            raise ValueError("the region holds no pixel of the scene; draw a larger one")
+            raise ValueError("the region holds no pixel of the scene; draw a larger region inside the scene")
         label, repaint = self.choose_label(request, scene), request.repaint()
         blocks = len(split_region(self.pipeline, scene, region))
 
@@ -231,7 +231,7 @@ class Studio:
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         rows, cols = scene.grid.rows, scene.grid.cols
         if max(rows, cols) * small.resolution_m >= MAX_SIDE_M:
-            raise ValueError(f"the scene is {MAX_SIDE_M:.0f} m long already; the studio stops there")
+            raise ValueError(f"the scene is already {MAX_SIDE_M:.0f} m long; use jobs/outpaint_scenes.py")
         across = cols if request.side in ("ahead", "behind") else rows
         blocks = -(-(across - small.rows) // (small.rows // 2)) + 1
         label, repaint = self.choose_label(request, scene), request.repaint()
@@ -247,7 +247,7 @@ class Studio:
         edits = parse_edits(request.edits)
         if any(edit.select.where for edit in edits):
             raise ValueError(
-                "conditions in SQL are for jobs/edit_scenes.py; select by number, category or polygon here"
+                "the studio takes no SQL; select by number, category or polygon, or use jobs/edit_scenes.py"
             )
         for edit in edits:
             edit.check()

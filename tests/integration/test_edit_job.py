@@ -68,7 +68,7 @@ def test_edit_job_rejects_bad_scene_and_edits_the_rest(table, town_scenes, tmp_p
     rejects = pq.read_table(str(tmp_path / "rejects"), partitioning=None).to_pylist()
     assert {row["scene_id"] for row in rejects} == {s.scene_id for s in town_scenes if len(s) <= last}
     assert all("primitives, from 0 on, not" in row["reason"] for row in rejects)
-    with pytest.raises(ValueError, match="none of the 4 scenes can be edited so; the first: edit 0"):
+    with pytest.raises(ValueError, match="all 4 scenes were rejected; the first: edit 0"):
         edit_scenes(Remove(primitives=(9999,), input=table, output=str(tmp_path), run="none"))
-    with pytest.raises(ValueError, match="nothing is changed: no primitive in 4 scene"):
+    with pytest.raises(ValueError, match="no primitive in 4 scene"):
         edit_scenes(Remove(where="length_m > 900", input=table, output=str(tmp_path), run="nothing"))

@@ -1,4 +1,4 @@
-"""GLB files are read as scenes: own exports exactly, files of the authors (FORMATS.md, section 4) by shape."""
+"""GLB files are read as scenes: own exports exactly, files of the authors (docs/imports.md) by shape."""
 
 import json
 from dataclasses import replace
@@ -143,7 +143,7 @@ def three_sphere() -> tuple[np.ndarray, np.ndarray]:
 
 
 def three_box() -> tuple[np.ndarray, np.ndarray]:
-    """Eight vertices at ±0.5 in the order of FORMATS.md, section 1, and twelve triangles."""
+    """Eight vertices at ±0.5 in the order of KITTI-360, and twelve triangles."""
     corners = [
         [(1 if s == "+" else -1) / 2 for s in word] for word in ["+++", "++-", "+-+", "+--", "-+-", "-++", "---", "--+"]
     ]
@@ -181,7 +181,7 @@ def authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
 def authors_glb(
     scene: Scene, merged: bool = False, linear: bool = False, unmerged: bool = False, faces: bool = False
 ) -> bytes:
-    """The scene in the format of the published files (FORMATS.md, section 4), exported by trimesh."""
+    """The scene in the format of the published files (docs/imports.md), exported by trimesh."""
     parts = [(authors_ground(scene, linear), np.eye(4))] if scene.occupied.any() else []
     for k, category in enumerate(scene.category):
         round_ = category == ELLIPSOID

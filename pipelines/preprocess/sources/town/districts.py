@@ -42,8 +42,8 @@ class District:
     trucks_per_100m: float
 
 
-# Tuned on samples of 1,000 scenes until `measure` agreed with TARGETS (TOWN_VERSION 1): over plan seeds 0..2 all means
-# lie within their tolerance, most within half of it.
+# Tuned on samples of 1,000 scenes until `measure_town` agreed with TARGETS (TOWN_VERSION 1): over plan seeds 0..2 all
+# means lie within their tolerance, most within half of it.
 DISTRICTS = {
     "centre": District(
         house_scale=(1.16, 1.14, 1.03),

@@ -69,7 +69,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What `measure` needs to know of n scenes; `size_m[name]` holds the sizes of all boxes of a SIZES_M name."""
+    """What `measure_town` needs to know of n scenes; `size_m[name]` holds the sizes of all boxes of a SIZES_M name."""
 
     counts: np.ndarray  # (n, 11) per category
     vegetation_volume_m3: np.ndarray  # (n,)
