@@ -8,7 +8,6 @@ from rich.progress import Progress
 from jobs.inspect_scenes import DatasetOptions, Gallery, OneScene, Report, Sheet
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.ray_session import start_ray
-from jobs.support.value_names import SHEET_PICKS
 from pipelines.io.mesh_export import export_glb
 from pipelines.rendering.render import encode_png
 from pipelines.reporting.contact_sheet import (
@@ -70,9 +69,9 @@ def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
     require_positive(config, "max_scenes", "size_px")
     catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
-    chosen = catalogue.choose(config.max_scenes, config.sort, SHEET_PICKS[config.pick], config.seed)
+    chosen = catalogue.choose(config.max_scenes, config.sort, config.pick, config.seed)
     pictures = [picture for (picture,) in draw_pictures(catalogue, chosen, (View(config.view, config.size_px),))]
-    title = make_sheet_title(catalogue, len(chosen), config.sort, SHEET_PICKS[config.pick])
+    title = make_sheet_title(catalogue, len(chosen), config.sort, config.pick)
     sheet = draw_scene_sheet(pictures, make_captions(catalogue, chosen, config.sort), title, config.num_columns or None)
     path = make_output_path(config, "sheet.png")
     storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))

@@ -11,5 +11,4 @@ if TYPE_CHECKING:
 RECORDED_PREDICTIONS = {"epsilon": "noise", "v_prediction": "velocity"}
 RECORDED_TIMESTEPS = {"uniform": "even", "logit_normal": "middle"}
 REFERENCES: dict[str, Pick] = {"farthest-point": "farthest", "min-distance": "apart", "uniform": "spread"}
-SHEET_PICKS = {"uniform": "spread", "lowest": "lowest", "highest": "highest"}
 EDIT_FRAMES: dict[str, Literal["scene", "own"]] = {"scene": "scene", "object": "own"}

@@ -406,5 +406,5 @@ def make_sheet_title(catalogue: Catalogue, count: int, sort: str, pick: str) -> 
         sort, f"by {spell_name(sort.removeprefix('num_'))}"
     )
     if sort != "random":
-        order += {"spread": "", "lowest": ", the first", "highest": ", the last first"}[pick]
+        order += {"uniform": "", "lowest": ", the first", "highest": ", the last first"}[pick]
     return "  ·  ".join([*parts, f"{format_number(count)} of {format_number(len(catalogue))} scenes", order])

@@ -88,10 +88,10 @@ class Catalogue:
             )
         return column
 
-    def choose(self, count: int, sort: str, pick: str = "spread", seed: int = 0) -> np.ndarray:
+    def choose(self, count: int, sort: str, pick: str = "uniform", seed: int = 0) -> np.ndarray:
         """Indices of at most `count` scenes in the order of `sort`.
 
-        `pick` is spread (evenly from least to most), lowest or highest; `sort` is random, drive (sequence and
+        `pick` is uniform (evenly from least to most), lowest or highest; `sort` is random, drive (sequence and
         frame) or what `sort_column` knows. Scenes without a value are left out.
         """
         if sort == "random":
@@ -104,7 +104,7 @@ class Catalogue:
             order = np.argsort(values, kind="stable")[: np.isfinite(values).sum()]
             if len(order) == 0:
                 raise ValueError(f"--sort {sort}: no scene of {self.root} has a value there")
-        if pick == "spread":
+        if pick == "uniform":
             return self.spread(order, count)
         return order[:count] if pick == "lowest" else order[::-1][:count]
 
