@@ -191,7 +191,7 @@ def test_evaluate_voxels_scores_perfect_reconstruction_as_1(cluster, tmp_path, t
     assert scores["left_out"] == {"truths": 0, "reconstructions": 0} and "stored_bytes" not in scores
     turned = evaluate(replace(config, axes=("x+", "y-", "z+")))
     assert turned["voxels"]["miou"] < 0.5
-    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*by --allow-missing"):
+    with pytest.raises(ValueError, match=r"reconstructions lack 1 of 4 names: town-.*with --allow-missing"):
         evaluate(replace(config, split=""))
     partial = evaluate(replace(config, split="", allow_missing=True))
     assert partial["scenes"] == 3 and partial["left_out"] == {"truths": 1, "reconstructions": 0}
