@@ -1,4 +1,7 @@
-"""Scene, networks and their maths, with torch, numpy and scipy; no Ray. diffusers is imported on first use only."""
+"""Scenes, networks and their mathematics, built on torch, numpy and scipy.
+
+This package does not import Ray. It imports diffusers only when a function needs it.
+"""
 
 from importlib import import_module
 
@@ -6,7 +9,7 @@ _HOME = {"LayoutVAE": "models.lvae", "DiT": "models.dit", "PrITTIPipeline": "mod
 
 
 def __getattr__(name: str):
-    """Import the heavy classes on first use."""
+    """Import `LayoutVAE`, `DiT` or `PrITTIPipeline` when it is first used, because these modules import torch."""
     if name in _HOME:
         return getattr(import_module(_HOME[name]), name)
     raise AttributeError(f"module 'models' has no attribute {name!r}")

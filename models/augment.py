@@ -1,7 +1,7 @@
-"""Augmentation of training scenes: the same place seen in a mirror, or from a slightly moved vehicle.
+"""Augment training scenes: mirror a scene, or view it from a slightly moved vehicle.
 
-Not in the paper; SLEDGE, its forerunner, moves the vehicle by up to a metre and 2.5 degrees. What a moved crop would
-see beyond the border of the old one is unknown and stays empty, so moves are small.
+The paper does not augment scenes. SLEDGE, on which the paper builds, moves the vehicle by up to 1 m and 2.5 degrees.
+A moved crop includes an area outside the stored crop. This area stays empty, so moves should be small.
 """
 
 from __future__ import annotations
@@ -15,14 +15,30 @@ from models.scene import Scene, canonicalize_boxes, make_yaw_rotation
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Which scenes training sees instead of the stored ones. The draw depends on (seed, place in the stream) alone."""
+    """Random changes to training scenes; each draw depends on `seed` and the position in the sample stream only.
 
-    flip: bool = False  # half of the scenes mirrored left to right
-    move_m: float = 0.0  # the vehicle moved by up to this along x and along y
-    turn_rad: float = 0.0  # and turned by up to this
+    Attributes:
+        flip: Mirror half of the scenes left to right.
+        move_m: Largest translation of the vehicle along x and along y (metres).
+        turn_rad: Largest rotation of the vehicle about z (radians).
+        seed: Seed of the draws.
+    """
+
+    flip: bool = False
+    move_m: float = 0.0
+    turn_rad: float = 0.0
     seed: int = 0
 
     def __call__(self, scene: Scene, place: int) -> Scene:
+        """Return a mirrored and moved copy of a scene, as the draw at this position requires.
+
+        Args:
+            scene: Stored scene.
+            place: Position in the sample stream; it keys the random draw.
+
+        Returns:
+            The changed scene, or `scene` itself if the draw changes nothing.
+        """
         rng = np.random.default_rng([7303, self.seed, place])
         flip, dx, dy, turn = rng.random(), *rng.uniform(-1, 1, 3)
         if self.move_m or self.turn_rad:
@@ -31,9 +47,21 @@ class Augmentation:
 
 
 def mirror_scene(scene: Scene) -> Scene:
-    """The scene with left and right exchanged; exact. Raises ValueError if its grid is not symmetric."""
+    """Mirror a scene left to right; the result is exact.
+
+    Args:
+        scene: Scene on a grid that is symmetric about the x axis.
+
+    Returns:
+        The mirrored scene on the same grid.
+
+    Raises:
+        ValueError: The grid is not symmetric about the x axis.
+    """
     if not np.isclose(scene.grid.left_m, -scene.grid.right_m):
-        raise ValueError(f"scene {scene.scene_id}: {scene.grid} is not symmetric about the vehicle, cannot mirror")
+        raise ValueError(
+            f"scene {scene.scene_id}: {scene.grid} is not symmetric about the x axis, so the scene cannot be mirrored"
+        )
     mirror = np.array([1, -1, 1], np.float32)
     rotation, size = canonicalize_boxes(scene.rotation * mirror[:, None], scene.size_m)
     return replace(
@@ -48,9 +76,19 @@ def mirror_scene(scene: Scene) -> Scene:
 
 
 def move_vehicle(scene: Scene, dx_m: float, dy_m: float, turn_rad: float) -> Scene:
-    """The scene as seen from a vehicle moved by (dx, dy) and then turned to the left by `turn_rad`.
+    """Transform a scene into the frame of a vehicle that moves by (dx, dy) and then turns left by `turn_rad`.
 
-    Primitives are exact, rasters take the nearest pixel; what lies beyond the old crop is empty.
+    Primitives are transformed exactly. Rasters are resampled by nearest neighbour. The area outside the stored crop is
+    empty.
+
+    Args:
+        scene: Scene in the frame of the vehicle before the move.
+        dx_m: Forward translation (metres, frame of `scene`).
+        dy_m: Translation to the left (metres, frame of `scene`).
+        turn_rad: Rotation to the left about z (radians).
+
+    Returns:
+        The scene in the frame of the moved vehicle, on the same grid.
     """
     new_from_old = make_yaw_rotation(-turn_rad)
     center = (scene.center_m - np.array([dx_m, dy_m, 0.0])) @ new_from_old.T

@@ -1,7 +1,8 @@
-"""Configured models in diffusers' file format, without importing diffusers (two to three seconds per process).
+"""Save and load models in diffusers' file format, without the import of diffusers (two to three seconds per process).
 
-`ConfiguredModel` has the part of diffusers' `ModelMixin` and `ConfigMixin` that this project uses: a directory holds
-config.json and diffusion_pytorch_model.safetensors, and diffusers' names of methods and files are kept.
+`ConfiguredModel` provides the methods of diffusers' `ModelMixin` and `ConfigMixin` that this project uses. A model
+directory holds config.json and diffusion_pytorch_model.safetensors. Methods and files have the names that diffusers
+gives them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Model = TypeVar("Model", bound="ConfiguredModel")
 
 
 class Config(dict):
-    """Constructor arguments, readable as attributes; `register_to_config` replaces the whole."""
+    """Constructor arguments of a model as a dictionary; entries are also readable as attributes."""
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -38,7 +39,14 @@ class Config(dict):
 
 
 def register_to_config(init: Callable[..., None]) -> Callable[..., None]:
-    """Decorator of `__init__`: keep its arguments, defaults included, as `self.config`; dataclasses become dicts."""
+    """Decorate `__init__` so that it stores its arguments, defaults included, as `self.config`.
+
+    Args:
+        init: Constructor of a `ConfiguredModel`. Arguments that are dataclasses are stored as dictionaries.
+
+    Returns:
+        The decorated constructor.
+    """
     signature = inspect.signature(init)
 
     @wraps(init)
@@ -57,13 +65,25 @@ def _plain(value: Any) -> Any:
 
 
 def write_config(kind: str, config: Mapping[str, Any], path: Path) -> None:
-    """Write a config as diffusers does: sorted JSON with the class and diffusers' version."""
+    """Write a config as diffusers does: sorted JSON with the class name and diffusers' version.
+
+    Args:
+        kind: Name of the class.
+        config: Constructor arguments; they must be JSON-serialisable.
+        path: Output file.
+    """
     content = {"_class_name": kind, "_diffusers_version": version("diffusers")} | dict(config)
     path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read_config(path: Path) -> dict[str, Any]:
     """Read a config without the entries that diffusers adds.
+
+    Args:
+        path: JSON file that `write_config` or diffusers wrote.
+
+    Returns:
+        Constructor arguments by name.
 
     Raises:
         ValueError: The file is missing or is not a JSON object.
@@ -80,21 +100,40 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 class ConfiguredModel(nn.Module):
-    """A network that is stored with the arguments of its constructor, which `register_to_config` decorates."""
+    """A network that is stored together with its constructor arguments.
+
+    Subclasses decorate `__init__` with the function `register_to_config`.
+
+    Attributes:
+        config: Constructor arguments, defaults included.
+    """
 
     config: Config
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Constructor arguments from the entries of a config that an earlier version wrote."""
+        """Convert a config that an earlier version wrote to the current constructor arguments.
+
+        Args:
+            config: Entries of a stored config.
+
+        Returns:
+            Keyword arguments of the constructor. The base class returns `config` unchanged.
+        """
         return config
 
     @classmethod
     def from_config(cls: type[Model], config: Mapping[str, Any]) -> Model:
-        """A model with new weights.
+        """Build a model with newly initialised weights from a config.
+
+        Args:
+            config: Constructor arguments by name; entries that begin with "_" are ignored.
+
+        Returns:
+            The model in training mode.
 
         Raises:
-            ValueError: An entry is unknown or does not fit.
+            ValueError: An entry is unknown or has an invalid value.
         """
         arguments = cls.upgrade_config({name: value for name, value in config.items() if not name.startswith("_")})
         known = inspect.signature(cls.__init__).parameters
@@ -106,14 +145,17 @@ class ConfiguredModel(nn.Module):
     def from_pretrained(
         cls: type[Model], directory: str | os.PathLike, torch_dtype: torch.dtype | None = None
     ) -> Model:
-        """The model that `save_pretrained` wrote into a local directory, in evaluation mode.
+        """Load a model from a local directory that `save_pretrained` wrote.
 
         Args:
-            directory: Holds config.json and diffusion_pytorch_model.safetensors. Nothing is downloaded.
+            directory: Directory with config.json and diffusion_pytorch_model.safetensors. Nothing is downloaded.
             torch_dtype: Data type of the parameters (default: as stored).
 
+        Returns:
+            The model in evaluation mode.
+
         Raises:
-            ValueError: A file is missing or damaged, or its weights are not those of the config's architecture.
+            ValueError: A file is missing or damaged, or the weights do not fit the architecture in config.json.
         """
         path = Path(directory)
         model = cls.from_config(read_config(path / CONFIG_NAME))
@@ -122,15 +164,21 @@ class ConfiguredModel(nn.Module):
         except FileNotFoundError as error:
             raise ValueError(f"{path / WEIGHTS_NAME}: no such file") from error
         except SafetensorError as error:
-            raise ValueError(f"{path / WEIGHTS_NAME}: damaged: {error}") from error
+            raise ValueError(f"{path / WEIGHTS_NAME}: the file is damaged: {error}") from error
         try:
             model.load_state_dict(state)
         except RuntimeError as error:
-            raise ValueError(f"{path / WEIGHTS_NAME}: not the weights of its {CONFIG_NAME}: {error}") from error
+            raise ValueError(
+                f"{path / WEIGHTS_NAME}: the weights do not fit the {CONFIG_NAME} next to them: {error}"
+            ) from error
         return (model if torch_dtype is None else model.to(torch_dtype)).eval()
 
     def save_pretrained(self, directory: str | os.PathLike) -> None:
-        """Write config.json and diffusion_pytorch_model.safetensors into a directory, which is made if missing."""
+        """Write config.json and diffusion_pytorch_model.safetensors into a directory.
+
+        Args:
+            directory: Output directory. It is created if it does not exist.
+        """
         path = Path(directory)
         path.mkdir(parents=True, exist_ok=True)
         write_config(type(self).__name__, self.config, path / CONFIG_NAME)
@@ -138,17 +186,30 @@ class ConfiguredModel(nn.Module):
         save_file(state, path / WEIGHTS_NAME, metadata={"format": "pt"})
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace entries of the config."""
+        """Replace entries of the config.
+
+        Args:
+            **changes: New values by name.
+        """
         self.config = Config(self.config | changes)
 
     @property
     def device(self) -> torch.device:
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     @property
     def dtype(self) -> torch.dtype:
+        """Data type of the parameters."""
         return next(self.parameters()).dtype
 
     def num_parameters(self, only_trainable: bool = False) -> int:
-        """Number of parameters, or of those that are trained."""
+        """Return the number of parameters.
+
+        Args:
+            only_trainable: Count only parameters that require a gradient.
+
+        Returns:
+            Number of scalar parameters.
+        """
         return sum(p.numel() for p in self.parameters() if p.requires_grad or not only_trainable)

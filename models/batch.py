@@ -1,4 +1,7 @@
-"""LayoutBatch: what a LayoutSpec (layout.py) describes, as tensors. Apart from it, so that data jobs need no torch."""
+"""A batch of layouts as tensors; a LayoutSpec (layout.py) defines the meaning of the values.
+
+This module is separate from layout.py because data jobs do not need torch.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +14,44 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class LayoutBatch:
-    """A batch of normalised layouts L = {H, B, F} (paper, Sec. 3.1), every value in [0, 1]."""
+    """A batch of normalised layouts L = {H, B, F} (paper, Sec. 3.1); every value lies in [0, 1].
+
+    Attributes:
+        height: Normalised ground heights H.
+        occupied: Ground masks B, 0 or 1.
+        features: Normalised centres and Cholesky parameters F; 0 in padded slots.
+        real: The paper's padding flag p; True where a slot holds a primitive.
+    """
 
     height: Float[Tensor, "batch ground rows cols"]
     occupied: Float[Tensor, "batch ground rows cols"]
     features: Float[Tensor, "batch slots 9"]
-    real: Bool[Tensor, "batch slots"]  # the padding flag p
+    real: Bool[Tensor, "batch slots"]
 
     def __len__(self) -> int:
         return len(self.real)
 
     def to(self, device: torch.device | str) -> LayoutBatch:
+        """Copy the batch to a device.
+
+        Args:
+            device: Target device.
+
+        Returns:
+            The batch on that device.
+        """
         return LayoutBatch(*(getattr(self, name).to(device, non_blocking=True) for name in self.__dataclass_fields__))
 
     @classmethod
     def from_compact(cls, arrays: dict[str, Tensor]) -> LayoutBatch:
-        """From stacked arrays of `tensors.encode_layout`, unpacked on whatever device they are on."""
+        """Build a batch from the compact arrays of `tensors.encode_layout`.
+
+        Args:
+            arrays: Compact arrays with a leading batch axis, as tensors on any device.
+
+        Returns:
+            The batch on the same device, with float32 values.
+        """
         return cls(
             height=arrays["height"].to(torch.float32) / 65535,
             occupied=arrays["occupied"].to(torch.float32),

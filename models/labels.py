@@ -1,4 +1,4 @@
-"""Classes that a diffusion transformer can be conditioned on."""
+"""Labels on which a diffusion transformer can be conditioned."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from models.scene import DENSITIES
 
-# Names of the classes by kind of label; the index of a joint label is 3 * vegetation + vehicle.
+# Names of the labels by kind of label. The index of a joint label is 3 * vegetation + vehicle.
 LABELS = {
     "vegetation": DENSITIES,
     "vehicle": DENSITIES,
@@ -16,21 +16,49 @@ LABELS = {
 
 
 def find_label_index(kind: str, name: str) -> int:
-    """Index of a label's name; ValueError lists the names of this kind."""
+    """Return the index of a label's name.
+
+    Args:
+        kind: Kind of label, a key of `LABELS`.
+        name: Name of the label.
+
+    Returns:
+        Index of the class.
+
+    Raises:
+        ValueError: The name is unknown; the message lists the names of this kind.
+    """
     if name not in LABELS[kind]:
         raise ValueError(f"label {name!r} is unknown to a {kind} model, expected one of: {', '.join(LABELS[kind])}")
     return LABELS[kind].index(name)
 
 
 def compose_label(kind: str, vegetation: str | None, vehicle: str | None) -> str | None:
-    """The label of a kind from a scene's two densities; None if a density that it needs is unknown."""
+    """Return the label of a scene from its two density labels.
+
+    Args:
+        kind: Kind of label, a key of `LABELS`.
+        vegetation: Density label of the vegetation, or None if it is unknown.
+        vehicle: Density label of the vehicles, or None if it is unknown.
+
+    Returns:
+        Name of the label, or None if a density label that this kind needs is unknown.
+    """
     if kind == "joint":
         return None if vegetation is None or vehicle is None else f"{vegetation}-{vehicle}"
     return {"vegetation": vegetation, "vehicle": vehicle, "none": LABELS["none"][0]}[kind]
 
 
 def split_label(kind: str, label: str) -> tuple[str | None, str | None]:
-    """Vegetation and vehicle density that a label asks for; None for one that it leaves open."""
+    """Return the density labels of vegetation and vehicles that a label requests.
+
+    Args:
+        kind: Kind of label, a key of `LABELS`.
+        label: Name of the label.
+
+    Returns:
+        Density label of the vegetation and of the vehicles; None where the label does not determine it.
+    """
     if kind == "joint":
         vegetation, vehicle = label.split("-")
         return vegetation, vehicle
@@ -38,6 +66,14 @@ def split_label(kind: str, label: str) -> tuple[str | None, str | None]:
 
 
 def require_labels(kind: str, names: Iterable[str]) -> None:
-    """Raises ValueError for a label that is unknown to a model conditioned on `kind`."""
+    """Raise an error if a label is unknown to a model that is conditioned on `kind`.
+
+    Args:
+        kind: Kind of label, a key of `LABELS`.
+        names: Names of labels.
+
+    Raises:
+        ValueError: A name is unknown.
+    """
     for name in names:
         find_label_index(kind, name)

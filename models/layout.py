@@ -1,7 +1,7 @@
-"""The contract between scenes and networks: LayoutSpec says what the numbers of a LayoutBatch (batch.py) mean.
+"""LayoutSpec defines the meaning of the values of a LayoutBatch (batch.py).
 
-A LayoutSpec is made once per dataset (pipelines/preprocess/ingest.py writes it to dataset.json), travels inside every
-checkpoint and inverts a network's outputs without the data.
+pipelines/preprocess/ingest.py computes one LayoutSpec per dataset and writes it to dataset.json. Each checkpoint stores
+a copy of it. A model therefore decodes its outputs to scenes without the dataset.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ PAPER_SLOTS = (178, 159, 2, 18, 6, 5, 16, 77, 19, 17, 17)
 
 @dataclass(frozen=True)
 class Bounds:
-    """Affine normalisation of each entry to [0, 1]; values outside are clipped."""
+    """Lower and upper bound of each entry, for the affine map to [0, 1].
+
+    Attributes:
+        low: Lower bound of each entry.
+        high: Upper bound of each entry; it must exceed the lower bound.
+    """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -32,22 +37,48 @@ class Bounds:
             raise ValueError(f"bounds need low < high entry by entry, got low={self.low} high={self.high}")
 
     def normalise(self, value: np.ndarray) -> np.ndarray:
-        """value (..., k) -> [0, 1], clipped."""
+        """Map values from their bounds to [0, 1] and clip them.
+
+        Args:
+            value: (..., k) values, one entry per bound.
+
+        Returns:
+            (..., k) normalised values in [0, 1].
+        """
         low, high = np.array(self.low), np.array(self.high)
         return ((value - low) / (high - low)).clip(0, 1)
 
     def restore(self, value: np.ndarray) -> np.ndarray:
+        """Map normalised values back to their bounds.
+
+        Args:
+            value: (..., k) normalised values.
+
+        Returns:
+            (..., k) values in the units of the bounds.
+        """
         low, high = np.array(self.low), np.array(self.high)
         return value * (high - low) + low
 
 
 @dataclass(frozen=True)
 class LayoutSpec:
-    """What a layout tensor means: categories and their slots, ground classes, grid and normalisation bounds.
+    """Meaning of a layout tensor: categories, slots, ground classes, grid and normalisation bounds.
 
-    `slots[k]` queries predict `categories[k]`; slots are ordered by category, nearest primitive first. Bounds come
-    from the training split. `surface` says what ground heights are: `top` of the slabs (0.3 m above the true
-    surface, as in the authors' data) or the surface itself.
+    The slots of a category are consecutive. Within a category, the nearest primitive comes first. Bounds come from the
+    training split.
+
+    Attributes:
+        categories: Names of the categories.
+        slots: Number of slots per category.
+        ground_classes: Names of the ground classes, in the order of the rasters.
+        grid: Pixel grid of the rasters in the scene frame.
+        center_bounds_m: Bounds of the centre x, y, z (metres, scene frame).
+        cholesky_bounds: Bounds of the six Cholesky parameters (sqrt(metres)).
+        height_bounds_m: Bounds of the ground height (metres, scene frame).
+        surface: Reference surface of the ground heights. "top" is the top of the slabs, 0.3 m above the true surface,
+            as in
+            the authors' data. Any other value is the true surface.
     """
 
     categories: tuple[str, ...] = CATEGORIES
@@ -68,20 +99,37 @@ class LayoutSpec:
 
     @property
     def num_slots(self) -> int:
+        """Number of slots of all categories."""
         return sum(self.slots)
 
     @property
     def slot_category(self) -> np.ndarray:
-        """(N,) position in `categories` of each slot."""
+        """(N,) index into `categories` of each slot."""
         return np.repeat(np.arange(len(self.slots)), self.slots)
 
     def with_resolution(self, pixels: int) -> LayoutSpec:
-        """The same layout on a square grid of `pixels` rows over the same ground."""
+        """Return this spec with a square pixel grid of another resolution over the same area.
+
+        Args:
+            pixels: Number of rows and of columns.
+
+        Returns:
+            The new spec.
+        """
         extent_m = self.grid.rows * self.grid.resolution_m
         return replace(self, grid=replace(self.grid, rows=pixels, cols=pixels, resolution_m=extent_m / pixels))
 
     def feature_unit(self, length_m: float) -> tuple[float, ...]:
-        """(9,) a length in normalised features, those of the centre and of the Cholesky entries (roots of metres)."""
+        """Convert a length to normalised feature units.
+
+        Cholesky parameters are square roots of lengths, so the square root of `length_m` is used for them.
+
+        Args:
+            length_m: Length (metres).
+
+        Returns:
+            Nine numbers: the length in normalised units of each centre coordinate and Cholesky parameter.
+        """
         return tuple(
             unit / (high - low)
             for bounds, unit in ((self.center_bounds_m, length_m), (self.cholesky_bounds, length_m**0.5))
@@ -89,11 +137,22 @@ class LayoutSpec:
         )
 
     def to_dict(self) -> dict:
+        """Return the spec as plain dictionaries, lists, strings and numbers, as JSON can store it."""
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod
     def from_dict(cls, values: dict) -> LayoutSpec:
-        """Raises ValueError if a field is missing or makes no sense."""
+        """Build a spec from the output of `to_dict`.
+
+        Args:
+            values: Fields of the spec by name.
+
+        Returns:
+            The spec.
+
+        Raises:
+            ValueError: A field is missing or invalid.
+        """
         try:
             bounds = {
                 name: Bounds(tuple(values[name]["low"]), tuple(values[name]["high"]))
@@ -111,11 +170,19 @@ class LayoutSpec:
             raise ValueError(f"not a LayoutSpec: {error!r} in {sorted(values) if values else values}") from error
 
     def fingerprint(self) -> str:
-        """Twelve hex digits that agree exactly when two specs do."""
+        """Return the first twelve hexadecimal digits of the SHA-256 digest of the spec."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
 
     def require(self, other: LayoutSpec, what: str) -> None:
-        """Raises ValueError naming the first difference if `other` (of `what`) is not this spec."""
+        """Raise an error if another spec differs from this one.
+
+        Args:
+            other: Spec to compare.
+            what: Owner of `other`, as the message names it.
+
+        Raises:
+            ValueError: The specs differ; the message names the first field that differs.
+        """
         if self == other:
             return
         mine, theirs = self.to_dict(), other.to_dict()

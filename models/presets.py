@@ -1,7 +1,8 @@
-"""Presets: one row per model size, the same code for all of them.
+"""Presets: one table row of options per model size. All presets use the same code.
 
-`smoke` takes seconds (tests); `demo` and `town` train on two CPU cores in half an hour (layout VAE) and three hours
-(transformer); `kitti360` and `av2` are the paper's (supplement B.2 and B.3).
+* `smoke` trains within seconds, for tests.
+* `demo` and `town` train on two CPU cores: the layout VAE in half an hour and the transformer in three hours.
+* `kitti360` and `av2` are the paper's models (supplement B.2 and B.3).
 """
 
 from __future__ import annotations
@@ -16,10 +17,27 @@ Preset = TypeVar("Preset")
 
 @dataclass(frozen=True)
 class LVAEPreset:
-    """Architecture and training of a layout VAE. `source` is the dataset it is meant for."""
+    """Architecture and training options of a layout VAE.
+
+    Attributes:
+        source: Source of the scenes that the preset is designed for.
+        raster_px: Number of rows and of columns of the rasters.
+        model: Architecture.
+        batch_size: Samples per step.
+        steps: Number of training steps.
+        learning_rate: Initial learning rate.
+        final_learning_rate: Learning rate of the last step.
+        weight_decay: Weight decay of AdamW.
+        warmup_steps: Number of steps in which the learning rate rises linearly.
+        grad_clip: Largest gradient norm (None: no clipping).
+        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        kl_weight: Weight of the KL term, which is summed over the latent.
+        latent_noise: Standard deviation of noise on the training latents. It makes decoders tolerate errors in sampled
+            latents. The paper uses no such noise.
+    """
 
     source: str
-    raster_px: int  # rows = columns of the ground rasters
+    raster_px: int
     model: LayoutVAEConfig
     batch_size: int
     steps: int
@@ -29,18 +47,18 @@ class LVAEPreset:
     warmup_steps: int = 0
     grad_clip: float | None = None
     ema_decay: float | None = None
-    kl_weight: float = 1e-6  # of the sum over the latent
-    latent_noise: float = 0.0  # standard deviation of the noise that decoders learn to tolerate; not in the paper
+    kl_weight: float = 1e-6
+    latent_noise: float = 0.0
 
     def architecture(self) -> dict:
-        """Keyword arguments of `LayoutVAE` apart from the layout."""
+        """Return the keyword arguments of `LayoutVAE` except the layout."""
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
 LOWER_RATE: dict[str, Any] = {"learning_rate": 1e-3}
 QUICK: dict[str, Any] = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "warmup_steps": 50, "grad_clip": 1.0}
 
-# The paper's networks (supplement B.2), and small ones that read primitives off latent cells.
+# PAPER has the paper's networks (supplement B.2). SMALL_CELLS and PAPER_CELLS use the cell decoder for objects.
 PAPER = LayoutVAEConfig(32, GroundConfig((64, 128, 256, 512), 32), ObjectConfig(512, 6, 8, 1024, 1024))
 SMOKE = LayoutVAEConfig(4, GroundConfig((8, 16, 16), 4), ObjectConfig(32, 1, 2, 64, 32))
 SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3)
@@ -54,10 +72,11 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "smoke":    LVAEPreset("town",      32,  SMOKE, 4,     8,       learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, DEMO,  8,     5_000,   latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, TOWN,  8,     2_000,   kl_weight=1e-7, **QUICK),
-    # The paper gives three days on one A100, not a number of steps.
+    # The paper states three days of training on one A100 but no number of steps.
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000),
-    # The paper's object encoder with the town's ground branch and cells: the same latent at a fraction of the cost.
+    # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
+    # The latent has the shape of the paper's, and training costs less.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,
                                  **(QUICK | LOWER_RATE)),
 }
@@ -66,32 +85,55 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
 
 @dataclass(frozen=True)
 class DiTConfig:
-    """Architecture of a `DiT` apart from the shape and the statistics of its latents."""
+    """Architecture of a `DiT`, except the shape and the statistics of its latents.
+
+    Attributes:
+        patch: Side of a patch in latent cells.
+        depth: Number of blocks.
+        width: Width of the tokens.
+        heads: Number of attention heads.
+        prediction: Output of the network: "epsilon", as in the paper, or "v_prediction".
+    """
 
     patch: int
     depth: int
     width: int
     heads: int
-    prediction: str = "epsilon"  # the paper's, or "v_prediction"
+    prediction: str = "epsilon"
 
 
 @dataclass(frozen=True)
 class DiTPreset:
-    """Architecture and training of a diffusion transformer on the latents of the LVAE preset `lvae`."""
+    """Architecture and training options of a diffusion transformer.
+
+    Attributes:
+        lvae: LVAE preset whose latents the transformer is trained on.
+        model: Architecture.
+        batch_size: Samples per step.
+        steps: Number of training steps.
+        normalise_latents: Shift and scale each latent channel to zero mean and unit variance. The paper and SLEDGE do
+            not.
+        learning_rate: Learning rate.
+        weight_decay: Weight decay of AdamW.
+        grad_clip: Largest gradient norm (None: no clipping).
+        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        label_dropout: Probability of training a sample with the null label. The paper does not specify it; 0.1 is
+            DiT's.
+    """
 
     lvae: str
     model: DiTConfig
     batch_size: int
     steps: int
-    normalise_latents: bool = False  # the paper and SLEDGE use latents as they are
+    normalise_latents: bool = False
     learning_rate: float = 1e-4
     weight_decay: float = 1e-6
     grad_clip: float | None = 1.0
     ema_decay: float | None = 0.9999
-    label_dropout: float = 0.1  # the paper leaves it open; DiT's value
+    label_dropout: float = 0.1
 
     def architecture(self) -> dict:
-        """Keyword arguments of `DiT` apart from those that follow from its latents."""
+        """Return the keyword arguments of `DiT` except those that depend on the latents."""
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
@@ -104,7 +146,7 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, True, 1e-3),
     "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "town":        DiTPreset("town",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
-    # The paper gives three days on four A100s, not a number of steps.
+    # The paper states three days of training on four A100s but no number of steps.
     "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000),
     "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 400_000),
     "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 400_000),
@@ -114,10 +156,17 @@ DIT_PRESETS: dict[str, DiTPreset] = {
 
 
 def find_preset(table: dict[str, Preset], name: str) -> Preset:
-    """A preset by name.
+    """Return a preset by name.
+
+    Args:
+        table: Presets by name.
+        name: Name of the preset.
+
+    Returns:
+        The preset.
 
     Raises:
-        ValueError: The name is unknown; the message lists the known ones.
+        ValueError: The name is unknown; the message lists the known names.
     """
     if name not in table:
         raise ValueError(f"unknown preset {name!r}, expected one of: {', '.join(table)}")

@@ -1,4 +1,4 @@
-"""Weights that come with the package: one pipeline directory each, models/weights/<name>, with a model card in it."""
+"""Weights that the package includes: one pipeline directory per model, models/weights/<name>, with a model card."""
 
 from __future__ import annotations
 
@@ -7,20 +7,27 @@ import os
 from pathlib import Path
 
 WEIGHTS = Path(__file__).parent / "weights"
-INDEX_NAME = "model_index.json"  # makes a directory a pipeline's
+INDEX_NAME = "model_index.json"  # every pipeline directory holds this file
 CHECKSUMS_NAME = "checksums.json"
 TRAINING_NAME = "training.json"  # training facts of the model card, for runs that start from these weights
 
 
 def list_released() -> list[str]:
-    """Names that `PrITTIPipeline.from_pretrained` knows."""
+    """Return the names of the included weights, which `PrITTIPipeline.from_pretrained` accepts."""
     return sorted(path.parent.name for path in WEIGHTS.glob(f"*/{INDEX_NAME}"))
 
 
 def find_pipeline_path(model: str | os.PathLike) -> str:
-    """The directory that a path or a name means; a path goes first. Raises ValueError where there is neither.
+    """Find the directory of a pipeline on this machine; nothing is downloaded.
 
-    Never looks beyond this machine.
+    Args:
+        model: Path of a pipeline directory or name of included weights. An existing path has precedence.
+
+    Returns:
+        Path of the directory.
+
+    Raises:
+        ValueError: There is neither such a directory nor such a name.
     """
     model = os.fspath(model)
     if os.path.exists(os.path.join(model, INDEX_NAME)):
@@ -28,12 +35,19 @@ def find_pipeline_path(model: str | os.PathLike) -> str:
     if model in list_released():
         return str(WEIGHTS / model)
     raise ValueError(
-        f"{model}: no PrITTI pipeline here, and none of that name comes with the package ({', '.join(list_released())})"
+        f"{model}: no PrITTI pipeline here, and no included weights have this name ({', '.join(list_released())})"
     )
 
 
 def compute_checksums(directory: str | os.PathLike) -> dict[str, str]:
-    """SHA-256 of every file that is loaded from a pipeline's directory, by its path there."""
+    """Compute the SHA-256 digest of every file that a pipeline loads.
+
+    Args:
+        directory: Pipeline directory.
+
+    Returns:
+        Hexadecimal digests by path relative to `directory`.
+    """
     root = Path(directory)
     files = [root / INDEX_NAME, *sorted(path for path in root.glob("*/*") if path.suffix in (".safetensors", ".json"))]
     return {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -1,11 +1,10 @@
-"""The Scene: one 64 x 64 m semantic layout as arrays in metres (paper, Sec. 3.1).
+"""Scene: one semantic layout of 64 m x 64 m as arrays in metres (paper, Sec. 3.1).
 
-Everything in this project either makes Scenes, stores Scenes or scores Scenes. Real and generated scenes are
-the same struct, in the same frame:
+Real and generated scenes use the same class and the same scene frame. Its origin is the ego vehicle, and its axes are
+**x forward, y left, z up**, aligned with gravity.
 
-    origin at the ego vehicle, **x forward, y left, z up**, gravity-aligned.
-
-Differs from the paper, whose frame keeps the IMU's pitch and roll: blocks would not join.
+Differs from the paper, whose frame keeps the pitch and roll of the IMU. With pitch and roll, the ground of neighbouring
+blocks would not meet.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-# Paper, supplement Tab. "object categories"; the order is the order of the slots.
+# Paper, supplement Tab. "object categories". Slots have the same order.
 CATEGORIES = (
     "vegetation_cuboid",
     "vegetation_ellipsoid",
@@ -35,7 +34,7 @@ ELLIPSOID = CATEGORY_INDEX["vegetation_ellipsoid"]
 VEGETATION = (CATEGORY_INDEX["vegetation_cuboid"], ELLIPSOID)
 VEHICLES = (CATEGORY_INDEX["vehicle_big"], CATEGORY_INDEX["vehicle_small"])
 
-# The paper's five, and Argoverse 2's crossings.
+# The paper's five ground classes and the crossings of Argoverse 2.
 GROUND_CLASSES = ("road", "sidewalk", "parking", "terrain", "ground", "crossing")
 KITTI_GROUND_CLASSES = GROUND_CLASSES[:5]
 ROAD_CLASSES = ("road", "crossing")
@@ -43,15 +42,22 @@ DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 DENSITIES = ("low", "medium", "high")
 
-# Fields of a Scene with a row per primitive.
+# Fields of a Scene that hold one row per primitive.
 PER_PRIMITIVE = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A top-down pixel grid in the scene frame: row 0 is farthest ahead, column 0 leftmost.
+    """A pixel grid in top view in the scene frame; row 0 is farthest ahead and column 0 is leftmost.
 
-    Pixel centre (row, col) lies at x = front_m - (row + .5) resolution_m, y = left_m - (col + .5) resolution_m.
+    The centre of pixel (row, col) is x = front_m - (row + .5) resolution_m, y = left_m - (col + .5) resolution_m.
+
+    Attributes:
+        front_m: x of the far border (metres, scene frame).
+        left_m: y of the left border (metres, scene frame).
+        resolution_m: Side of a pixel (metres).
+        rows: Number of rows.
+        cols: Number of columns.
     """
 
     front_m: float = 64.0
@@ -62,26 +68,44 @@ class Grid:
 
     @property
     def back_m(self) -> float:
+        """x of the rear border (metres, scene frame)."""
         return self.front_m - self.rows * self.resolution_m
 
     @property
     def right_m(self) -> float:
+        """y of the right border (metres, scene frame)."""
         return self.left_m - self.cols * self.resolution_m
 
     def x_m(self) -> np.ndarray:
-        """(rows,) x of the pixel centres."""
+        """Return the x coordinates (rows,) of the pixel centres in metres."""
         return self.front_m - (np.arange(self.rows) + 0.5) * self.resolution_m
 
     def y_m(self) -> np.ndarray:
-        """(cols,) y of the pixel centres."""
+        """Return the y coordinates (cols,) of the pixel centres in metres."""
         return self.left_m - (np.arange(self.cols) + 0.5) * self.resolution_m
 
     def contains(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> Any:
-        """True where a point lies inside the grid's rectangle (half-open: the far and left border belong)."""
+        """Test whether points lie inside the rectangle of the grid.
+
+        The far and the left border belong to the rectangle; the other two borders do not.
+
+        Args:
+            x_m: x coordinates (metres, scene frame).
+            y_m: y coordinates (metres, scene frame).
+
+        Returns:
+            Boolean, or array of booleans with the broadcast shape of the inputs.
+        """
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 
     def intersect(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Slices (rows, cols) of this grid and of the other that show the same place.
+        """Find the pixels of this grid and of another one that cover the same area.
+
+        Args:
+            other: Grid of the same resolution in the same frame.
+
+        Returns:
+            Row and column slices of this grid, then those of `other`.
 
         Raises:
             ValueError: The grids are not aligned to whole pixels.
@@ -93,30 +117,52 @@ class Grid:
             raise ValueError(f"grid {self} is not aligned with {other} to whole pixels")
         here, there = [], []
         for ahead, count, others in ((round(row0), self.rows, other.rows), (round(col0), self.cols, other.cols)):
-            start = max(0, -ahead)  # `ahead`: the other's index of our pixel 0
+            start = max(0, -ahead)  # `ahead` is the index in the other grid of pixel 0 of this grid
             stop = max(start, min(count, others - ahead))
             here.append(slice(start, stop))
             there.append(slice(start + ahead, stop + ahead))
         return (here[0], here[1]), (there[0], there[1])
 
     def upsample_cells(self, cells: np.ndarray) -> np.ndarray:
-        """(rows, cols): each of the coarser (h, w) cells as its block of pixels. h divides rows and w cols."""
+        """Repeat each coarse cell over its block of pixels.
+
+        Args:
+            cells: (h, w) values; h must divide `rows` and w must divide `cols`.
+
+        Returns:
+            (rows, cols) values.
+        """
         h, w = cells.shape
         return cells.repeat(self.rows // h, axis=0).repeat(self.cols // w, axis=1)
 
     def pixel(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> tuple[Any, Any]:
-        """(row, col) of the pixel that holds each point; may lie outside the grid."""
+        """Find the pixel that contains each point.
+
+        Args:
+            x_m: x coordinates (metres, scene frame).
+            y_m: y coordinates (metres, scene frame).
+
+        Returns:
+            Row and column indices as int64; they may lie outside the grid.
+        """
         row = np.floor((self.front_m - np.asarray(x_m)) / self.resolution_m).astype(np.int64)
         col = np.floor((self.left_m - np.asarray(y_m)) / self.resolution_m).astype(np.int64)
         return row, col
 
 
 def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same boxes with height nearest the vertical, length >= width and yaw in [-pi/2, pi/2).
+    """Rewrite boxes so that the height axis is nearest to the vertical, length >= width and yaw in [-pi/2, pi/2).
 
-    rotation (n, 3, 3), columns = the box's axes in the scene frame; size_m (n, 3), full extents along them.
-    Returns rotation (n, 3, 3), right-handed with columns (length, width, height), and size_m (n, 3) = (l, w, h).
-    A mirrored input (determinant < 0) becomes right-handed: a box is its own mirror image.
+    The point sets of the boxes do not change. A mirrored input (determinant < 0) becomes right-handed, because a box
+    equals
+    its mirror image.
+
+    Args:
+        rotation: (n, 3, 3) axes of the boxes in the scene frame, as columns.
+        size_m: (n, 3) full extents along these axes (metres).
+
+    Returns:
+        rotation (n, 3, 3), right-handed with columns (length, width, height), and size_m (n, 3) = (l, w, h).
     """
     rotation, size_m = np.asarray(rotation), np.asarray(size_m)
     if len(size_m) == 0:
@@ -138,28 +184,63 @@ def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.nda
 
 
 def compute_yaw(rotation: np.ndarray) -> np.ndarray:
-    """(n,) yaw of the length axis, in [-pi/2, pi/2) for canonical boxes."""
+    """Compute the yaw of the length axis.
+
+    Args:
+        rotation: (n, 3, 3) axes of the boxes as columns; column 0 is the length axis.
+
+    Returns:
+        (n,) yaw in radians, in [-pi/2, pi/2) for canonical boxes.
+    """
     return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
 
 
 def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
-    """(..., 3, 3) rotation about z."""
+    """Return rotation matrices about the z axis.
+
+    Args:
+        yaw_rad: Angle to the left (radians), any shape.
+
+    Returns:
+        (..., 3, 3) rotation matrices.
+    """
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     zero, one = np.zeros_like(cos), np.ones_like(cos)
     rows = [np.stack(row, -1) for row in ([cos, -sin, zero], [sin, cos, zero], [zero, zero, one])]
     return np.stack(rows, -2)
 
 
-UNSET = np.zeros(0)  # replaced by the default that fits the number of primitives
+UNSET = np.zeros(0)  # placeholder; `Scene` replaces it by an array with one default per primitive
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One scene. n primitives, G ground classes on an H x W grid; metres, radians, scene frame.
+    """One scene with n primitives and G ground classes on an H x W grid, in metres and radians in the scene frame.
 
-    `size_m` holds full extents along the columns of `rotation`; both are canonical (`canonicalize_boxes`).
-    `heading_rad` is NaN where the direction of travel is unknown (the scatter matrix loses 180 degrees).
-    `height_m` is 0 where `occupied` is False. `world_from_imu` (3, 4) is the dataset's own full pose, if any.
+    Attributes:
+        scene_id: Unique id of the scene.
+        source: Name of the source.
+        sequence: Name of the drive; for a generated scene, its seed.
+        frame: Index of the frame within the drive; for a generated scene, its index within the run.
+        split: Name of the split.
+        category: Category of each primitive.
+        center_m: Centres.
+        rotation: Axes of the primitives as columns, canonical (`canonicalize_boxes`).
+        size_m: Full extents along the columns of `rotation`, canonical (`canonicalize_boxes`).
+        ground_classes: Ground classes of the rasters.
+        height_m: Ground height per ground class; 0 where `occupied` is False.
+        occupied: Ground mask per ground class.
+        grid: Pixel grid of the rasters.
+        existence: Existence probability; 1 for annotated primitives.
+        heading_rad: Direction of travel; NaN where it is unknown. The scatter matrix does not distinguish front and
+            back.
+        instance_id: Id of the object in the source's annotation; -1 if there is none.
+        label: Class name of the object in the source's annotation (default: the name of the category).
+        world_xyz_m: Position of the scene frame's origin in the world frame.
+        world_yaw_rad: Yaw of the scene frame in the world frame.
+        world_from_imu: (3, 4) full pose from the source, or None.
+        vegetation_density: Density label of the vegetation, or None if it is unknown.
+        vehicle_density: Density label of the vehicles, or None if it is unknown.
     """
 
     scene_id: str
@@ -175,14 +256,10 @@ class Scene:
     height_m: np.ndarray  # (G, H, W) float32
     occupied: np.ndarray  # (G, H, W) bool
     grid: Grid = field(default_factory=Grid)
-    existence: np.ndarray = field(
-        default_factory=lambda: UNSET
-    )  # (n,) float32; default: 1, as for annotated primitives
+    existence: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) float32; default: 1
     heading_rad: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) float32; default: NaN
-    instance_id: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) int64; default: -1, none
-    label: np.ndarray = field(
-        default_factory=lambda: UNSET
-    )  # (n,) str, the dataset's own class name; default: the category's
+    instance_id: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) int64; default: -1
+    label: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) str; default: name of the category
     world_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_yaw_rad: float = 0.0
     world_from_imu: np.ndarray | None = None
@@ -217,22 +294,27 @@ class Scene:
 
     @property
     def volume_m3(self) -> np.ndarray:
-        """(n,) volume of each primitive: l w h for cuboids, pi/6 l w h for ellipsoids."""
+        """(n,) volume of each primitive (m^3): l w h for cuboids, pi/6 l w h for ellipsoids."""
         return self.size_m.prod(axis=1) * np.where(self.category == ELLIPSOID, np.pi / 6, 1.0)
 
     @property
     def yaw_rad(self) -> np.ndarray:
+        """(n,) yaw of the length axis of each primitive (radians)."""
         return compute_yaw(self.rotation)
 
     @property
     def bottom_m(self) -> np.ndarray:
-        """(n,) z of each primitive's lowest point."""
+        """(n,) z of the lowest point of each primitive (metres, scene frame)."""
         half_m = 0.5 * np.abs(self.rotation[:, 2, :]) * self.size_m
         down_m = np.where(self.category == ELLIPSOID, np.sqrt((half_m**2).sum(axis=1)), half_m.sum(axis=1))
         return self.center_m[:, 2] - down_m
 
     def ground_under(self) -> tuple[np.ndarray, np.ndarray]:
-        """height_m (n,) and class (n,) of the fused ground under each centre; NaN and -1 where there is none."""
+        """Look up the fused ground (`surface`) under the centre of each primitive.
+
+        Returns:
+            Height (n,) in metres, NaN without ground, and class (n,), -1 without ground.
+        """
         height_m, winner = self.surface()
         x_m, y_m = self.center_m[:, 0], self.center_m[:, 1]
         row, col = self.grid.pixel(x_m, y_m)
@@ -241,18 +323,22 @@ class Scene:
         return np.where(known, height_m[pixel], np.nan), np.where(known, winner[pixel], -1)
 
     def counts(self) -> np.ndarray:
-        """(11,) primitives per category."""
+        """Return the number of primitives per category as an array (11,)."""
         return np.bincount(self.category, minlength=len(CATEGORIES))
 
     def ground_area_m2(self) -> np.ndarray:
-        """(G,) occupied area per ground class."""
+        """Return the occupied area (G,) of each ground class in m^2."""
         return self.occupied.sum(axis=(1, 2)) * self.grid.resolution_m**2
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """The fused ground (paper, supplement B.2, Layout Reconstruction): at each pixel the highest class wins.
+        """Fuse the ground classes into one surface (paper, supplement B.2, Layout Reconstruction).
 
-        Of equal heights the later class wins: a crossing lies on its road. Returns height_m (H, W) and ground_class
-        (H, W) int8, index into ground_classes, -1 where there is none.
+        The highest class is kept at each pixel. If two classes have the same height, the later one is kept, because a
+        crossing
+        lies on its road.
+
+        Returns:
+            Height (H, W) in metres, and class (H, W) int8 as index into `ground_classes`, -1 without ground.
         """
         top = np.full(self.height_m.shape[1:], -np.inf, np.float32)
         winner = np.full(top.shape, -1, np.int8)
@@ -264,20 +350,43 @@ class Scene:
         return top, winner
 
     def select(self, keep: np.ndarray | slice | Sequence[int]) -> Scene:
-        """The scene with only the primitives that `keep` (mask or indices) names, in its order."""
+        """Return the scene with a subset of its primitives.
+
+        Args:
+            keep: Mask or indices of the primitives to keep; indices also set the order.
+
+        Returns:
+            The scene with these primitives and the same ground.
+        """
         return replace(self, **{name: getattr(self, name)[keep] for name in PER_PRIMITIVE})
 
     def translate(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
-        """The same content in a frame whose origin lies at (-dx, -dy, -dz): everything, the grid too, moves by d."""
+        """Return the scene with all primitives, the ground and the grid moved by (dx, dy, dz).
+
+        Args:
+            dx_m: Translation along x (metres).
+            dy_m: Translation along y (metres).
+            dz_m: Translation along z (metres).
+
+        Returns:
+            The moved scene.
+        """
         grid = replace(self.grid, front_m=self.grid.front_m + dx_m, left_m=self.grid.left_m + dy_m)
         center = self.center_m + np.array([dx_m, dy_m, dz_m], np.float32)
         height = np.where(self.occupied, self.height_m + np.float32(dz_m), np.float32(0))
         return replace(self, center_m=center, height_m=height, grid=grid)
 
     def crop(self, grid: Grid) -> Scene:
-        """The part inside `grid` (same resolution, aligned to whole pixels); pixels beyond the scene are empty.
+        """Return the part of the scene inside another grid; pixels outside this scene are empty.
 
-        Raises ValueError if the grids are not aligned.
+        Args:
+            grid: Grid of the same resolution, aligned to whole pixels.
+
+        Returns:
+            The scene on `grid`, with the primitives whose centre lies inside it.
+
+        Raises:
+            ValueError: The grids are not aligned.
         """
         here, there = grid.intersect(self.grid)
         shape = (len(self.ground_classes), grid.rows, grid.cols)
@@ -288,9 +397,17 @@ class Scene:
 
 
 def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
-    """One scene on `like.grid` from scenes on that grid, by ownership (mask per scene, (H, W) bool, disjoint).
+    """Merge scenes on one grid: each pixel comes from the scene that owns it.
 
-    A pixel comes from the scene that owns it; a primitive from the scene that owns the pixel under its centre.
+    A primitive is kept if its scene owns the pixel under its centre.
+
+    Args:
+        scenes: Scenes on `like.grid`.
+        owned: (H, W) bool mask per scene; the masks are disjoint.
+        like: Scene that provides ids, labels, pose and grid.
+
+    Returns:
+        One scene with the fields of `like` and the merged content.
     """
     height, occupied = np.zeros_like(like.height_m), np.zeros_like(like.occupied)
     parts = []
@@ -303,5 +420,12 @@ def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> S
 
 
 def concatenate_primitives(scenes: Sequence[Scene]) -> dict[str, Any]:
-    """The primitives of all scenes, one after the other, as fields of a Scene."""
+    """Concatenate the primitives of scenes.
+
+    Args:
+        scenes: Scenes in order.
+
+    Returns:
+        The per-primitive fields of a Scene by name.
+    """
     return {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in PER_PRIMITIVE}

@@ -1,4 +1,4 @@
-"""Scene <-> layout tensors under a LayoutSpec: normalise, keep the nearest, pad; and back with a threshold."""
+"""Convert scenes to layout tensors of a LayoutSpec, and decoded layouts back to scenes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,32 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
 
 def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """height_m and occupied (G, H, W) of the named classes on a grid over the same ground (`resample_ground`)."""
+    """Resample ground classes of a scene onto another grid over the same area (`resample_ground`).
+
+    Args:
+        scene: Scene.
+        ground_classes: Names of the classes of the result.
+        grid: Grid of the result.
+
+    Returns:
+        Height (G, H, W) in metres and mask (G, H, W) of these classes.
+
+    Raises:
+        ValueError: The grids cover different areas, or the ratio of their resolutions is not a whole number.
+    """
     return resample_ground(*select_ground_classes(scene, ground_classes), scene.grid, grid)
 
 
 def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """height_m and occupied of the named classes; those that the scene does not have are empty."""
+    """Return the rasters of the given ground classes; classes that the scene lacks are empty.
+
+    Args:
+        scene: Scene.
+        ground_classes: Names of the classes of the result, in order.
+
+    Returns:
+        Height (G, H, W) in metres and mask (G, H, W) of these classes.
+    """
     if ground_classes == scene.ground_classes:
         return scene.height_m, scene.occupied
     shape = (len(ground_classes), scene.grid.rows, scene.grid.cols)
@@ -34,14 +54,27 @@ def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tupl
 
 
 def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (G, H, W), metres or whole numbers, and masks on another grid over the same ground.
+    """Resample rasters onto another grid over the same area.
 
-    Coarser: a pixel is occupied where at least half of it is, its height the mean over the occupied part. Finer:
-    nearest. Raises ValueError if the grids do not cover the same ground, or if the ratio of pixels is not whole.
+    On a coarser grid, a pixel is occupied if at least half of its area is occupied. Its height is the mean over the
+    occupied
+    part. On a finer grid, values are those of the nearest pixel.
+
+    Args:
+        height: (G, H, W) heights, in metres or as unsigned integers.
+        occupied: (G, H, W) masks.
+        own: Grid of the rasters.
+        grid: Grid of the result.
+
+    Returns:
+        Heights and masks on `grid`, with the data types of the inputs.
+
+    Raises:
+        ValueError: The grids cover different areas, or the ratio of their resolutions is not a whole number.
     """
     covered, wanted = ((g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid))
     if not np.allclose(covered, wanted):
-        raise ValueError(f"the scene covers {own}, wanted is {grid}")
+        raise ValueError(f"the scene covers {own}, expected the area of {grid}")
     if grid.rows == own.rows:
         return height, occupied
     if own.rows % grid.rows == 0:
@@ -56,11 +89,14 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
         f = grid.rows // own.rows
         height, occupied = (a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
         return height, occupied
-    raise ValueError(f"{own.rows} pixels do not divide into {grid.rows}")
+    raise ValueError(f"cannot resample {own.rows} rows to {grid.rows}: the ratio must be a whole number")
 
 
 def _sum_blocks(values: np.ndarray, f: int, dtype: np.typing.DTypeLike) -> np.ndarray:
-    """(G, H / f, W / f) sums over f x f blocks: whole rows first, then strided columns of what is left."""
+    """Return sums (G, H / f, W / f) over blocks of f x f pixels.
+
+    Rows are added first, because they are contiguous in memory; the strided columns are then fewer.
+    """
     rows = sum(
         (values[:, i::f].astype(dtype, copy=False) for i in range(1, f)), values[:, ::f].astype(dtype, copy=False)
     )
@@ -68,15 +104,23 @@ def _sum_blocks(values: np.ndarray, f: int, dtype: np.typing.DTypeLike) -> np.nd
 
 
 def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Which primitive sits in which slot: (m,) slots and (m,) primitive indices.
+    """Assign primitives to slots.
 
-    A category with more primitives than slots keeps those nearest to the ego vehicle (supplement A).
+    If a category has more primitives than slots, the primitives nearest to the ego vehicle are kept (supplement A).
+
+    Args:
+        category: (n,) categories.
+        center_m: (n, 3) centres (metres, scene frame).
+        spec: Defines the slots.
+
+    Returns:
+        Slots (m,) and the indices (m,) of the primitives in them.
     """
     position = np.full(len(CATEGORY_INDEX), -1)
     position[[CATEGORY_INDEX[name] for name in spec.categories]] = np.arange(len(spec.categories))
     position = position[category]
     order = np.lexsort((np.linalg.norm(center_m, axis=1), position))
-    order = order[np.searchsorted(position[order], 0) :]  # categories that the spec does not have
+    order = order[np.searchsorted(position[order], 0) :]  # drop categories that the spec lacks
     group = position[order]
     rank = np.arange(len(order)) - np.searchsorted(group, group)
     slots = np.array(spec.slots)
@@ -85,16 +129,38 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
 
 
 def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
-    """The layout of one scene as small arrays, cheap to send between processes: `LayoutBatch.from_compact` unpacks.
+    """Encode a scene as compact arrays, which are cheap to send between processes.
 
-    height (G, H, W) uint16 in 65535ths of the bounds, occupied (G, H, W) bool, features (N, 9) float32, real (N,).
+    `LayoutBatch.from_compact` converts them to tensors.
+
+    Args:
+        scene: Scene of any resolution over the area of `spec.grid`.
+        spec: Defines the encoding.
+
+    Returns:
+        height (G, H, W) uint16, where 65535 is the upper bound; occupied (G, H, W) bool; features (N, 9) float32; real
+        (N,) bool.
+
+    Raises:
+        ValueError: The scene covers another area, or the ratio of the resolutions is not a whole number.
     """
     parameters = compute_cholesky_parameters(scene.rotation, scene.size_m)
     return encode_ground(scene, spec) | encode_primitives(scene.category, scene.center_m, parameters, spec)
 
 
 def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
-    """height and occupied of `encode_layout`."""
+    """Encode the rasters of a scene.
+
+    Args:
+        scene: Scene of any resolution over the area of `spec.grid`.
+        spec: Defines the encoding.
+
+    Returns:
+        The entries `height` and `occupied` of `encode_layout`.
+
+    Raises:
+        ValueError: The scene covers another area, or the ratio of the resolutions is not a whole number.
+    """
     height_m, occupied = select_ground_classes(scene, spec.ground_classes)
     height = np.zeros(height_m.shape, np.uint16)
     height[occupied] = encode_height(height_m[occupied], spec)
@@ -103,7 +169,15 @@ def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
 
 def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
-    """Heights in 65535ths of the spec's bounds, uint16, clipped."""
+    """Quantise heights to 16 bits.
+
+    Args:
+        height_m: Heights (metres, scene frame), any shape.
+        spec: Gives the bounds, which map to 0 and 65535.
+
+    Returns:
+        uint16 array of the same shape; heights outside the bounds are clipped.
+    """
     (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
     scaled = (height_m - np.float32(low)) * np.float32(65535 / (high - low))
     return np.rint(scaled.clip(0, 65535)).astype(np.uint16)
@@ -112,7 +186,17 @@ def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
 def encode_primitives(
     category: np.ndarray, center_m: np.ndarray, parameters: np.ndarray, spec: LayoutSpec
 ) -> dict[str, np.ndarray]:
-    """features and real of `encode_layout` from categories (n,), centres (n, 3) and Cholesky parameters (n, 6)."""
+    """Encode primitives as slots.
+
+    Args:
+        category: (n,) categories.
+        center_m: (n, 3) centres (metres, scene frame).
+        parameters: (n, 6) Cholesky parameters (sqrt(metres)).
+        spec: Defines the slots and the bounds.
+
+    Returns:
+        The entries `features` and `real` of `encode_layout`.
+    """
     features = np.zeros((spec.num_slots, FEATURES), np.float32)
     real = np.zeros(spec.num_slots, bool)
     slots, primitives = assign_slots(category, center_m, spec)
@@ -123,7 +207,18 @@ def encode_primitives(
 
 
 def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
-    """Scenes as one batch on the CPU."""
+    """Encode scenes as one batch on the CPU.
+
+    Args:
+        scenes: Scenes over the area of `spec.grid`.
+        spec: Defines the encoding.
+
+    Returns:
+        The batch.
+
+    Raises:
+        ValueError: A scene covers another area, or the ratio of the resolutions is not a whole number.
+    """
     layouts = [encode_layout(scene, spec) for scene in scenes]
     stacked = {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
     return LayoutBatch.from_compact({name: torch.from_numpy(value) for name, value in stacked.items()})
@@ -131,21 +226,38 @@ def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
 
 @dataclass(frozen=True, eq=False)
 class DecodedLayout:
-    """One decoded layout, as numpy: probabilities and normalised values, before any threshold."""
+    """One decoded layout as numpy arrays, before any threshold.
 
-    occupancy: np.ndarray  # (G, H, W) probability
-    height: np.ndarray  # (G, H, W) normalised
-    features: np.ndarray  # (n, 9) normalised
-    existence: np.ndarray  # (n,) probability
-    category: np.ndarray  # (n,) position in the spec's categories
+    Attributes:
+        occupancy: (G, H, W) probability that a pixel is occupied.
+        height: (G, H, W) normalised heights.
+        features: (n, 9) normalised features of the proposals.
+        existence: (n,) existence probabilities.
+        category: (n,) index of each proposal's category in `LayoutSpec.categories`.
+    """
+
+    occupancy: np.ndarray
+    height: np.ndarray
+    features: np.ndarray
+    existence: np.ndarray
+    category: np.ndarray
 
 
 def decode_layout(
     layout: DecodedLayout, spec: LayoutSpec, identity: Scene, threshold: float = EXISTENCE_THRESHOLD
 ) -> Scene:
-    """The Scene a decoder means (supplement B.2, Layout Reconstruction); ids, pose and labels from `identity`.
+    """Convert a decoded layout to a Scene (supplement B.2, Layout Reconstruction).
 
-    Primitives with existence probability above `threshold` are kept, ground where occupancy exceeds one half.
+    A pixel is occupied if its occupancy exceeds 0.5.
+
+    Args:
+        layout: Output of a decoder.
+        spec: Defines the encoding.
+        identity: Scene that provides ids, pose and labels.
+        threshold: Primitives with a higher existence probability are kept.
+
+    Returns:
+        The scene on `spec.grid`.
     """
     occupied = layout.occupancy > 0.5
     height = spec.height_bounds_m.restore(layout.height[..., None])[..., 0]
@@ -171,7 +283,19 @@ def decode_layout(
 
 
 def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields) -> Scene:
-    """An empty generated Scene to hand to `decode_layout` as its identity."""
+    """Make an empty generated Scene, for example as the identity for `decode_layout`.
+
+    Args:
+        scene_id: Unique id.
+        source: Name of the source.
+        sequence: Name of the sequence.
+        frame: Index within the sequence.
+        spec: Gives the grid and the ground classes.
+        **fields: Further fields of `Scene`.
+
+    Returns:
+        A scene without primitives and ground.
+    """
     shape = (len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
     return Scene(
         scene_id=scene_id,

@@ -21,7 +21,7 @@ MISTAKES = {
     ("train_lvae.py",): "run jobs/preprocess_scenes.py",
     ("train_dit.py", "kitti360"): "run jobs/preprocess_scenes.py",
     ("encode_latents.py",): "run jobs/preprocess_scenes.py",
-    ("sample_scenes.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here, and none of that name comes with",
+    ("sample_scenes.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here, and no included weights",
     ("publish_model.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here",
     ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
     ("outpaint_scenes.py", "--num-actors", "0"): "--num-actors is 0, expected at least 1",
