@@ -1,1 +1,1 @@
-"""Exact geometry of boxes: IoU3D, the Cholesky parametrisation and other encodings."""
+"""Exact box geometry: IoU3D, Cholesky parameters and other encodings."""

@@ -1,11 +1,13 @@
-"""Rotation and size <-> scatter matrix <-> six Cholesky parameters (paper, Sec. 3.1 and supplement B.1).
+"""Convert rotation and size of a box to six Cholesky parameters and back (paper, Sec. 3.1 and supplement B.1).
 
-S = R diag(l, w, h) R^T with full extents (not squared), S = L L^T, c = the six non-zero entries of L. Entries of L
-are in sqrt(metres); those off the diagonal are signed. The paper leaves open which entry order and which bounds:
-row-major (L00, L10, L11, L20, L21, L22), bounds from the training split.
+The scatter matrix is S = R diag(l, w, h) R^T with full extents (not squared). Its Cholesky factor L fulfils S = L L^T.
+The six parameters c are the lower-triangular entries of L. Entries of L have the unit sqrt(metres); off-diagonal
+entries may be negative.
 
-Plain numpy, any leading batch shape: encoding happens on data, decoding on what a network gave, neither needs a
-gradient.
+The paper does not specify the order and the bounds of the entries. This module uses the row-major order (L00, L10, L11,
+L20, L21, L22). Bounds come from the training split.
+
+The functions use numpy and accept any leading batch shape, because none of them needs a gradient.
 """
 
 from __future__ import annotations
@@ -17,23 +19,47 @@ MIN_EXTENT_M = 0.01
 
 
 def compute_scatter_matrix(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """S (..., 3, 3) of boxes with axes rotation[..., :, j] and full extents size_m[..., j] (supplement Eq. 1)."""
+    """Compute the scatter matrices of boxes (supplement Eq. 1).
+
+    Args:
+        rotation: (..., 3, 3) axes of the boxes as columns.
+        size_m: (..., 3) full extents along these axes (metres).
+
+    Returns:
+        S (..., 3, 3) in metres.
+    """
     return np.einsum("...ij,...j,...kj->...ik", rotation, size_m, rotation)
 
 
 def compute_cholesky_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """c (..., 6), float64, of boxes (supplement Eq. 2). Extents below 1 cm count as 1 cm."""
+    """Compute the Cholesky parameters of boxes (supplement Eq. 2).
+
+    Args:
+        rotation: (..., 3, 3) axes of the boxes as columns.
+        size_m: (..., 3) full extents along these axes (metres). Extents below 1 cm count as 1 cm.
+
+    Returns:
+        c (..., 6), float64, in sqrt(metres).
+    """
     size_m = np.maximum(np.asarray(size_m, np.float64), MIN_EXTENT_M)
     lower = np.linalg.cholesky(compute_scatter_matrix(np.asarray(rotation, np.float64), size_m))
     return lower[..., TRIL[0], TRIL[1]]
 
 
 def decode_cholesky_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rotation (..., 3, 3), right-handed, and size_m (..., 3) from c (..., 6) (supplement, Reconstruction).
+    """Decode Cholesky parameters to boxes (supplement, Reconstruction).
 
-    Any six finite numbers give a box: S = L L^T is positive semi-definite whatever L is, extents below 1 cm are
-    clamped to 1 cm, and one column is flipped where the eigenvectors come out left-handed. Extents are ascending;
-    `scene.canonicalize_boxes` puts them in order.
+    Any six finite numbers decode to a box, because S = L L^T is positive semi-definite for every L. If the eigenvectors
+    are
+    left-handed, one axis is flipped. Extents below 1 cm are clamped to 1 cm.
+
+    Args:
+        parameters: c (..., 6) in sqrt(metres).
+
+    Returns:
+        rotation (..., 3, 3), right-handed, and size_m (..., 3) in ascending order; `scene.canonicalize_boxes` reorders
+        the
+        axes.
     """
     parameters = np.asarray(parameters, np.float64)
     lower = np.zeros((*parameters.shape[:-1], 3, 3))

@@ -1,26 +1,27 @@
-"""Ways to write the shape of a box (rotation and size) as numbers that a network can regress.
+"""Encodings of the shape of a box (rotation and size) as numbers that a network can regress.
 
-`cholesky` is the paper's (Sec. 3.1), `quaternion` the baseline that it compares with, `octahedral` ours. A box is a set
-of points, so its 24 descriptions (axes renamed or turned round) should have one code, different boxes different codes,
-and a small change of the box should be a small change of the code:
+`cholesky` is the paper's encoding (Sec. 3.1), `quaternion` is the paper's baseline, and `octahedral` is new here. The
+same box has 24 descriptions, which differ in the order and the signs of the axes. An ideal encoding has three
+properties: one code per box, one box per code, and continuity.
 
-* quaternion and size: neither. q and -q are one rotation, and turning a box by 180 degrees about an axis gives the
-  same box another q. Wherever a convention picks one of them (here w >= 0), the code jumps.
-* Cholesky factor of the scatter matrix: continuous, and one code per box, but not one box per code. Where two extents
-  are equal their plane is isotropic and the angle in it is gone. Near that, noise d in S turns the box by
-  atan(2 d / |l - w|) / 2.
-* octahedral: the scatter matrix S = sum_j s_j v_j v_j^T and the frame tensor T = sum_j v_j (x) v_j (x) v_j (x) v_j.
-  Both are polynomials that do not notice which axis is first or which way it points, so equal boxes have equal codes
-  and the code is as smooth as the box. T is unchanged by exactly the 24 symmetries of a cube, so it gives the
-  three axes whatever the extents, cubes included; S then gives the extent along each. One code per box, one box per
-  code, continuous both ways: for every rotation, not for yaw alone (tests/unit/test_ablation.py).
+* quaternion and size: This encoding has none of the properties. q and -q are the same rotation. A rotation of the box
+  by
+  180 degrees about an axis gives the same box but another q. A convention such as w >= 0 makes the code jump.
+* Cholesky factor of the scatter matrix: This encoding is continuous and has one code per box, but not one box per code.
+  If two extents are equal, the scatter matrix does not determine the angle in their plane. If two extents l and w are
+  similar, noise d in S rotates the box by atan(2 d / |l - w|) / 2.
+* octahedral: The code consists of the scatter matrix S = sum_j s_j v_j v_j^T and the frame tensor
+  T = sum_j v_j (x) v_j (x) v_j (x) v_j. Both are polynomials that do not depend on the order and the signs of the axes.
+  Equal boxes therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries of a
+  cube. It therefore determines the three axes for all extents, also for cubes. S then gives the extent along each axis.
+  The encoding has all three properties for every rotation (tests/unit/test_ablation.py).
 
-T is symmetric; of its 15 entries the trace part never changes, since the v_j are orthonormal. What remains is
-traceless and has nine entries: the spherical harmonics of degree four. They represent cross frames in hexahedral
-meshing (Huang et al., Boundary aligned smooth 3D cross-frame field, 2011). For an upright box two of them turn, as
-cos 4 yaw and sin 4 yaw, and seven stand still.
+T is symmetric and has 15 distinct entries. Its trace part is constant, because the v_j are orthonormal. The remaining
+traceless part has nine entries, the spherical harmonics of degree four. They represent cross frames in hexahedral
+meshing (Huang et al., Boundary aligned smooth 3D cross-frame field, 2011). For an upright box, two of them vary as
+cos 4 yaw and sin 4 yaw, and seven are constant.
 
-Plain numpy, float64, any leading batch shape, as in cholesky.py.
+The functions use numpy in float64 and accept any leading batch shape.
 """
 
 from __future__ import annotations
@@ -42,13 +43,18 @@ from models.geometry.cholesky import (
 )
 
 TRACE_PART = 3 / 5  # the mean over the unit sphere of sum_j (v_j . x)^4
-STARTS, ROUNDS = 4, 12  # of the search for the frame: tests/unit/test_ablation.py
+STARTS, ROUNDS = 4, 12  # starts and iterations of the frame search; tests/unit/test_ablation.py checks them
 
 
 class Encoding(NamedTuple):
-    """`encode(rotation (..., 3, 3), size_m (..., 3))` gives (..., entries); `decode` goes back, right-handed.
+    """An encoding of boxes.
 
-    Decoding takes any finite numbers. Extents below 1 cm count as 1 cm, both ways.
+    Attributes:
+        entries: Numbers per box.
+        encode: Maps rotation (..., 3, 3) and size_m (..., 3) to codes (..., entries).
+        decode: Maps any finite codes to rotation (..., 3, 3), right-handed, and size_m (..., 3). Extents below 1 cm
+            count
+            as 1 cm in both directions.
     """
 
     entries: int
@@ -60,9 +66,16 @@ class Encoding(NamedTuple):
 
 
 def encode_quaternions(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """(..., 7): the unit quaternion x, y, z, w >= 0 of the rotation, then the three extents in metres.
+    """Encode boxes as unit quaternions and extents.
 
-    Axes are taken as they come: a heading of yaw + 180 degrees is another code for the same box.
+    The axes are not reordered. The same box with the opposite heading therefore has another code.
+
+    Args:
+        rotation: (..., 3, 3) axes of the boxes as columns.
+        size_m: (..., 3) full extents along these axes (metres).
+
+    Returns:
+        (..., 7): quaternion x, y, z, w with w >= 0, then the three extents in metres.
     """
     rotation = np.asarray(rotation, np.float64)
     quaternion = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
@@ -71,7 +84,17 @@ def encode_quaternions(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 
 
 def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rotation (..., 3, 3) and size_m (..., 3) from (..., 7). Raises ValueError for a quaternion that is all zeros."""
+    """Decode quaternions and extents to boxes.
+
+    Args:
+        parameters: (..., 7): quaternion x, y, z, w of any length above 0, then three extents in metres.
+
+    Returns:
+        rotation (..., 3, 3) and size_m (..., 3).
+
+    Raises:
+        ValueError: A quaternion is all zeros.
+    """
     parameters = np.asarray(parameters, np.float64)
     rotation = Rotation.from_quat(parameters[..., :4].reshape(-1, 4)).as_matrix()
     return rotation.reshape(*parameters.shape[:-1], 3, 3), np.maximum(parameters[..., 4:], MIN_EXTENT_M)
@@ -82,10 +105,11 @@ def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @cache
 def compute_harmonics() -> np.ndarray:
-    """(9, 3, 3, 3, 3) orthonormal basis of the traceless symmetric tensors of rank four.
+    """Compute an orthonormal basis (9, 3, 3, 3, 3) of the traceless symmetric tensors of rank four.
 
-    In the order cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. Coefficients of t^k in n(t)^4 with n(t) . n(t) = 0:
-    such powers are traceless, and k = 0 is (x + iy)^4.
+    The order is cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The tensors are the coefficients of t^k in n(t)^4,
+    where
+    n(t) . n(t) = 0. Such powers are traceless, and k = 0 gives (x + iy)^4.
     """
     parts = np.array([[1, 1j, 0], [0, 0, -2], [-1, 1j, 0]])  # n(t) = parts[0] + parts[1] t + parts[2] t^2
     tensors = np.zeros((9, 3, 3, 3, 3), complex)
@@ -97,14 +121,23 @@ def compute_harmonics() -> np.ndarray:
 
 @cache
 def compute_isotropic_part() -> np.ndarray:
-    """(3, 3, 3, 3) the symmetric tensor of |x|^4."""
+    """Compute the symmetric tensor (3, 3, 3, 3) of the polynomial |x|^4."""
     eye = np.eye(3)
     pairs = np.einsum("ab,cd->abcd", eye, eye)
     return (pairs + pairs.transpose(0, 2, 1, 3) + pairs.transpose(0, 3, 2, 1)) / 3
 
 
 def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """(..., 15): the scatter matrix in metres, row-major lower triangle, then the nine harmonics of the axes."""
+    """Encode boxes as scatter matrix and frame tensor.
+
+    Args:
+        rotation: (..., 3, 3) axes of the boxes as columns.
+        size_m: (..., 3) full extents along these axes (metres).
+
+    Returns:
+        (..., 15): row-major lower triangle of the scatter matrix in metres, then the nine harmonics of the frame
+        tensor.
+    """
     rotation, size_m = np.asarray(rotation, np.float64), np.maximum(np.asarray(size_m, np.float64), MIN_EXTENT_M)
     scatter = compute_scatter_matrix(rotation, size_m)[..., TRIL[0], TRIL[1]]
     square = np.einsum("...aj,...bj->...jab", rotation, rotation)
@@ -113,10 +146,17 @@ def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 
 
 def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rotation (..., 3, 3), right-handed, and size_m (..., 3) from (..., 15).
+    """Decode scatter matrix and frame tensor to boxes.
 
-    Axes are those of the nearest frame tensor, extents s_j = v_j^T S v_j: linear in S, so nothing is divided by a
-    difference of extents.
+    The axes are those of the nearest frame tensor. The extents are s_j = v_j^T S v_j. This expression is linear in S,
+    so
+    similar extents do not amplify errors.
+
+    Args:
+        parameters: (..., 15) codes of `encode_octahedral`.
+
+    Returns:
+        rotation (..., 3, 3), right-handed, and size_m (..., 3) in metres.
     """
     parameters = np.asarray(parameters, np.float64)
     scatter = np.zeros((*parameters.shape[:-1], 3, 3))
@@ -126,17 +166,24 @@ def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
-    """Find the right-handed axes (..., 3, 3) whose frame tensor is nearest to (..., 9).
+    """Find the axes whose frame tensor is nearest to the given harmonics.
 
-    They maximise sum_j T(v_j, v_j, v_j, v_j).
+    These axes maximise sum_j T(v_j, v_j, v_j, v_j). Each iteration replaces the axes by the orthogonal polar factor of
+    the
+    gradient and never decreases the sum (Zhai et al., Complete dictionary learning via l4-norm maximization, 2020).
+    Near
+    the maximum, an iteration triples the number of correct digits. The search runs from STARTS fixed frames.
 
-    Monotone ascent: axes <- the orthogonal polar factor of the gradient (Zhai et al., Complete dictionary learning via
-    l4-norm maximization, 2020), which triples the correct digits per round, from STARTS fixed frames.
+    Args:
+        harmonic: (..., 9) harmonics; their length has no effect.
+
+    Returns:
+        Right-handed axes (..., 3, 3) as columns.
     """
     harmonic = np.asarray(harmonic, np.float64)
     flat = harmonic.reshape(-1, 9)
     unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-    length = np.sqrt(3 - 5 * TRACE_PART**2)  # of the harmonics of any frame: |T|^2 = 3 less the trace part
+    length = np.sqrt(3 - 5 * TRACE_PART**2)  # norm of the harmonics of any frame: |T|^2 is 3 minus the trace part
     tensor = np.einsum("nk,kabcd->nabcd", unit * length, compute_harmonics()) + TRACE_PART * compute_isotropic_part()
     best, best_value = np.zeros((len(flat), 3, 3)), np.full(len(flat), -np.inf)
     for start in Rotation.random(STARTS, rng=np.random.default_rng(0)).as_matrix():
@@ -152,7 +199,7 @@ def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
 
 
 def _compute_gradient(tensor: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """(n, 3, 3): column j is T(v_j, v_j, v_j, .)."""
+    """Return the gradient (n, 3, 3), whose column j is T(v_j, v_j, v_j, .)."""
     square = np.einsum("naj,nbj->nabj", axes, axes)
     half = np.einsum("nabcd,nabj->ncdj", tensor, square)
     return np.einsum("ncdj,ncj->ndj", half, axes)

@@ -1,15 +1,17 @@
-"""Exact IoU3D of arbitrarily rotated boxes, vectorised over pairs; ellipsoids by a fixed point set.
+"""Exact IoU3D of arbitrarily rotated boxes, vectorised over pairs, and sampled IoU3D of ellipsoids.
 
-The volume of a convex polytope follows from its edges alone (the divergence theorem twice): with d the distance of a
-face's plane from any one origin and r the distance of an edge from that origin's foot on the face,
+Two applications of the divergence theorem give the volume of a convex polytope from its edges. Let d be the distance
+of a face's plane from the origin. Let r be the distance of an edge from the foot point of the origin on that face. Then
 
     V = 1/3 sum_faces d A_face = 1/6 sum_faces d sum_edges r |edge|.
 
-The edges of A ∩ B are the edges of A inside B, the edges of B inside A, and the lines where a face of A meets a face
-of B: 12 + 12 + 36 segments, each a line clipped by slabs. No polygon is ever built, so nothing branches per pair.
+The edges of A ∩ B are the edges of A inside B, the edges of B inside A, and the intersection lines of their faces.
+These are 12 + 12 + 36 segments, and each one is a line clipped by slabs. No polygon is built, so the code needs no
+branch per pair.
 
-Coplanar faces: before anything else B grows by 1e-9 of the pair's largest extent, far above rounding and far below any
-tolerance. A face of B that coincides with one of A then lies outside A, so the common face is counted once, as A's.
+Coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the pair's largest extent, which is far above
+rounding errors and far below any tolerance. A face of B that coincides with a face of A then lies outside A, and only
+the face of A counts.
 """
 
 from __future__ import annotations
@@ -20,32 +22,59 @@ import numpy as np
 
 from models.scene import Scene
 
-GROWTH = 1e-9  # of the largest extent of a pair
+GROWTH = 1e-9  # enlargement of B as a share of the largest extent of a pair
 PARALLEL = 1e-12  # sine of the angle below which two faces have no common line
-PAIRS_PER_CHUNK = 4096  # of 256 to 16384 the fastest on two AVX2 cores: call overhead below, cache misses above
+PAIRS_PER_CHUNK = 4096  # fastest of 256 to 16384 on two AVX2 cores
 BALL_POINTS = 4096
 CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
 class Boxes(NamedTuple):
-    """n boxes, float64. Columns of `rotation` are the axes, `size_m` the full extents along them."""
+    """n boxes in float64.
 
-    center_m: np.ndarray  # (n, 3)
-    rotation: np.ndarray  # (n, 3, 3)
-    size_m: np.ndarray  # (n, 3)
+    Attributes:
+        center_m: (n, 3) centres.
+        rotation: (n, 3, 3) axes as columns.
+        size_m: (n, 3) full extents along the axes.
+    """
+
+    center_m: np.ndarray
+    rotation: np.ndarray
+    size_m: np.ndarray
 
     def take(self, index: np.ndarray | slice) -> Boxes:
+        """Return a subset of the boxes.
+
+        Args:
+            index: Indices, mask or slice.
+
+        Returns:
+            The selected boxes.
+        """
         return Boxes(*(part[index] for part in self))
 
     @property
     def volume_m3(self) -> np.ndarray:
+        """(n,) volumes in m^3."""
         return self.size_m.prod(axis=1)
 
 
 def make_boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -> Boxes:
-    """Boxes ready for the functions below: float64, axes orthonormal to rounding (float32 rotations are not).
+    """Check boxes and convert them to float64 with exactly orthonormal axes.
 
-    Raises ValueError for wrong shapes, non-finite numbers, negative extents or axes far from orthonormal.
+    Float32 rotations are orthonormal only up to float32 rounding.
+
+    Args:
+        center_m: (n, 3) centres.
+        rotation: (n, 3, 3) axes as columns.
+        size_m: (n, 3) full extents along the axes.
+
+    Returns:
+        The boxes.
+
+    Raises:
+        ValueError: A shape is wrong, a number is not finite, an extent is negative, or axes are not orthonormal within
+            1e-3.
     """
     center_m, rotation, size_m = (np.asarray(part, np.float64) for part in (center_m, rotation, size_m))
     n = len(center_m)
@@ -53,7 +82,7 @@ def make_boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -
         shapes = f"{center_m.shape}, {rotation.shape}, {size_m.shape}"
         raise ValueError(f"boxes need center (n, 3), rotation (n, 3, 3), size (n, 3); got {shapes}")
     if not all(np.isfinite(part).all() for part in (center_m, rotation, size_m)):
-        raise ValueError("boxes hold NaN or infinite numbers")
+        raise ValueError("boxes contain NaN or infinite numbers")
     if (size_m < 0).any():
         raise ValueError(f"boxes have negative extents: {size_m.min()} m")
     gram = np.swapaxes(rotation, 1, 2) @ rotation
@@ -66,7 +95,14 @@ def make_boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -
 
 
 def extract_boxes(scene: Scene) -> Boxes:
-    """The bounding boxes of a scene's primitives; an ellipsoid's is the box around it."""
+    """Return the bounding boxes of a scene's primitives.
+
+    Args:
+        scene: Scene. An ellipsoid is represented by its circumscribed box.
+
+    Returns:
+        Boxes in the order of the primitives.
+    """
     return make_boxes(scene.center_m, scene.rotation, scene.size_m)
 
 
@@ -74,7 +110,15 @@ def extract_boxes(scene: Scene) -> Boxes:
 
 
 def compute_intersection_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n,) volume of a[i] ∩ b[i], exact up to rounding and GROWTH; 0 where the boxes only touch."""
+    """Compute the intersection volume of each pair a[i], b[i], exact up to rounding and GROWTH.
+
+    Args:
+        a: n boxes.
+        b: n boxes.
+
+    Returns:
+        (n,) volumes in m^3; 0 if the boxes only touch.
+    """
     volume = np.empty(len(a.center_m))
     for start in range(0, len(volume), PAIRS_PER_CHUNK):
         chunk = slice(start, start + PAIRS_PER_CHUNK)
@@ -83,14 +127,30 @@ def compute_intersection_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def compute_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n,) IoU3D of a[i] with b[i], in [0, 1]; 0 for two boxes without volume."""
+    """Compute the IoU3D of each pair a[i], b[i].
+
+    Args:
+        a: n boxes.
+        b: n boxes.
+
+    Returns:
+        (n,) IoU3D in [0, 1]; 0 for two boxes without volume.
+    """
     return _compute_iou(compute_intersection_volume_m3(a, b), a.volume_m3, b.volume_m3)
 
 
 def compute_iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -> np.ndarray:
-    """(n, m) IoU3D of every a with every b, or of those that the mask `wanted` (n, m) names, 0 elsewhere.
+    """Compute the IoU3D of every box of `a` with every box of `b`.
 
-    Only pairs whose axis-aligned bounds overlap are computed.
+    Only pairs with overlapping axis-aligned bounds are computed; all others have IoU3D 0.
+
+    Args:
+        a: n boxes.
+        b: m boxes.
+        wanted: (n, m) mask of the pairs to compute (default: all pairs).
+
+    Returns:
+        (n, m) IoU3D in [0, 1]; 0 for pairs that are not wanted.
     """
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
     i, j = find_overlapping_bounds(a, b)
@@ -102,7 +162,15 @@ def compute_iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -
 
 
 def find_overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (p,), (p,) of the pairs whose axis-aligned bounds overlap: every pair with IoU3D > 0 is among them."""
+    """Find the pairs whose axis-aligned bounds overlap; they include every pair with IoU3D > 0.
+
+    Args:
+        a: n boxes.
+        b: m boxes.
+
+    Returns:
+        Indices (p,) into `a` and (p,) into `b`.
+    """
     reach_a, reach_b = (0.5 * np.einsum("nij,nj->ni", np.abs(box.rotation), box.size_m) for box in (a, b))
     overlap = np.ones((len(a.center_m), len(b.center_m)), bool)
     for axis in range(3):
@@ -120,7 +188,10 @@ def _compute_iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.nd
 
 
 def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n,) volumes in A's frame, whose origin is A's centre. Arrays are (..., n): pairs lie along the last axis."""
+    """Return intersection volumes (n,), computed in the frame of A with the origin at A's centre.
+
+    Arrays have shape (..., n): the last axis is the pair.
+    """
     rotation_a, rotation_b = np.moveaxis(a.rotation, 0, -1), np.moveaxis(b.rotation, 0, -1)
     axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n): a_i . b_j
     offset = np.einsum("kjn,nk->jn", rotation_b, b.center_m - a.center_m)  # (3, n): B's centre along B's axes
@@ -128,7 +199,7 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
     center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n): B's centre along A's axes
 
-    # Boxes that a face of either one keeps apart: a fifth of the pairs of a town whose bounds overlap.
+    # Skip pairs that a face plane separates: a fifth of the town's pairs whose bounds overlap.
     reach = np.abs(axes)
     near_a = np.abs(center_b) < half_a + np.einsum("ijn,jn->in", reach, half_b)
     near_b = np.abs(offset) < half_b + np.einsum("ijn,in->jn", reach, half_a)
@@ -148,10 +219,11 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
 def _clip_own_edges(
     half: np.ndarray, other_half: np.ndarray, axes: np.ndarray, other_center: np.ndarray, distance: np.ndarray
 ) -> np.ndarray:
-    """(n,) sum over one box's 12 edges of d d' |edge inside the other box|.
+    """Return the sum (n,) over one box's 12 edges of d d' |edge inside the other box|.
 
-    other_center (3, n) is the other box's centre seen from this one's, along the other's axes; both faces of an edge
-    are perpendicular, so r of one face is d of the other.
+    `other_center` (3, n) is the centre of the other box relative to this box, along the axes of the other box. The two
+    faces
+    of an edge are perpendicular, so r of one face equals d of the other face.
     """
     total = np.zeros(half.shape[1])
     for along, second, third in CYCLIC:
@@ -167,7 +239,7 @@ def _clip_own_edges(
 def _clip_crossing_edges(
     half_a: np.ndarray, half_b: np.ndarray, axes: np.ndarray, offset: np.ndarray, distance_b: np.ndarray
 ) -> np.ndarray:
-    """(n,) sum over the 36 face pairs of (d_a r_a + d_b r_b) |common line inside both boxes|."""
+    """Return the sum (n,) over the 36 face pairs of (d_a r_a + d_b r_b) |common line inside both boxes|."""
     total = np.zeros(half_a.shape[1])
     sign_b = np.array([-1.0, 1.0])[None, :, None]
     for i, k, l in CYCLIC:  # noqa: E741
@@ -176,7 +248,7 @@ def _clip_crossing_edges(
             sine = np.hypot(axes[k, j], axes[l, j])
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
-            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # of the line, within A's face
+            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # normal of the line within A's face
             # rho (2, 2, n): signed distance of the line from the foot of A's centre; x = rho normal + tau tangent.
             rho = (offset[j] + _list_signs(half_b[j])[None] - axes[i, j] * plane_a) * inverse
             clip = _Clip(-np.inf, np.inf)
@@ -194,13 +266,13 @@ def _clip_crossing_edges(
 
 
 class _Clip:
-    """The interval of a line's parameter that is left after clipping by slabs."""
+    """The interval of a line's parameter that remains after clipping by slabs."""
 
     def __init__(self, low: np.ndarray | float, high: np.ndarray | float) -> None:
         self.low, self.high = low, high
 
     def slab(self, at: np.ndarray, slope: np.ndarray, half: np.ndarray) -> None:
-        """Keep |at + slope tau| <= half. A line along the slab (slope 0) stays whole or vanishes."""
+        """Keep |at + slope tau| <= half. If slope is 0, the line is kept completely or removed."""
         inverse = 1 / np.where(np.abs(slope) < 1e-30, 1e-30, slope)
         middle, reach = at * -inverse, half * np.abs(inverse)
         self.low = np.maximum(self.low, middle - reach)
@@ -211,7 +283,7 @@ class _Clip:
 
 
 def _list_signs(half: np.ndarray) -> np.ndarray:
-    """(2, n): the two faces, negative side first."""
+    """Return the positions (2, n) of the two faces, negative side first."""
     return np.stack([-half, half])
 
 
@@ -219,15 +291,24 @@ def _list_signs(half: np.ndarray) -> np.ndarray:
 
 
 def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n,) IoU3D of the ellipsoids inscribed in a[i] and b[i], estimated on a fixed set of BALL_POINTS points.
+    """Estimate the IoU3D of the ellipsoids inscribed in each pair a[i], b[i].
 
-    The share of the smaller ellipsoid's points that lie in the larger one. Deterministic; not exact: the error is at
-    most 0.01, and 0.002 in the root mean square (a test holds it on closed forms). The paper's AP3D has no ellipsoids.
+    The estimate counts how many of BALL_POINTS fixed points of the smaller ellipsoid lie in the larger one. It is
+    deterministic. Its error is at most 0.01, and the root mean square error is 0.002 (a test checks both on closed
+    forms).
+    The paper's AP3D does not include ellipsoids.
+
+    Args:
+        a: n bounding boxes of ellipsoids.
+        b: n bounding boxes of ellipsoids.
+
+    Returns:
+        (n,) IoU3D in [0, 1].
     """
     swap = a.volume_m3 > b.volume_m3
     small = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), q, p) for p, q in zip(a, b, strict=True)))
     large = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), p, q) for p, q in zip(a, b, strict=True)))
-    # large_from_small takes the unit ball of the small ellipsoid to the frame where the large one is the unit ball.
+    # large_from_small maps the unit ball of the small ellipsoid to the frame in which the large one is the unit ball.
     large_from_world = np.swapaxes(large.rotation, 1, 2) / np.maximum(large.size_m / 2, 1e-12)[:, :, None]
     large_from_small = large_from_world @ (small.rotation * (small.size_m / 2)[:, None, :])
     shift = np.einsum("nij,nj->ni", large_from_world, small.center_m - large.center_m)
@@ -241,7 +322,17 @@ def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
-    """(n, m) IoU3D of every ellipsoid of a with every one of b, sampled as in `compute_ellipsoid_iou3d_pairs`."""
+    """Estimate the IoU3D of every ellipsoid of `a` with every ellipsoid of `b`.
+
+    See `compute_ellipsoid_iou3d_pairs` for the method.
+
+    Args:
+        a: n bounding boxes of ellipsoids.
+        b: m bounding boxes of ellipsoids.
+
+    Returns:
+        (n, m) IoU3D in [0, 1].
+    """
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
     i, j = find_overlapping_bounds(a, b)
     matrix[i, j] = compute_ellipsoid_iou3d_pairs(a.take(i), b.take(j))
@@ -249,7 +340,14 @@ def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def sample_ball_points(count: int) -> np.ndarray:
-    """(count, 3) evenly spread points in the unit ball: Roberts' R3 low-discrepancy sequence, mapped by volume."""
+    """Return evenly spread points in the unit ball: Roberts' R3 low-discrepancy sequence, mapped by volume.
+
+    Args:
+        count: Number of points.
+
+    Returns:
+        (count, 3) points; the same for every call.
+    """
     root = 1.2207440846057596  # the real root of x^4 = x + 1
     unit = (0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1
     radius, up, turn = np.cbrt(unit[:, 0]), 2 * unit[:, 1] - 1, 2 * np.pi * unit[:, 2]
