@@ -1,1 +1,1 @@
-"""The Parquet schema, dataset metadata, splits, labels and selections of scenes."""
+"""The Parquet schema, dataset metadata, splits, density labels and selection of scenes."""

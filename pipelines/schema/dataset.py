@@ -1,6 +1,6 @@
 """A dataset directory: statistics of its training split, density labels and dataset.json.
 
-dataset.json is written last, so a directory that holds it is complete.
+The writer creates dataset.json last. A directory that holds dataset.json is therefore complete.
 """
 
 from __future__ import annotations
@@ -18,14 +18,21 @@ from pipelines.schema.density_labels import DensityThresholds, classify_density,
 from pipelines.schema.tables import SCENES, Shard
 
 DESCRIPTION = "dataset.json"
-Extremes = dict[str, list[list[float]]]  # name -> [lowest, highest], a number per entry
-# Meaning of ground heights: "top" of slabs, 0.3 m above the surface that objects stand on, or that "surface" itself.
+Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; each is a list with one value per component.
+# Surface that the ground heights of each source describe. "surface" is the surface that objects stand on.
+# "top" is the top of the ground slabs, which lies 0.3 m above that surface.
 SURFACE = {"town": "top", "kitti360": "top", "av2": "surface", "own": "surface"}
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of the training split: label thresholds and the LayoutSpec."""
+    """Statistics of the training split: thresholds of both density labels and the LayoutSpec.
+
+    Attributes:
+        vegetation: Thresholds of the vegetation density label.
+        vehicle: Thresholds of the vehicle density label.
+        spec: Categories, slots, ground classes, raster grid and value bounds that the models need.
+    """
 
     vegetation: DensityThresholds
     vehicle: DensityThresholds
@@ -33,27 +40,38 @@ class Statistics:
 
 
 def count_groups(scenes: pa.Table, group: tuple[int, ...]) -> np.ndarray:
-    """(n,) number of primitives of a group of categories in each row of `scenes`."""
+    """Count the primitives of a group of categories in each scene.
+
+    Args:
+        scenes: Rows of the scenes table.
+        group: Indices into CATEGORIES.
+
+    Returns:
+        (n,) number of primitives, one per row of `scenes`.
+    """
     return np.asarray(sum(scenes[f"num_{CATEGORIES[k]}"].to_numpy() for k in group))
 
 
 def compute_training_statistics(
     manifests: list[dict], staging: str, grid: Grid, slots: tuple[int, ...] | None
 ) -> Statistics:
-    """Compute thresholds, 95th percentiles of counts and bounds of the training split.
+    """Compute density thresholds, slots per category and value bounds from the training split.
 
     Args:
         manifests: Manifests of all shards.
-        staging: Directory with the shards' tables.
+        staging: Directory with the tables of the shards.
         grid: Grid of the rasters.
-        slots: Fixed number of slots per category (the paper's sum to N = 514); None for the 95th percentiles.
+        slots: Number of slots per category (the paper's sum to N = 514). None takes the 95th percentiles of the counts.
+
+    Returns:
+        Statistics of all scenes whose split is train.
 
     Raises:
         ValueError: The training split is empty.
     """
     training = [m for m in manifests if m["split"] == "train" and m["scenes"]]
     if not training:
-        raise ValueError("the training split is empty; give more data, or preprocess without a split")
+        raise ValueError("the training split is empty; add more data, or preprocess without a split")
     shards = [Shard(staging, m["source"], m["split"], m["number"]) for m in training]
     columns = [*(f"num_{name}" for name in CATEGORIES), "vegetation_volume_m3", "vehicle_volume_m3"]
     scenes = pa.concat_tables([shard.read("scenes", columns) for shard in shards])
@@ -93,7 +111,15 @@ def compute_training_statistics(
 
 
 def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
-    """Return the scenes table with both density labels."""
+    """Fill both density labels of the scenes table.
+
+    Args:
+        scenes: Rows of the scenes table.
+        statistics: Statistics of the training split, which hold the label thresholds.
+
+    Returns:
+        The scenes table with the columns vegetation_density and vehicle_density filled.
+    """
     groups = (("vegetation", VEGETATION, statistics.vegetation), ("vehicle", VEHICLES, statistics.vehicle))
     for name, group, thresholds in groups:
         labels = classify_density(count_groups(scenes, group), scenes[f"{name}_volume_m3"].to_numpy(), thresholds)
@@ -106,7 +132,16 @@ def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A complete dataset directory: its dataset.json, read and checked."""
+    """A complete dataset directory with the content of its dataset.json.
+
+    Attributes:
+        root: Path or URI of the directory.
+        source: Value of the source column, such as kitti360.
+        scenes: Number of scenes per split.
+        spec: LayoutSpec of the training split.
+        vegetation: Thresholds of the vegetation density label.
+        vehicle: Thresholds of the vehicle density label.
+    """
 
     root: str
     source: str
@@ -117,10 +152,20 @@ class Dataset:
 
     @classmethod
     def open(cls, root: str) -> Dataset:
-        """Raises ValueError if `root` holds no complete dataset."""
+        """Read and check the dataset.json of a dataset directory.
+
+        Args:
+            root: Path or URI of the directory.
+
+        Returns:
+            The dataset's metadata.
+
+        Raises:
+            ValueError: `root` holds no complete dataset, or its dataset.json is invalid.
+        """
         path = storage.join_uri(root, DESCRIPTION)
         if not storage.exists(path):
-            raise ValueError(f"{root}: no dataset.json here; run jobs/preprocess_scenes.py with --output {root} first")
+            raise ValueError(f"{root} holds no dataset.json; run jobs/preprocess_scenes.py with --output {root} first")
         content = storage.read_json(path)
         try:
             return cls(
@@ -132,11 +177,18 @@ class Dataset:
                 vehicle=DensityThresholds(**content["vehicle_thresholds"]),
             )
         except (KeyError, TypeError) as error:
-            raise ValueError(f"{path}: not a dataset description ({error!r}); preprocess again") from error
+            raise ValueError(f"{path} is not a valid dataset description ({error!r}); preprocess again") from error
 
 
 def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
-    """Return the lowest and highest values over all parts."""
+    """Merge the lowest and highest values of several parts.
+
+    Args:
+        parts: Lowest and highest values by name; a name may be absent from a part.
+
+    Returns:
+        The lowest and highest value over all parts, by name.
+    """
     parts = list(parts)
     return {
         name: [

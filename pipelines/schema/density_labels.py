@@ -1,4 +1,4 @@
-"""Density labels from statistics of the training split (paper, supplement A, Scene Labeling)."""
+"""Compute density labels from statistics of the training split (paper, supplement A, Scene Labeling)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from models.scene import DENSITIES
 
 @dataclass(frozen=True)
 class DensityThresholds:
-    """25th and 75th percentiles of a group's count and volume over the training split."""
+    """25th and 75th percentiles of a group's count and total volume per scene of the training split."""
 
     count_p25: float
     count_p75: float
@@ -22,7 +22,18 @@ class DensityThresholds:
 
 
 def compute_density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> DensityThresholds:
-    """Thresholds from the counts (n,) and volumes (n,) of a training split, before any truncation to slots."""
+    """Compute the thresholds of a density label from a training split.
+
+    Args:
+        count: (n,) number of the group's primitives per scene, before any truncation to slots.
+        volume_m3: (n,) total volume of the group's primitives per scene (m3).
+
+    Returns:
+        25th and 75th percentiles of both quantities.
+
+    Raises:
+        ValueError: The training split is empty.
+    """
     if len(count) == 0:
         raise ValueError("density thresholds need at least one training scene; the training split is empty")
     return DensityThresholds(*np.percentile(count, [25, 75]), *np.percentile(volume_m3, [25, 75]))
@@ -33,7 +44,19 @@ def classify_density(
     volume_m3: np.ndarray | Sequence[float] | float,
     thresholds: DensityThresholds,
 ) -> Any:
-    """(n,) str: low if count and volume lie below their p25, high if both lie above their p75, else medium."""
+    """Assign the density label low, medium or high to each scene.
+
+    The label is low if count and volume both lie below their 25th percentile. It is high if both lie above their 75th
+    percentile. It is medium otherwise (paper, supplement A, Scene Labeling).
+
+    Args:
+        count: Number of the group's primitives, per scene or for one scene.
+        volume_m3: Total volume of the group's primitives (m3), same shape as `count`.
+        thresholds: Percentiles of the training split.
+
+    Returns:
+        Array of str with the shape of `count`; a numpy str for one scene.
+    """
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)
     high = (count > thresholds.count_p75) & (volume_m3 > thresholds.volume_p75_m3)

@@ -1,7 +1,7 @@
 """Colours and class ids of the authors' renderings, keyed by category and ground class.
 
-A class id names either a ground class or a primitive category, so that one small integer says what a pixel, a
-triangle or a voxel shows. The authors' data have no crossings: id 17 and its colour are ours.
+A class id names either a ground class or a primitive category. One small integer thus describes a pixel, a triangle or
+a voxel. The authors' data contain no crossings; this project adds id 17 and its colour.
 """
 
 from __future__ import annotations
@@ -38,7 +38,14 @@ EMPTY_HEX = "ffffff"
 
 
 def parse_rgb(color_hex: str) -> tuple[int, int, int]:
-    """Parse six hexadecimal digits to (red, green, blue), 0..255, sRGB."""
+    """Parse a hexadecimal colour.
+
+    Args:
+        color_hex: Six hexadecimal digits, such as "804080".
+
+    Returns:
+        (red, green, blue) in sRGB, each in 0..255.
+    """
     red, green, blue = bytes.fromhex(color_hex)
     return red, green, blue
 
@@ -51,12 +58,19 @@ def _list_colors_by_class_id() -> np.ndarray:
     return colors
 
 
-CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB, by class id; white for EMPTY
-CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) by category
+CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB; row k is the colour of class id k; EMPTY is white.
+CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) class id of each category
 
 assert set(GROUND_CLASS_ID) == set(GROUND_CLASSES) and set(COLOR_HEX) == set(CLASS_ID)
 
 
 def list_ground_ids(scene: Scene) -> np.ndarray:
-    """(G + 1,) class id of each of the scene's ground classes; the last, also found at index -1, is EMPTY."""
+    """Return the class ids of a scene's ground classes.
+
+    Args:
+        scene: Scene with G ground classes.
+
+    Returns:
+        (G + 1,) class ids. The last entry is EMPTY, so index -1 (no ground) gives EMPTY.
+    """
     return np.array([GROUND_CLASS_ID[name] for name in scene.ground_classes] + [EMPTY], np.uint8)

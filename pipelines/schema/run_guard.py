@@ -1,4 +1,4 @@
-"""Bind a directory, or a run's name in it, to one set of options, recorded in a JSON file."""
+"""Bind a directory, or a run name in it, to one set of options that a JSON file records."""
 
 from __future__ import annotations
 
@@ -16,17 +16,20 @@ def guard_options(
     discard: Callable[[], None],
     describe: Callable[[str], str],
 ) -> None:
-    """Record options; if the record holds other options, discard their results unless these are in use.
+    """Record the options of a run, or raise an error if results with other options exist.
+
+    If the file records other options and their results are not in use, the function deletes these results and records
+    the new options.
 
     Args:
-        record: JSON file with the options.
-        options: Options of this run, as JSON can hold them.
-        is_in_use: Whether a run with the recorded options has written results, which must be kept.
-        discard: Deletes the rest of a run with other options.
-        describe: Makes the error message from the first option that differs ("seed=1, asked for 2").
+        record: Path of the JSON file with the options.
+        options: Options of this run; values must be valid in JSON.
+        is_in_use: Returns whether a run with the recorded options has written results, which must be kept.
+        discard: Deletes the incomplete results of a run with other options.
+        describe: Returns the error message for the first option that differs, such as "seed=1, asked for 2".
 
     Raises:
-        ValueError: The record holds other options and is in use.
+        ValueError: The file records other options, and results with these options are in use.
     """
     if difference := find_changed_option(record, options):
         if is_in_use():
@@ -36,17 +39,18 @@ def guard_options(
 
 
 def guard_run(output: str, source: str, run: str, options: Mapping[str, object], parts: Sequence[str] = ()) -> None:
-    """Bind source `source` of a dataset directory to one set of options, in `<source>.json`.
+    """Bind a run name to one set of options, recorded in `<source>.json` of the dataset directory.
 
     Args:
         output: Dataset directory.
         source: Value of the source column, such as generated-<run>.
-        run: Name of the run.
-        options: Its options.
-        parts: Further directories of the run. A run that wrote neither a scene nor a file there can be replaced.
+        run: Run name.
+        options: Options of this run; values must be valid in JSON.
+        parts: Further directories of the run. A run with other options is replaced only if it wrote no scene and no
+            file in these directories.
 
     Raises:
-        ValueError: The directory holds a run of that name with other options.
+        ValueError: The directory holds a run of the same name with other options.
     """
     tables = [storage.join_uri(output, table, f"source={source}") for table in TABLES]
 
@@ -64,12 +68,29 @@ def guard_run(output: str, source: str, run: str, options: Mapping[str, object],
 
 
 def find_changed_option(record: str, options: Mapping[str, object]) -> str:
-    """Describe the first option that differs from those in a JSON file; "" if none does or there is no such file."""
+    """Describe the first option that differs from those recorded in a JSON file.
+
+    Args:
+        record: Path of the JSON file; the file may be absent.
+        options: Options of this run.
+
+    Returns:
+        Description such as "seed=1, asked for 2". The string is empty if no option differs or the file is absent.
+    """
     return compare_options(storage.read_json(record), options) if storage.exists(record) else ""
 
 
 def compare_options(recorded: Mapping[str, object], options: Mapping[str, object]) -> str:
-    """Describe the first option that differs from the recorded ones, such as "seed=1, asked for 2"; "" if none does."""
+    """Describe the first option that differs from the recorded options.
+
+    Args:
+        recorded: Options of the earlier run.
+        options: Options of this run.
+
+    Returns:
+        Description such as "seed=1, asked for 2", with options in alphabetical order. The string is empty if no option
+        differs.
+    """
     recorded, asked = dict(recorded), json.loads(json.dumps(options))
     if recorded == asked:
         return ""

@@ -1,4 +1,4 @@
-"""Select scenes of a dataset directory: evenly spaced, by distance between poses, or balanced over labels."""
+"""Select scenes of a dataset directory: evenly spaced, by distance between poses, or balanced over density labels."""
 
 from __future__ import annotations
 
@@ -14,18 +14,28 @@ from pipelines.schema.tables import Shard, find_shards
 
 Pick = Literal["spread", "first", "farthest", "apart", "balanced"]
 COLUMNS = ["sequence", "x_m", "y_m", "vegetation_density", "vehicle_density"]
-ONE_WORLD = ("kitti360",)  # sources whose drives share one world frame
+ONE_WORLD = ("kitti360",)  # Sources whose drives share one world frame.
 
 
 @dataclass(frozen=True)
 class SceneSubset:
-    """Scenes of a source and a split, at most `limit` of them, chosen by `pick`.
+    """A selection of at most `limit` scenes of a source and a split.
+
+    The selection rules (`pick`) are:
 
     * spread: evenly spaced over all scenes.
     * first: the first scenes.
     * farthest: farthest point sampling of the poses (paper, supplement, Precision and Recall Metrics).
-    * apart: poses at least apart_m from all earlier ones, evenly thinned to `limit` (same section of the paper).
-    * balanced: equally many scenes of each pair of density labels where available, evenly spaced within each pair.
+    * apart: poses that are at least apart_m apart, evenly thinned to `limit` (same section of the paper).
+    * balanced: equal numbers of scenes per pair of density labels where available, evenly spaced within each pair.
+
+    Attributes:
+        root: Dataset directory.
+        source: Value of the source column (default: all sources).
+        split: Value of the split column (default: all splits).
+        limit: Maximum number of scenes (default: all).
+        pick: Selection rule.
+        apart_m: Minimum distance between poses for the rule apart (m).
     """
 
     root: str
@@ -44,11 +54,23 @@ class SceneSubset:
             raise ValueError(f"apart_m is {self.apart_m}, expected a distance above 0")
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Return shards with the rows to take, in order; the first call decides. Raises ValueError if there is none."""
+        """Return the selected rows of each shard that has at least one.
+
+        The first call makes the selection; later calls return the same result.
+
+        Returns:
+            Shards in order, each with its selected row numbers in ascending order.
+
+        Raises:
+            ValueError: The dataset directory holds no matching scene.
+        """
         return self._shards
 
     def files(self) -> list[list]:
-        """Return fingerprints of the chosen files with the rows to take; they differ once scenes or files change."""
+        """Return a fingerprint of each selected file, followed by the selected rows.
+
+        The result changes when the selection or a file changes.
+        """
         return [[*storage.fingerprint_file(shard.path("scenes")), rows] for shard, rows in self._shards]
 
     @cached_property
@@ -65,7 +87,15 @@ class SceneSubset:
         return [(shard, r.tolist()) for shard, r in zip(shards, rows, strict=True) if len(r)]
 
     def chosen(self, scenes: pa.Table, source: np.ndarray) -> np.ndarray:
-        """Return the rows to take of a table of all scenes, in order of selection; `source` is (n,)."""
+        """Select rows of a table of all scenes.
+
+        Args:
+            scenes: Columns COLUMNS of all scenes.
+            source: (n,) source of each scene.
+
+        Returns:
+            Selected row numbers, in order of selection.
+        """
         total = len(scenes)
         wanted = min(total, self.limit or total)
         if self.pick == "first":
@@ -81,46 +111,98 @@ class SceneSubset:
 
 
 def read_described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
-    """Return COLUMNS of the scenes in some shards' rows, in that order, and their sources (n,)."""
+    """Read COLUMNS of the scenes in some rows of some shards.
+
+    Args:
+        parts: Shards with their row numbers.
+
+    Returns:
+        The table in the given order, and the source of each scene (n,).
+    """
     table = pa.concat_tables([shard.read("scenes", COLUMNS).take(rows) for shard, rows in parts])
     return table, np.repeat([shard.source for shard, _ in parts], [len(rows) for _, rows in parts])
 
 
 def list_label_pairs(scenes: pa.Table) -> np.ndarray:
-    """(n,) str: both density labels of each scene."""
+    """Return both density labels of each scene as one string.
+
+    Args:
+        scenes: Table with the columns vegetation_density and vehicle_density.
+
+    Returns:
+        (n,) str, such as "('low', 'high')".
+    """
     return np.array([str(pair) for pair in zip(*(scenes[name].to_pylist() for name in COLUMNS[-2:]), strict=True)])
 
 
 def select_evenly(total: int, count: int) -> np.ndarray:
-    """`count` of the numbers 0 .. total - 1, evenly spaced."""
+    """Select evenly spaced numbers from 0 .. total - 1.
+
+    Args:
+        total: Number of candidates.
+        count: Number of selected candidates, at most `total`.
+
+    Returns:
+        (count,) selected numbers in ascending order.
+    """
     return np.floor((np.arange(count) + 0.5) * total / max(count, 1)).astype(int)
 
 
 def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 2) metres and (n,) world of each scene. Poses of different worlds are infinitely far apart."""
+    """Read the positions of scenes and number the world frame of each scene.
+
+    Callers treat poses of different world frames as infinitely far apart.
+
+    Args:
+        scenes: Columns COLUMNS of the scenes.
+        source: (n,) source of each scene.
+
+    Returns:
+        (n, 2) position in the world frame (m), and (n,) number of the world frame.
+    """
     world = np.where(np.isin(source, ONE_WORLD), "", scenes["sequence"].to_numpy().astype(str))
     world = np.unique(np.char.add(np.char.add(source.astype(str), "/"), world), return_inverse=True)[1]
     return np.stack([scenes["x_m"].to_numpy(), scenes["y_m"].to_numpy()], axis=1), world
 
 
 def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices by farthest point sampling of poses (n, 2). The first is 0; every prefix is a sample as well."""
+    """Select poses by farthest point sampling, starting with pose 0.
+
+    Every prefix of the result is a farthest point sample as well.
+
+    Args:
+        xy_m: (n, 2) position of each pose (m).
+        world: (n,) number of the world frame of each pose.
+        count: Number of selected poses, at most n.
+
+    Returns:
+        (count,) indices in order of selection.
+    """
     nearest_m = np.full(len(xy_m), np.inf)
     chosen = np.zeros(count, int)
     for place in range(1, count + 1):
         last = chosen[place - 1]
         there = world == world[last]
         nearest_m[there] = np.minimum(nearest_m[there], np.hypot(*(xy_m[there] - xy_m[last]).T))
-        nearest_m[last] = -1  # poses in one place are different scenes
+        nearest_m[last] = -1  # A second pose at the same position is still selectable: its distance of 0 m exceeds -1.
         if place < count:
             chosen[place] = nearest_m.argmax()
     return chosen
 
 
 def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
-    """Return indices of poses (n, 2), in order, that lie at least apart_m from every pose selected before.
+    """Select poses that lie at least apart_m from every pose selected before.
 
-    A pose is compared with the poses in its cell and the eight neighbouring cells of a grid of that width.
+    The search uses a grid of cells of width apart_m. Each pose is compared with the poses in its cell and the eight
+    neighbouring cells.
+
+    Args:
+        xy_m: (n, 2) position of each pose (m).
+        world: (n,) number of the world frame of each pose.
+        apart_m: Minimum distance between selected poses (m).
+
+    Returns:
+        Indices of the selected poses in ascending order.
     """
     cells: dict[tuple[int, int, int], list[np.ndarray]] = {}
     taken = []
@@ -134,7 +216,17 @@ def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndar
 
 
 def select_balanced(labels: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices, equally many of each label; other labels share the places that a rare label cannot fill."""
+    """Select the same number of scenes for each label where possible.
+
+    If a label has too few scenes, the other labels share the remaining number. Scenes are evenly spaced within a label.
+
+    Args:
+        labels: (n,) label of each scene.
+        count: Number of selected scenes, at most n.
+
+    Returns:
+        (count,) indices, grouped by label.
+    """
     groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     shares = np.zeros(len(groups), int)
     while (left := count - shares.sum()) > 0:

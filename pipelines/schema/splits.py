@@ -1,4 +1,4 @@
-"""Split poses into training, test and unused ones (paper, supplement A, Dataset Construction)."""
+"""Split poses into training, test and unused poses (paper, supplement A, Dataset Construction)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 TRAIN, TEST, UNUSED = "train", "test", "unused"
 
-# Paper, supplement A.
+# Values from the paper, supplement A.
 MAX_SEGMENTS = 100
 TEST_M = 15.0
 MARGIN_M = 5.0
 REMOVAL_M = 5.0
-# The paper does not define splits of drives shorter than its 73.7 km. A segment needs 25 m for test poses and margins,
-# and another 25 m for training poses.
+# The paper defines the split only for its 73.7 km of drives. Shorter drives get fewer segments of at least 50 m:
+# 25 m for test poses with margins, and 25 m for training poses.
 MIN_SEGMENT_M = 50.0
 
 # Argoverse 2 is split by log; its test logs have no annotations.
@@ -25,32 +25,32 @@ logger = logging.getLogger(__name__)
 
 
 def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Label every pose of every sequence.
+    """Assign the split train, test or unused to every pose of every sequence.
 
-    The distance driven is cut into equal segments, sequence after sequence; the jump between two sequences has no
-    length. A segment has the parts
+    The distance driven is cut into equal segments, one sequence after the other. The gap between two sequences counts
+    as 0 m. A segment has the parts
 
         train ... | 5 m unused | 15 m test | 5 m unused
 
     Then every train pose within 5 m (BEV) of a test pose becomes unused, and every test pose within 5 m of a train
-    pose. The paper does not define the order of the two removals. Here both use the labels before any removal, so
-    both poses of a close pair become unused.
+    pose. The paper does not define the order of these two removals. Here both removals use the labels before any
+    removal. Both poses of a close pair therefore become unused.
 
     Args:
-        positions_by_sequence: (p, 3) positions of each sequence in metres, in driving order, in one world frame. Give
-            all poses; poses that are dropped first would shorten the distance driven.
+        positions_by_sequence: (p, 3) positions of each sequence in driving order (m), in one shared world frame. Pass
+            all poses, because missing poses shorten the distance driven.
 
     Returns:
         (p,) str per sequence: train, test or unused.
 
     Raises:
-        ValueError: Positions are not (p, 3) or not finite.
+        ValueError: Positions do not have shape (p, 3), or are not finite.
     """
     for sequence, position_m in positions_by_sequence.items():
         if np.ndim(position_m) != 2 or np.shape(position_m)[1] != 3:
             raise ValueError(f"sequence {sequence}: positions have shape {np.shape(position_m)}, expected (p, 3)")
         if not np.isfinite(position_m).all():
-            raise ValueError(f"sequence {sequence}: positions are not finite; fix or drop those poses first")
+            raise ValueError(f"sequence {sequence}: some positions are not finite; fix or drop these poses first")
     if not any(len(position_m) for position_m in positions_by_sequence.values()):
         return make_no_split(positions_by_sequence)
 
@@ -63,12 +63,28 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
 
 
 def make_no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Label every pose "train"."""
+    """Assign the split "train" to every pose.
+
+    Args:
+        positions_by_sequence: (p, 3) positions of each sequence (m).
+
+    Returns:
+        (p,) str per sequence, all "train".
+    """
     return {sequence: np.full(len(p), TRAIN, object) for sequence, p in positions_by_sequence.items()}
 
 
 def count_segments(total_m: float) -> int:
-    """Return min(100, floor(distance / 50 m)), at least 1; log a warning if it is below the paper's 100."""
+    """Return the number of split segments: min(100, floor(total_m / 50 m)), at least 1.
+
+    The function logs a warning if the number is below the paper's 100.
+
+    Args:
+        total_m: Distance driven over all sequences (m).
+
+    Returns:
+        Number of segments.
+    """
     count = max(1, min(MAX_SEGMENTS, int(total_m // MIN_SEGMENT_M)))
     if count < MAX_SEGMENTS:
         logger.warning(
@@ -77,13 +93,13 @@ def count_segments(total_m: float) -> int:
             count,
             total_m / count,
             MAX_SEGMENTS,
-            "" if total_m > TEST_M + 2 * MARGIN_M else "; nothing is left to train on, use no split",
+            "" if total_m > TEST_M + 2 * MARGIN_M else "; no training pose remains, so preprocess without a split",
         )
     return count
 
 
 def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """(sum of p,) distance driven at each pose of all sequences, and the total distance; metres."""
+    """Return the distance driven at each pose of all sequences, (sum of p,), and the total distance (m)."""
     steps = [
         np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])
         for p in positions_m
@@ -94,7 +110,7 @@ def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray,
 
 
 def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> np.ndarray:
-    """(p,) str: the label of each pose by its place within its segment."""
+    """(p,) str: the split of each pose, from its position within its segment."""
     ends_m = total_m * np.arange(1, segments + 1) / segments
     segment = np.searchsorted(ends_m, driven_m, side="right").clip(max=segments - 1)
     to_end_m = ends_m[segment] - driven_m
@@ -105,7 +121,7 @@ def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> n
 
 
 def _remove_close(labels: np.ndarray, bev_m: np.ndarray) -> np.ndarray:
-    """(p,) labels in which train and test poses within 5 m (BEV) of each other are unused."""
+    """Return the splits (p,) after train and test poses within 5 m (BEV) of each other become unused."""
     train, test = np.flatnonzero(labels == TRAIN), np.flatnonzero(labels == TEST)
     if len(train) == 0 or len(test) == 0:
         return labels

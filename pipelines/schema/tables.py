@@ -1,8 +1,8 @@
-"""Scenes <-> Parquet tables: the project's one schema, for real and generated scenes alike.
+"""Convert scenes to and from Parquet tables; real and generated scenes share this schema.
 
-A dataset directory holds `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`, each partitioned by
-hive directories `source=.../split=.../part-<shard>.parquet`. Shard k of every table holds the same scenes in the
-same order, so a reader never joins. Units are in the names, and the metadata of every file describes its columns.
+A dataset directory holds the tables `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`. Hive directories
+`source=.../split=.../part-<shard>.parquet` partition each table. Part k of every table holds the same scenes in the
+same order, so a reader needs no join. Column names contain units, and the metadata of every file describes its columns.
 docs/tables.md documents the tables for users.
 """
 
@@ -21,11 +21,11 @@ from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHI
 from pipelines.runtime import storage
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
-SCHEMA_VERSION = "1"  # of names and types; descriptions may change without it
+SCHEMA_VERSION = "1"  # Version of names and types; descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # the largest height that 16 bits hold
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit number of steps represents.
 
-# Meanings of the categories and ground classes, for the descriptions of columns.
+# Meanings of the categories and ground classes, used in the descriptions of columns.
 # fmt: off
 CATEGORY_MEANING = {
     "vegetation_cuboid":    "trees, bushes and hedges annotated as boxes",
@@ -38,24 +38,24 @@ CATEGORY_MEANING = {
     "construction_small":   "walls, fences, guard rails and gates",
     "pole":                 "poles and bollards",
     "traffic_control":      "traffic lights, traffic signs and street lamps",
-    "object":               "bins, boxes, cones and other things",
+    "object":               "bins, boxes, cones and other small objects",
 }
 GROUND_MEANING = {
     "road":     "carriageway, or drivable area (av2)",
     "sidewalk": "sidewalks",
     "parking":  "parking areas and driveways",
-    "terrain":  "grass, soil and the like",
+    "terrain":  "grass, soil and similar surfaces",
     "ground":   "ground of any other kind",
-    "crossing": "pedestrian crossings, lying on the road",
+    "crossing": "pedestrian crossings on the road",
 }
 # fmt: on
 
 
 def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
-    """Make a self-describing schema from rows of (name, type, unit, description); unit "" where none applies.
+    """Make a self-describing schema from rows of (name, type, unit, description); the unit is "" for none.
 
-    Every field has the metadata `unit` and `description`. DuckDB does not show field metadata, so the table's metadata
-    repeats the rows as JSON under `pritti_columns`.
+    Every field has the metadata `unit` and `description`. DuckDB does not show field metadata. The metadata of the
+    table therefore repeats the rows as JSON under `pritti_columns`.
     """
     fields, rows = [], []
     for name, kind, unit, meaning in columns:
@@ -71,132 +71,139 @@ def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) 
 
 # fmt: off
 _FRAME = (
-    "Scene frame: origin at the ego vehicle, x forward, y left, z up, gravity-aligned; angles "
+    "Scene frame: origin at the ego vehicle, x forward, y left, z up along gravity. Angles are "
     "counter-clockwise from x, seen from above."
 )
-_SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; joins all tables.")
+_SCENE_ID = ("scene_id", pa.string(), "", "Name of the scene, unique within a dataset directory; key of all tables.")
 _SEQUENCE = ("sequence", pa.string(), "",
-             "Drive the scene belongs to: KITTI-360 drive, Argoverse 2 log, town or own folder; sampled scenes: "
-             "the seed.")
+             "Drive of the scene: KITTI-360 drive, Argoverse 2 log, town or own folder; for sampled scenes, the "
+             "seed.")
 
 SCENES = _make_schema(
-    "One row per scene: a crop of the world ahead of one ego pose (64 x 64 m unless extended), its labels and "
-    "totals. " + _FRAME,
+    "One row per scene, a crop of the world ahead of one ego pose (64 x 64 m unless extended), with its labels "
+    "and totals. " + _FRAME,
     _SCENE_ID,
     _SEQUENCE,
     ("frame",                pa.int64(),   "1; av2: ns",
-     "Frame number (av2: timestamp), ascending along the drive; generated scenes: index within the run."),
+     "Frame number (av2: timestamp), ascending along the drive; for generated scenes, the index within the run."),
     ("x_m",                  pa.float64(), "m",
-     "x of the scene's origin in the world: kitti360 has one world, av2 one per city, others one per sequence."),
+     "x of the scene's origin in the world frame: one frame for kitti360, one per city for av2, else one per "
+     "sequence."),
     ("y_m",                  pa.float64(), "m",
-     "y of the scene's origin in the world; sampled scenes lie at 0, 0, 0."),
+     "y of the scene's origin in the world frame; the origin of a sampled scene is (0, 0, 0)."),
     ("z_m",                  pa.float64(), "m",
-     "z (up) of the scene's origin in the world: height of the vehicle's origin, not of the road."),
+     "z (up) of the scene's origin in the world frame: height of the vehicle's origin, not of the road."),
     ("yaw_rad",              pa.float64(), "rad",
-     "Direction of the scene's x axis in the world, from the world's x axis, in [-pi, pi]."),
-    # A variable list: Parquet has no null of a fixed size.
+     "Direction of the scene's x axis in the world frame, from the world's x axis, in [-pi, pi]."),
+    # A list of variable size, because Parquet has no null value for a list of fixed size.
     ("world_from_imu",       pa.list_(pa.float64()), "1; m",
-     "The dataset's full pose, a 3 x 4 matrix row by row, translation (m) in its last column; null if there is none."),
+     "Full pose in the source dataset, a 3 x 4 matrix row by row with the translation (m) in its last column; or "
+     "null."),
     ("vegetation_density",   pa.string(),  "",
-     "low, medium or high by number and volume of vegetation; generated scenes: what was asked for, null if nothing "
-     "was."),
+     "low, medium or high, by number and volume of vegetation; for generated scenes, the requested label or null."),
     ("vehicle_density",      pa.string(),  "",
-     "low, medium or high by number and volume of vehicles, big and small; generated scenes: what was asked for."),
+     "low, medium or high, by number and volume of big and small vehicles; for generated scenes, the requested label "
+     "or null."),
     ("vegetation_volume_m3", pa.float64(), "m3",
-     "Sum of the volumes of all vegetation primitives; overlaps count twice."),
-    ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all vehicles, big and small."),
+     "Sum of the volumes of all vegetation primitives; overlapping volume counts once per primitive."),
+    ("vehicle_volume_m3",    pa.float64(), "m3",  "Sum of the volumes of all big and small vehicles."),
     ("num_primitives",       pa.int32(),   "1",   "Number of primitives of all categories."),
     *[(f"num_{name}",        pa.int32(),   "1",
        f"Number of {name} primitives: {CATEGORY_MEANING[name]}.")
       for name in CATEGORIES],
     *[(f"{name}_area_m2",    pa.float64(), "m2",
-       f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source has no such class.")
+       f"Area of {name} seen from above: {GROUND_MEANING[name]}; null if the scene's source lacks this class.")
       for name in GROUND_CLASSES],
     ("primitive_offset",     pa.int64(),   "1",
-     "Row, from 0, of the scene's first primitive in the primitives file of the same part."),
+     "Row (from 0) of the scene's first primitive in the primitives file of the same part."),
 )
 
 PRIMITIVES = _make_schema(
-    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene; an object seen "
-    "from several poses has a row in each. " + _FRAME,
+    "One row per primitive and scene: a cuboid or ellipsoid whose centre lies in the scene. An object that "
+    "several scenes contain has one row per scene. " + _FRAME,
     _SCENE_ID,
-    ("category",    pa.string(),  "",    "One of the eleven categories that every source shares."),
+    ("category",    pa.string(),  "",    "One of the eleven categories that all sources share."),
     ("label",       pa.string(),  "",
-     "Class name as the source dataset spells it; generated primitives: the category."),
-    ("kind",        pa.string(),  "",    "Shape that fills the box: cuboid or ellipsoid."),
+     "Class name in the source dataset; for generated primitives, the category."),
+    ("kind",        pa.string(),  "",    "Shape within the bounding box: cuboid or ellipsoid."),
     ("instance_id", pa.int64(),   "",
-     "The object's number in its sequence, -1 if it has none; kitti360 and town number static and moving objects "
-     "apart."),
+     "Number of the object in its sequence, or -1; kitti360 and town number static and moving objects separately."),
     ("x_m",         pa.float32(), "m",   "x of the centre in the scene frame: distance ahead of the ego vehicle."),
     ("y_m",         pa.float32(), "m",
      "y of the centre in the scene frame: distance to the left of the ego vehicle."),
     ("z_m",         pa.float32(), "m",
      "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
-    ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes that are not the height axis."),
-    ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes that are not the height axis."),
-    ("height_m",    pa.float32(), "m",   "Full extent along the axis nearest the vertical."),
+    ("length_m",    pa.float32(), "m",   "Full extent along the length axis, the longer axis besides the height axis."),
+    ("width_m",     pa.float32(), "m",   "Full extent along the width axis, the shorter axis besides the height axis."),
+    ("height_m",    pa.float32(), "m",   "Full extent along the height axis, the axis closest to vertical."),
     ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
     ("heading_rad", pa.float32(), "rad",
-     "Direction of travel in the scene frame, in [-pi, pi); null if unknown, as for every generated primitive."),
+     "Direction of travel in the scene frame, in [-pi, pi); null if unknown and for all generated primitives."),
     ("rotation",    pa.list_(pa.float32(), 9), "1",
-     "Rotation matrix R row by row; its columns are the length, width and height axes in the scene frame."),
+     "Rotation matrix R, row by row; its columns are the length, width and height axes in the scene frame."),
     ("cholesky",    pa.list_(pa.float32(), 6), "m^0.5",
-     "Cholesky factor, lower triangle row by row, of the scatter matrix R diag(length, width, height) R^T."),
+     "Cholesky factor of the scatter matrix R diag(length, width, height) R^T: the lower triangle, row by row."),
     ("existence",   pa.float32(), "1",
-     "Probability that the primitive exists, in [0, 1]; 1 for annotated primitives."),
+     "Existence probability in [0, 1]; 1 for annotated primitives."),
 )
 
 RASTERS = _make_schema(
-    "One row per scene: which ground class lies where and how high, as rasters [class, row, col] seen from "
-    "above. " + _FRAME,
+    "One row per scene: mask and height of each ground class, as rasters [class, row, col] seen from above. " + _FRAME,
     _SCENE_ID,
     ("height",         pa.binary(),  "height_step_m",
-     "z of the ground at each set bit of `occupied`: little-endian int16, each the difference to the one before."),
+     "z of the ground at each set bit of `occupied`: little-endian int16, stored as differences of successive values."),
     ("occupied",       pa.binary(),  "",
-     "Bit per (class, row, col) in C order, most significant first: 1 where the class covers the pixel's centre."),
-    ("resolution_m",   pa.float64(), "m",   "Edge of a pixel."),
-    ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` stands for."),
-    ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is farthest ahead."),
-    ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is leftmost."),
+     "One bit per (class, row, col) in C order, most significant first; 1 if the class covers the pixel's centre."),
+    ("resolution_m",   pa.float64(), "m",   "Edge length of a pixel."),
+    ("height_step_m",  pa.float64(), "m",   "Height of one unit of `height`."),
+    ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is the farthest ahead."),
+    ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is the leftmost."),
     ("front_m",        pa.float64(), "m",
-     "x of the far edge in the scene frame: pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
+     "x of the far edge in the scene frame; pixel centres lie at x = front_m - (row + 0.5) resolution_m."),
     ("left_m",         pa.float64(), "m",
-     "y of the left edge in the scene frame: pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
-    ("ground_classes", pa.list_(pa.string()), "", "Names of the classes, in the order of the rasters' first axis."),
+     "y of the left edge in the scene frame; pixel centres lie at y = left_m - (col + 0.5) resolution_m."),
+    ("ground_classes", pa.list_(pa.string()), "", "Names of the ground classes, in the order of the first axis."),
 )
 
 REJECTS = _make_schema(
-    "One row per scene that was left out, or per drive that could not be read.",
-    ("scene_id", pa.string(), "", "Name that the scene would have; without a frame it names the drive."),
+    "One row per reject: a scene that preprocessing left out, or a drive that it could not read.",
+    ("scene_id", pa.string(), "", "Name of the rejected scene; if frame is null, name of the rejected drive."),
     _SEQUENCE,
-    ("frame",    pa.int64(),  "1; av2: ns", "Frame number (av2: timestamp); null if the whole drive was left out."),
-    ("reason",   pa.string(), "", "Why it was left out."),
+    ("frame",    pa.int64(),  "1; av2: ns", "Frame number (av2: timestamp); null if the whole drive is rejected."),
+    ("reason",   pa.string(), "", "Reason for the reject."),
 )
 
 
 EDITS = _make_schema(
-    "One row per primitive that a step of the list of edits touched, in the scene that was given under the "
-    "same scene_id.",
+    "One row per primitive that an edit step changed. The scene_id is the same in the input and the edited "
+    "dataset.",
     _SCENE_ID,
-    ("step",       pa.int32(),   "1",   "Number of the edit in its list, from 0; edited-<run>.json holds the list."),
+    ("step",       pa.int32(),   "1",   "Number of the edit step, from 0; edited-<run>.json lists the steps."),
     ("edit",       pa.string(),  "",    "remove, duplicate, translate, rotate, scale, relabel, snap or repair."),
-    ("primitive",  pa.int32(),   "1",   "Number of the primitive in the scene as it was before this step, from 0."),
-    ("change",     pa.string(),  "",    "removed, copied or changed."),
-    ("moved_m",    pa.float32(), "m",   "How far the centre moved; a copy's distance from its original."),
-    ("turned_rad", pa.float32(), "rad", "The most that one of its axes turned, as a line."),
-    ("resized",    pa.float32(), "1",   "The largest change of an extent, as a share of what it was."),
+    ("primitive",  pa.int32(),   "1",   "Number (from 0) of the primitive in the scene before this step."),
+    ("change",     pa.string(),  "",    "Effect on the primitive: removed, copied or changed."),
+    ("moved_m",    pa.float32(), "m",   "Displacement of the centre; for a copy, the distance from its original."),
+    ("turned_rad", pa.float32(), "rad", "Largest angle between an axis before and after the step, ignoring its sign."),
+    ("resized",    pa.float32(), "1",   "Largest relative change of length, width or height."),
 )
 
 
 def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
-    """(C, h, w) posterior moments per scene; float16, channels first."""
+    """Return the schema of the latents table, with the posterior mean and log variance per scene.
+
+    Args:
+        shape: (C, h, w) shape of one latent, channels first; values are float16.
+
+    Returns:
+        Schema with the columns scene_id, mean and logvar.
+    """
     tensor = pa.fixed_shape_tensor(pa.float16(), shape)
     return _make_schema(
-        "One row per scene: its latent under the layout VAE that latents.json names, rows and columns as in the "
-        "rasters.",
+        "One row per scene: its latent from the layout VAE that latents.json names. Rows and columns have the "
+        "order of the rasters.",
         _SCENE_ID,
-        ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col) in C order."),
-        ("logvar", tensor, "1", "Natural logarithm of its variance: float16 (channel, row, col) in C order."),
+        ("mean",   tensor, "1", "Mean of the latent's normal distribution: float16 (channel, row, col), C order."),
+        ("logvar", tensor, "1", "Natural logarithm of the latent's variance: float16 (channel, row, col), C order."),
     )
 # fmt: on
 
@@ -205,17 +212,39 @@ def make_latents_schema(shape: tuple[int, int, int]) -> pa.Schema:
 
 
 def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
-    """Return (height, occupied) as bytes; only occupied pixels have a height, as the difference to the one before."""
+    """Encode the ground of a scene as the columns `height` and `occupied` of `rasters`.
+
+    Args:
+        scene: Scene whose ground heights lie within ±327.67 m.
+
+    Returns:
+        (height, occupied) as bytes. Only occupied pixels have a height, stored as the difference to the previous one.
+
+    Raises:
+        ValueError: A ground height exceeds the range of a 16-bit number of steps.
+    """
     steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
     if len(steps) and np.abs(steps).max() > 32767:
-        raise ValueError(f"scene {scene.scene_id}: ground heights beyond ±327 m, worst {scene.height_m.max()}")
+        raise ValueError(
+            f"scene {scene.scene_id}: ground heights exceed ±327 m, with a maximum of {scene.height_m.max()} m"
+        )
     return np.diff(steps.astype("<i2"), prepend=np.int16(0)).tobytes(), np.packbits(scene.occupied).tobytes()
 
 
 def decode_ground(
     height: bytes, occupied: bytes, shape: tuple[int, int, int], step_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """height_m (G, H, W) float32 and occupied (G, H, W) bool from one row of `rasters`."""
+    """Decode height and mask of the ground from one row of `rasters`.
+
+    Args:
+        height: Column `height`.
+        occupied: Column `occupied`.
+        shape: (G, H, W) number of ground classes, rows and columns.
+        step_m: Column `height_step_m` (m).
+
+    Returns:
+        height_m (G, H, W) float32, 0 outside the mask, and occupied (G, H, W) bool.
+    """
     steps, mask = list_ground_steps(height, occupied, shape)
     height_m = np.zeros(shape, np.float32)
     height_m[mask] = steps * np.float32(step_m)
@@ -223,7 +252,16 @@ def decode_ground(
 
 
 def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Heights of the occupied pixels (m,) int16, in steps, and occupied (G, H, W) bool from one row of `rasters`."""
+    """Decode the heights of occupied pixels, in steps, and the mask from one row of `rasters`.
+
+    Args:
+        height: Column `height`.
+        occupied: Column `occupied`.
+        shape: (G, H, W) number of ground classes, rows and columns.
+
+    Returns:
+        Heights of the occupied pixels (m,) int16 in steps of height_step_m, and occupied (G, H, W) bool.
+    """
     mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
     return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
 
@@ -263,7 +301,14 @@ def _make_fixed_lists(values: np.ndarray, width: int) -> pa.Array:
 
 
 def make_primitives_table(scenes: Sequence[Scene]) -> pa.Table:
-    """Return the rows of `primitives` for one or more scenes."""
+    """Make the rows of `primitives` for several scenes.
+
+    Args:
+        scenes: Scenes of one shard; may be empty.
+
+    Returns:
+        One row per primitive, in the order of the scenes.
+    """
 
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(s, name) for s in scenes]) if scenes else np.zeros(0)
@@ -307,7 +352,14 @@ def _make_rasters_table(scenes: Sequence[Scene]) -> pa.Table:
 
 
 def make_scene_tables(scenes: Sequence[Scene]) -> dict[str, pa.Table]:
-    """Return one aligned shard: tables `scenes`, `primitives` and `rasters` of the same scenes in the same order."""
+    """Make the tables of one shard.
+
+    Args:
+        scenes: Scenes of the shard.
+
+    Returns:
+        Tables `scenes`, `primitives` and `rasters` of the same scenes in the same order.
+    """
     return {
         "scenes": _make_scenes_table(scenes),
         "primitives": make_primitives_table(scenes),
@@ -326,15 +378,18 @@ def parse_scenes(
     split: str,
     rows: Sequence[int] | None = None,
 ) -> Iterator[Scene]:
-    """Yield the Scenes of one shard, or only those in `rows` in that order.
+    """Yield the Scenes of one shard.
 
     Args:
-        scenes: The shard's rows of `scenes`.
-        primitives: Its rows of `primitives`.
-        rasters: Its rows of `rasters`.
+        scenes: Rows of `scenes` of the shard.
+        primitives: Rows of `primitives` of the shard.
+        rasters: Rows of `rasters` of the shard.
         source: Value of the source column.
         split: Value of the split column.
-        rows: Numbers of the scenes (default: all).
+        rows: Row numbers of the scenes to return, in this order (default: all).
+
+    Yields:
+        Scene of each row.
 
     Raises:
         ValueError: The tables do not hold the same scenes in the same order, or a category is unknown.
@@ -343,7 +398,10 @@ def parse_scenes(
     rows = list(range(len(scenes)) if rows is None else rows)
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
         if scene["scene_id"] != raster["scene_id"]:
-            raise ValueError(f"shard is not aligned: scenes has {scene['scene_id']}, rasters has {raster['scene_id']}")
+            raise ValueError(
+                f"the tables of the shard are not aligned: scenes holds {scene['scene_id']} where rasters holds"
+                f" {raster['scene_id']}"
+            )
         here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = tuple(raster["ground_classes"])
@@ -371,21 +429,39 @@ def parse_scenes(
 
 
 def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
-    """(n,) int8 index into CATEGORIES. Raises ValueError for an unknown name."""
+    """Return the index of each category name.
+
+    Args:
+        names: (n,) category names.
+
+    Returns:
+        (n,) int8 index into CATEGORIES.
+
+    Raises:
+        ValueError: A name is no category of this version.
+    """
     category = pc.index_in(names, pa.array(CATEGORIES))  # pyright: ignore[reportAttributeAccessIssue]
     if category.null_count:
-        raise ValueError("primitives hold a category of another version; preprocess again")
+        raise ValueError("the primitives table holds an unknown category; preprocess again with this version")
     return category.to_numpy().astype(np.int8)
 
 
 def read_fixed_lists(column: pa.ChunkedArray, width: int) -> np.ndarray:
-    """(n, width) float32 of a column of fixed-size lists."""
+    """Return a column of fixed-size lists as an array.
+
+    Args:
+        column: Column of float32 lists.
+        width: Number of values per list.
+
+    Returns:
+        (n, width) float32.
+    """
     flat = pa.concat_arrays(column.chunks).flatten() if len(column) else pa.array([], pa.float32())
     return flat.to_numpy().reshape(-1, width)
 
 
 def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
-    """The per-primitive arrays of a Scene for all rows of a primitives table."""
+    """Return the per-primitive arrays of a Scene for all rows of a primitives table."""
     primitives = primitives.combine_chunks()
 
     def column(name: str) -> np.ndarray:
@@ -411,7 +487,14 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """One aligned shard of a dataset directory; `path(table)` is its file in each table."""
+    """One shard of a dataset directory: one Parquet file with the same number in each table.
+
+    Attributes:
+        root: Dataset directory.
+        source: Value of the source column.
+        split: Value of the split column.
+        number: Number of the part, from 0.
+    """
 
     root: str
     source: str
@@ -419,15 +502,42 @@ class Shard:
     number: int
 
     def path(self, table: str) -> str:
+        """Return the path of the shard's file in a table.
+
+        Args:
+            table: Name of the table, such as scenes.
+
+        Returns:
+            Path or URI of the Parquet file.
+        """
         name = f"part-{self.number:05d}.parquet"
         return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}", name)
 
     def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
+        """Read the shard's rows of a table.
+
+        Args:
+            table: Name of the table, such as scenes.
+            columns: Names of the columns to read (default: all).
+
+        Returns:
+            The rows.
+        """
         schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS, "edits": EDITS}.get(table)
         return storage.read_parquet(self.path(table), columns, schema)
 
     def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
-        """Return its Scenes. Raises ValueError naming the file that is missing, truncated or misaligned."""
+        """Read Scenes of the shard.
+
+        Args:
+            rows: Row numbers of the scenes, in this order (default: all).
+
+        Returns:
+            The Scenes.
+
+        Raises:
+            ValueError: A file is missing, truncated or misaligned; the message names the file.
+        """
         scenes, primitives, rasters = (self.read(table) for table in ("scenes", "primitives", "rasters"))
         try:
             return list(parse_scenes(scenes, primitives, rasters, self.source, self.split, rows))
@@ -435,15 +545,34 @@ class Shard:
             raise ValueError(f"{self.path('scenes')}: {error}") from error
 
     def write(self, scenes: Sequence[Scene]) -> None:
+        """Write the tables scenes, primitives and rasters of the shard.
+
+        Args:
+            scenes: All scenes of the shard.
+        """
         for table, content in make_scene_tables(scenes).items():
             storage.write_parquet(content, self.path(table))
 
     def is_written(self) -> bool:
+        """Return whether the files of the tables scenes, primitives and rasters exist."""
         return all(storage.exists(self.path(table)) for table in ("scenes", "primitives", "rasters"))
 
 
 def find_shards(root: str, table: str = "scenes", source: str | None = None, split: str | None = None) -> list[Shard]:
-    """Return the shards of a table, in order. Raises ValueError if there is none: no job accepts empty input."""
+    """Return the shards of a table, in order.
+
+    Args:
+        root: Dataset directory.
+        table: Name of the table.
+        source: Value of the source column (default: all sources).
+        split: Value of the split column (default: all splits).
+
+    Returns:
+        The shards; never an empty list, because no job accepts empty input.
+
+    Raises:
+        ValueError: The directory holds no matching shard.
+    """
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
         *_, source_part, split_part, name = path.split("/")
@@ -457,9 +586,9 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
         )
         there = sorted({"/".join(path.split("/")[-3:-1]) for path in storage.list_files(place, ".parquet")})
         if there:
-            raise ValueError(f"{place}: no {wanted}; there are {', '.join(there)}")
+            raise ValueError(f"{place} holds no {wanted}; it holds {', '.join(there)}")
         raise ValueError(
-            f"{place}: no scenes there; give a directory that jobs/preprocess_scenes.py or another job wrote"
+            f"{place} holds no scenes; pass a directory that jobs/preprocess_scenes.py or another job wrote"
         )
     return shards
 
@@ -467,7 +596,17 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
 def read_scenes(
     root: str, source: str | None = None, split: str | None = None, limit: int | None = None
 ) -> Iterator[Scene]:
-    """Yield scenes of a dataset directory, shard by shard; at most `limit`."""
+    """Yield the scenes of a dataset directory, shard by shard.
+
+    Args:
+        root: Dataset directory.
+        source: Value of the source column (default: all sources).
+        split: Value of the split column (default: all splits).
+        limit: Maximum number of scenes (default: all).
+
+    Yields:
+        Each Scene, in the order of the shards.
+    """
     left = limit
     for shard in find_shards(root, "scenes", source, split):
         for scene in shard.scenes():
@@ -478,4 +617,12 @@ def read_scenes(
 
 
 def make_rejects_table(rows: Iterable[dict]) -> pa.Table:
+    """Make the rejects table.
+
+    Args:
+        rows: One dictionary per reject, with the keys of the schema REJECTS.
+
+    Returns:
+        Table with the schema REJECTS.
+    """
     return pa.Table.from_pylist(list(rows), schema=REJECTS)

@@ -112,5 +112,5 @@ def test_studio_rejects_taken_port_and_missing_inputs(studio_files, tmp_path):
             serve_studio(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=port))
     with pytest.raises(ValueError, match="no PrITTI pipeline here"):
         serve_studio(Config(str(tmp_path)))
-    with pytest.raises(ValueError, match="no scenes there"):
+    with pytest.raises(ValueError, match="holds no scenes"):
         serve_studio(Config(str(studio_files / "model"), (str(tmp_path),)))

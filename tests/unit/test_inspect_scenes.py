@@ -277,5 +277,5 @@ def test_draw_scenes_runs_without_ray(generated, tmp_path, monkeypatch):
     assert Path(again).read_bytes() == (tmp_path / f"{names[0]}.png").read_bytes()
     with pytest.raises(ValueError, match="--max-scenes is 0, expected at least 1"):
         draw_scenes(OneScene(dataset=generated, max_scenes=0))
-    with pytest.raises(ValueError, match="no split=test; there are source="):
+    with pytest.raises(ValueError, match="holds no split=test; it holds source="):
         draw_scenes(OneScene(dataset=generated, split="test"))

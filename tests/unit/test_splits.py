@@ -89,7 +89,7 @@ def test_split_of_short_drive_has_fewer_segments_and_warns(total_m, count, caplo
     with caplog.at_level(logging.WARNING):
         assert count_segments(total_m) == count
     assert ("instead of the paper's 100" in caplog.text) == (count < 100)
-    assert ("nothing is left to train on" in caplog.text) == (total_m < 25)
+    assert ("no training pose remains" in caplog.text) == (total_m < 25)
 
 
 def test_split_none_trains_on_everything():

@@ -85,11 +85,11 @@ def test_shard_is_readable_by_decoder_of_readme(tmp_path, scenes):
 
 
 def test_shard_names_truncated_and_missing_files(tmp_path, scenes):
-    with pytest.raises(ValueError, match="scenes: no scenes there; give a directory"):
+    with pytest.raises(ValueError, match="scenes holds no scenes; pass a directory"):
         find_shards(str(tmp_path), source="av2")
     shard = Shard(str(tmp_path), "town", "train", 0)
     shard.write(scenes)
-    with pytest.raises(ValueError, match="no source=av2; there are source=town/split=train"):
+    with pytest.raises(ValueError, match="holds no source=av2; it holds source=town/split=train"):
         find_shards(str(tmp_path), source="av2")
     path = tmp_path / "rasters/source=town/split=train/part-00000.parquet"
     path.write_bytes(path.read_bytes()[:-100])
