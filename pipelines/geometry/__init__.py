@@ -1,1 +1,1 @@
-"""Geometry of whole scenes: rasterisation, voxels, centrelines, shape fitting."""
+"""Geometry of whole scenes: rasterisation, voxels, road centrelines and shape fitting."""

@@ -1,8 +1,8 @@
-"""Extract the roads of a Scene as lines from the road mask: centrelines with height and width, joined at nodes.
+"""Extract the road network of a Scene from its road mask: centrelines with height and width, joined at nodes.
 
-The mask is cleaned, thinned to a skeleton one pixel wide and cut at its forks. Spurs caused by the outline are pruned.
-Forks closer together than the road is wide become one node. The mask is extended beyond the scene's border by its edge
-values, so that a road leaves the scene straight.
+The mask is cleaned, thinned to a skeleton one pixel wide, and cut at its forks. Spurs that the shape of the outline
+causes are removed. Forks that are closer together than the road width become one node. Edge values extend the mask
+beyond the scene's border, so that a road crosses the border in a straight line.
 """
 
 from __future__ import annotations
@@ -18,49 +18,78 @@ from skimage.morphology import skeletonize
 from models.scene import ROAD_CLASSES, Scene
 from pipelines.geometry.masks import find_nearest_true, label_parts, measure_depth
 
-CELL_M = 0.5  # of the mask that is thinned
-HOLE_M2, ISLAND_M2 = 25.0, 40.0  # smaller holes are filled, smaller islands removed
-MARGIN_M = 16.0  # width of the mask's extension beyond the border
-SPUR = 1.6  # a dead end shorter than this multiple of the half width at its fork is not a road
-ONE_NODE = 1.0  # forks closer than this multiple of the sum of their half widths become one node
-SMOOTH_M = 3.0  # standard deviation of the Gaussian along a line
-LEAST_M = 4.0  # a shorter line is not a road
-AROUND = np.ones((3, 3), int)  # eight neighbours
+CELL_M = 0.5  # Cell size of the mask that is thinned
+HOLE_M2, ISLAND_M2 = 25.0, 40.0  # Smaller holes are filled and smaller islands are removed.
+MARGIN_M = 16.0  # Width of the mask's extension beyond the scene's border
+SPUR = 1.6  # A dead end shorter than this multiple of the half width at its fork is not a road.
+ONE_NODE = 1.0  # Forks closer than this multiple of the sum of their half widths become one node.
+SMOOTH_M = 3.0  # Standard deviation of the Gaussian that smooths a line
+LEAST_M = 4.0  # A shorter line is not a road.
+AROUND = np.ones((3, 3), int)  # Neighbourhood of eight pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """One line between two nodes; k points, evenly spaced, in the scene frame."""
+    """A road between two nodes: k evenly spaced points of its centreline, in the scene frame.
 
-    xyz_m: np.ndarray  # (k, 3), on the ground
-    width_m: np.ndarray  # (k,) of the whole road
-    start: int  # node, -1 where the road leaves the scene or ends
+    Attributes:
+        xyz_m: Points on the ground (m).
+        width_m: Width of the whole road at each point (m).
+        start: Node at the first point, or -1 if the road leaves the scene or ends.
+        end: Node at the last point, or -1.
+        number: Number of the road in the network.
+    """
+
+    xyz_m: np.ndarray  # (k, 3)
+    width_m: np.ndarray  # (k,)
+    start: int
     end: int
-    number: int  # in the network
+    number: int
 
     @property
     def length_m(self) -> float:
+        """Length seen from above (m)."""
         return float(np.linalg.norm(np.diff(self.xyz_m[:, :2], axis=0), axis=1).sum())
 
     def reverse(self) -> Road:
-        """Return the same road in the other direction."""
+        """Return the same road in the opposite direction."""
         return Road(self.xyz_m[::-1], self.width_m[::-1], self.end, self.start, self.number)
 
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """Roads, and the nodes where three or more of their ends meet."""
+    """Roads, and the nodes where three or more road ends meet.
+
+    Attributes:
+        roads: All roads; a road's number is its index.
+        nodes_m: Position of each node in the scene frame (m).
+    """
 
     roads: tuple[Road, ...]
     nodes_m: np.ndarray  # (n, 3)
 
     def list_leaving(self, node: int) -> list[Road]:
-        """Return the roads at a node, each directed away from it."""
+        """Return the roads at a node, each directed away from it.
+
+        Args:
+            node: Number of the node.
+
+        Returns:
+            Roads whose start is the node, in either direction.
+        """
         return [r for road in self.roads for r in (road, road.reverse()) if r.start == node]
 
 
 def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
-    """Extract the centrelines of a scene's roads, with points about spacing_m apart; no roads without a road class."""
+    """Extract the centrelines of a scene's roads.
+
+    Args:
+        scene: Scene; the network is empty if it has no road class.
+        spacing_m: Approximate distance between points of a centreline (m).
+
+    Returns:
+        Roads and nodes.
+    """
     mask = _make_road_mask(scene)
     margin = round(MARGIN_M / CELL_M)
     wide = np.pad(mask, margin, mode="edge")
@@ -94,7 +123,7 @@ def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
 
 
 def _make_road_mask(scene: Scene) -> np.ndarray:
-    """(h, w) bool mask of the road, in cells of CELL_M, without small holes and islands."""
+    """Return the road mask (h, w) in cells of CELL_M, without small holes and islands."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
     road = np.any(scene.occupied[index], axis=0)
     factor = max(1, round(CELL_M / scene.grid.resolution_m))
@@ -105,7 +134,10 @@ def _make_road_mask(scene: Scene) -> np.ndarray:
 
 
 def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
-    """Return the 4-connected parts of a mask that are large enough, and with `border` those that touch its border."""
+    """Return the 4-connected parts of a mask with at least the given area.
+
+    `border` also keeps the parts that touch the border of the mask.
+    """
     parts, count = label_parts(mask)
     keep = np.bincount(parts.ravel(), minlength=count + 1) * CELL_M**2 >= area_m2
     if border:
@@ -115,10 +147,10 @@ def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) ->
 
 
 def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
-    """Trace a skeleton to a graph.
+    """Convert a skeleton to a graph.
 
-    Forks and ends become nodes with `place` (2,), row and column. The lines between them become edges with `path`
-    (k, 2) from u to v, u < v.
+    Forks and ends become nodes with the attribute `place` (2,): row and column. The lines between them become edges
+    with the attribute `path` (k, 2), which leads from u to v with u < v.
     """
     neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1
     forks, count = label_parts(skeleton & (neighbours > 2), AROUND)
@@ -132,7 +164,8 @@ def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
         ends = []
         for end in (0, -1):
             fork = int(touching[tuple(path[end])])
-            if len(path) == 1 and end == -1 and fork:  # one pixel between two forks: they differ around it
+            # For a single pixel between two forks, find the second fork among its neighbours.
+            if len(path) == 1 and end == -1 and fork:
                 around = forks[path[0][0] - 1 : path[0][0] + 2, path[0][1] - 1 : path[0][1] + 2]
                 fork = int(min(set(around[around > 0].tolist()) - {ends[0]}, default=0))
             if not fork:
@@ -144,7 +177,7 @@ def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
 
 
 def _join(graph: nx.MultiGraph, u: int, v: int, path: np.ndarray) -> None:
-    """Add an edge whose path (k, 2) leads from u to v, with their places added at its ends."""
+    """Add an edge whose path (k, 2) leads from u to v, and extend the path to both nodes."""
     path = np.concatenate([[graph.nodes[u]["place"]], path, [graph.nodes[v]["place"]]])
     graph.add_edge(min(u, v), max(u, v), path=path if u <= v else path[::-1])
 
@@ -175,7 +208,7 @@ def _measure_half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> 
 
 
 def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
-    """Remove spurs, the shortest first, and join the two remaining lines at nodes that are no longer forks."""
+    """Remove spurs, the shortest first, and join the two remaining lines at each former fork."""
     while True:
         spurs = []
         for u, v, key, path in graph.edges(keys=True, data="path"):
@@ -193,21 +226,21 @@ def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
 
 
 def _straighten(graph: nx.MultiGraph) -> None:
-    """Join the two lines at every node where only two meet."""
+    """Join the two lines at every node where only two lines meet."""
     for node in [n for n, degree in graph.degree() if degree == 2]:
         edges = list(graph.edges(node, keys=True, data="path"))
-        if len(edges) == 2:  # else one line from the node to itself
+        if len(edges) == 2:  # Otherwise, a single line leads from the node to itself.
             parts, ends = [], []
             for u, v, _, path in edges:
                 other = v if u == node else u
                 ends.append(other)
-                parts.append(path if other <= node else path[::-1])  # towards the node
+                parts.append(path if other <= node else path[::-1])  # directed towards the node
             graph.remove_node(node)
             _join(graph, ends[0], ends[1], np.concatenate([parts[0][1:-1], parts[1][::-1][1:-1]]))
 
 
 def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
-    """Merge two forks whose line is shorter than the road is wide into one node, the closest first."""
+    """Merge two forks into one node if their line is shorter than the road width, the closest pair first."""
     while True:
         close = []
         for u, v, path in graph.edges(data="path"):
@@ -232,7 +265,7 @@ def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
 
 
 def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
-    """Smooth a line (k,) or (k, 2) along k with fixed ends."""
+    """Smooth a line (k,) or (k, 2) along k and keep its ends fixed."""
     reach = min(len(line) - 1, int(4 * sigma))
     if reach < 1:
         return line
@@ -242,7 +275,8 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
-    """Yield the runs of a line (k, 2) inside the scene, and whether each holds the line's first and last point."""
+    """Yield the sections of a line (k, 2) inside the scene, and whether each includes the line's first and last point.
+    """
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for start, stop in border.tolist():
@@ -252,7 +286,7 @@ def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.
 def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
     """Replace the end of a line (k, 2) at the scene's border by a straight continuation.
 
-    Within half a width of the border the line would bend towards the extension of the mask.
+    Without this step, the line bends towards the extended mask within half a road width of the border.
     """
     half = half_m[tuple(np.round(line[-1] + margin).astype(int))] / CELL_M
     left = len(line) - int(2 * half)
@@ -266,14 +300,14 @@ def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.nd
 
 
 def _resample_line(line: np.ndarray, spacing: float) -> np.ndarray:
-    """(n, 2) points of a line, evenly spaced along it, including both ends."""
+    """Return points (n, 2) that are evenly spaced along a line and include both ends."""
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
     wanted = np.linspace(0, along[-1], max(2, round(along[-1] / spacing) + 1))
     return np.stack([np.interp(wanted, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
-    """(h, w) height of the road in cells of CELL_M; outside the road, the height of the nearest road."""
+    """Return the height (h, w) of the road in cells of CELL_M; other cells take the height of the nearest road."""
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
     known = np.any(scene.occupied[index], axis=0)
     height_m = np.where(scene.occupied[index], scene.height_m[index], -np.inf).max(axis=0, initial=-np.inf)
@@ -288,17 +322,17 @@ def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
 def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
     """Plan a smooth path on the ground along the roads.
 
-    The path begins at the end of a road nearest to start_m. At each node it continues along the road that turns least,
-    among those not driven yet.
+    The path begins at the end of a road nearest to start_m. At each node, the path continues along the road with the
+    smallest change of direction that it has not used before.
 
     Args:
         network: Roads.
-        start_m: Position (x, y) in the scene frame.
-        right: Offset to the right of the centreline, as a share of the road's width; 0.25 is the middle of the right
+        start_m: Position (x, y) in the scene frame (m).
+        right: Offset to the right of the centreline, as a share of the road width. 0.25 is the middle of the right
             half.
 
     Returns:
-        (k, 3) points in metres, spaced like those of the roads; (0, 3) without roads.
+        (k, 3) points in the scene frame (m), spaced like those of the roads; (0, 3) without roads.
     """
     starts = [r for road in network.roads for r in (road, road.reverse()) if r.start == -1]
     starts = starts or [r for road in network.roads for r in (road, road.reverse())]
@@ -328,6 +362,6 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
 
 
 def _compute_direction(road: Road) -> np.ndarray:
-    """(2,) direction of a road's first metres, away from its start."""
+    """Return the direction (2,) of a road near its start, away from the start."""
     way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
     return way / np.linalg.norm(way)

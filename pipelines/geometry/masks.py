@@ -1,4 +1,4 @@
-"""Typed forms of scipy.ndimage's functions on masks, whose annotations do not give the types of their results."""
+"""Wrap functions of scipy.ndimage on masks with exact return types, which their own annotations lack."""
 
 from __future__ import annotations
 
@@ -13,20 +13,34 @@ def label_parts(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[
 
     Args:
         mask: (...) bool.
-        structure: Neighbours of an element, as in `scipy.ndimage.label` (default: those that share a face).
+        structure: Neighbourhood of an element, as in `scipy.ndimage.label` (default: elements that share a face).
 
     Returns:
-        (...) int32 number of each element's part, 0 outside the mask; and the number of parts.
+        (...) int32 number of each element's part, from 1 and 0 outside the mask; and the number of parts.
     """
     return cast("tuple[np.ndarray, int]", ndimage.label(mask, structure))
 
 
 def measure_depth(mask: np.ndarray) -> np.ndarray:
-    """(...) float64 distance of each element of a mask to the nearest element outside it; 0 outside."""
+    """Return the distance of each element of a mask to the nearest element outside the mask.
+
+    Args:
+        mask: (...) bool.
+
+    Returns:
+        (...) float64 Euclidean distance in elements; 0 outside the mask.
+    """
     return cast(np.ndarray, ndimage.distance_transform_edt(mask))
 
 
 def find_nearest_true(mask: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Index arrays (...), one per axis, of the element of a mask that is nearest to each element."""
+    """Find the element of a mask that is nearest to each element.
+
+    Args:
+        mask: (...) bool with at least one True element.
+
+    Returns:
+        One index array (...) per axis.
+    """
     indices = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     return tuple(cast(np.ndarray, indices))

@@ -1,4 +1,4 @@
-"""What a parallel camera sees of a Scene: triangles by the one rasteriser, ellipsoids exactly."""
+"""Orthographic cameras: views from above and oblique views, with exact ray casting of ellipsoids."""
 
 from __future__ import annotations
 
@@ -10,32 +10,65 @@ import numpy as np
 from models.scene import ELLIPSOID, Grid, Scene
 from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, list_integers_between
 
-FILL = 0.95  # of the picture's width or height, whichever is tighter
-ROUNDING_M = 1e-6  # far more than rounding adds to a depth
-BELOW_M, ABOVE_M = 2.0, 14.0  # what a camera frames below and above the ego vehicle's ground
+FILL = 0.95  # Share of the image width or height, whichever limits the scale, that the scene fills.
+ROUNDING_M = 1e-6  # Tolerance that exceeds the rounding error of a depth.
+BELOW_M, ABOVE_M = 2.0, 14.0  # Vertical range below and above the ego vehicle's origin that the camera covers.
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A parallel camera. Its frame: x up and y left in the picture, z towards the viewer; metres."""
+    """An orthographic camera.
 
-    camera_from_scene: np.ndarray  # (3, 3) rotation
-    view: Grid  # the pixels, in the camera frame
+    In the camera frame, x points up and y points left in the image. The z axis points towards the viewer. Lengths are
+    in metres.
+
+    Attributes:
+        camera_from_scene: Rotation from the scene frame to the camera frame.
+        view: Pixel grid in the camera frame.
+    """
+
+    camera_from_scene: np.ndarray  # (3, 3)
+    view: Grid  # pixel grid in the camera frame
 
     def turn(self, points_m: np.ndarray) -> np.ndarray:
-        """Scene points (..., 3) in the camera frame."""
+        """Rotate points from the scene frame into the camera frame.
+
+        Args:
+            points_m: (..., 3) points in the scene frame (m).
+
+        Returns:
+            (..., 3) points in the camera frame (m).
+        """
         return points_m @ self.camera_from_scene.T
 
 
 def make_top_camera(view: Grid) -> Camera:
-    """The camera of the picture from above: its frame is the scene's."""
+    """Return the camera that looks straight down; its frame is the scene frame.
+
+    Args:
+        view: Pixel grid in the scene frame.
+
+    Returns:
+        The camera.
+    """
     return Camera(np.eye(3), view)
 
 
 def make_oblique_camera(grid: Grid, width: int, height: int, azimuth_deg: float, elevation_deg: float) -> Camera:
-    """The camera that has all of the grid in a picture of width x height pixels, as large as it fits.
+    """Return an oblique camera that shows the whole grid as large as the image allows.
 
-    It looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg, above 0 and at most 90.
+    Args:
+        grid: Horizontal extent of the scene.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        azimuth_deg: Angle of the view direction to the left of +x (forward), in degrees.
+        elevation_deg: Downward angle of the view direction, in degrees, in (0, 90].
+
+    Returns:
+        The camera.
+
+    Raises:
+        ValueError: elevation_deg lies outside (0, 90].
     """
     if not 0 < elevation_deg <= 90:
         raise ValueError(f"elevation_deg is {elevation_deg}, must be above 0 and at most 90")
@@ -56,16 +89,30 @@ def make_oblique_camera(grid: Grid, width: int, height: int, azimuth_deg: float,
 
 
 def find_facing_sides(corners_m: np.ndarray) -> np.ndarray:
-    """Indices of the triangles (t, 3, 3), counter-clockwise from outside, whose outside is seen from +z."""
-    x, y, _ = corners_m.T  # (3, t) each
+    """Find the triangles whose outer side faces +z.
+
+    Args:
+        corners_m: (t, 3, 3) corners, counter-clockwise seen from outside.
+
+    Returns:
+        Indices of the triangles that face the viewer.
+    """
+    x, y, _ = corners_m.T  # each is (3, t)
     return np.flatnonzero((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]) > 1e-9)
 
 
 def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest hit of the ray through each pixel centre with the scene's ellipsoids; exact.
+    """Find the nearest ellipsoid on the ray through each pixel centre.
 
-    Returns depth_m (H, W) float64, z in the camera frame, -inf where nothing is hit, and primitive (H, W)
-    int64, its index in the scene, -1 for none.
+    The intersection is exact, because no mesh approximates the ellipsoids.
+
+    Args:
+        scene: Scene.
+        camera: Orthographic camera.
+
+    Returns:
+        depth_m (H, W) float64: z in the camera frame (m), -inf without a hit. primitive (H, W) int64: index of the
+        primitive, -1 without a hit.
     """
     pixel, chord, chords = _compute_chords(scene, camera)
     shape = camera.view.rows, camera.view.cols
@@ -76,9 +123,18 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
-    """Flat indices of the pixels where `cast_ellipsoids` has more than depth_m (H, W), some more than once.
+    """Find the pixels where `cast_ellipsoids` returns a larger depth than a given one.
 
-    The least depth of an ellipsoid decides most of its hits; the depths of the others are worked out.
+    The function compares a lower bound of the depth first. It computes the exact depth only where the lower bound
+    decides nothing.
+
+    Args:
+        scene: Scene.
+        camera: Orthographic camera.
+        depth_m: (H, W) depth to compare with: z in the camera frame (m).
+
+    Returns:
+        Flat pixel indices; a pixel may occur several times.
     """
     pixel, chord, chords = _compute_chords(scene, camera)
     there_m = depth_m.reshape(-1).take(pixel)
@@ -89,19 +145,20 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
 
 
 class _Chords(NamedTuple):
-    """Rows of pixel centres across ellipsoids, seen from a camera; m chords, by ellipsoid."""
+    """Chords of ellipsoids along rows of pixel centres, seen from a camera; m chords, ordered by ellipsoid."""
 
-    primitive: np.ndarray  # (m,) index into the scene
-    row_start: np.ndarray  # (m,) flat index of the row's first pixel
-    least_m: np.ndarray  # (m,) less than the depth of any hit
-    terms: tuple[np.ndarray, ...]  # (m,) each, of `_compute_depth_m`
+    primitive: np.ndarray  # (m,) index of the primitive in the scene
+    row_start: np.ndarray  # (m,) flat index of the first pixel in the row
+    least_m: np.ndarray  # (m,) lower bound of the depth of any hit
+    terms: tuple[np.ndarray, ...]  # (m,) each, the terms that `_compute_depth_m` needs
 
 
 def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
-    """Every pixel centre over every ellipsoid: flat pixel index and chord (k,), and the chords.
+    """Return the flat pixel index and the chord of each pixel centre inside an ellipsoid (k,), and the chords.
 
-    With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| = 1. L is lower
-    triangular: x gives the first entry of s, y then the second, and the positive root the third.
+    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| = 1. L is
+    lower triangular. Therefore x determines the first entry of s, and y then determines the second. The positive root
+    gives the third.
     """
     view = camera.view
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
@@ -129,7 +186,7 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def _compute_depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
-    """(k,) depth of the ellipsoids at flat pixels on their chords."""
+    """Return the depth (k,) of ellipsoids at flat pixel indices on their chords."""
     y, shift, l11, rest, middle, l21, l22 = chords.terms
     col = pixel - chords.row_start.take(chord)
     s1 = (view.y_m().take(col) - y.take(chord) - shift.take(chord)) / l11.take(chord)

@@ -1,8 +1,8 @@
-"""Exact top-down rasterisation: vertical ray casting at pixel centres, without casting a ray.
+"""Rasterise triangles exactly, seen from above, by vertical rays through pixel centres.
 
-A vertical ray meets a triangle where its foot lies inside the triangle's shadow. So each triangle is filled row by
-row: an interval of columns per row, a plane for the height, the highest hit wins. One kernel serves the ground
-rasters (paper, Sec. 3.1), the BEV pictures and, after turning the mesh, the 3D pictures.
+A vertical ray meets a triangle if the pixel centre lies inside the triangle's vertical projection. Each triangle is
+filled row by row: each row has an interval of columns, a plane gives the height, and the highest hit is kept. The same
+code serves the ground rasters (paper, Sec. 3.1), the BEV images and, after a rotation of the mesh, the 3D images.
 """
 
 from __future__ import annotations
@@ -11,28 +11,57 @@ import numpy as np
 
 from models.scene import Grid
 
-EDGE_PX = 1e-7  # a centre this close to an edge is inside: abutting triangles leave no crack
-STEEP = 1e3  # metres a pixel: planes of sliver triangles, whose hits are kept within their own triangle's heights
+EDGE_PX = 1e-7  # A pixel centre this close to an edge counts as inside, which prevents gaps between adjacent triangles.
+# Slope (m per pixel) above which hits are clamped to the height range of their triangle, for sliver triangles.
+STEEP = 1e3
 
 
 def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Concatenated integer ranges first[i] .. first[i] + count[i] - 1; np.repeat(x, count) is x along them."""
+    """Concatenate the integer ranges first[i] .. first[i] + count[i] - 1.
+
+    np.repeat(x, count) gives the corresponding values of x.
+
+    Args:
+        first: (n,) first integer of each range.
+        count: (n,) length of each range.
+
+    Returns:
+        (sum of count,) integers.
+    """
     return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 def list_integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first integer in [0, size) and in [low[i], high[i]], and how many there are."""
+    """Find the integers that lie in [0, size) and in [low[i], high[i]].
+
+    Args:
+        low: (n,) lower bounds, inclusive.
+        high: (n,) upper bounds, inclusive.
+        size: Upper bound of all integers, exclusive.
+
+    Returns:
+        First integer of each interval, and the number of integers in it; (n,) int64 both.
+    """
     first = np.minimum(np.maximum(np.ceil(low), 0), size)
     count = np.maximum(np.minimum(np.floor(high) + 1, size) - first, 0)
     return first.astype(np.int64), count.astype(np.int64)
 
 
 def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every pixel centre under every triangle (t, 3, 3), in turn: flat pixel index, owner (of (t,)) and height (m,)."""
-    x, y, z = np.ascontiguousarray(triangles_m.astype(np.float64).T)  # (3, t) each
+    """Return the hits of vertical rays through pixel centres with triangles.
+
+    Args:
+        triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
+        grid: Pixel grid.
+        owner: (t,) value to report for the hits of each triangle.
+
+    Returns:
+        Flat pixel index, owner and height (m) of each hit, (m,) each, ordered by triangle.
+    """
+    x, y, z = np.ascontiguousarray(triangles_m.astype(np.float64).T)  # each is (3, t)
     u = (grid.front_m - x) / grid.resolution_m - 0.5
     v = (grid.left_m - y) / grid.resolution_m - 0.5
-    # Plane z = z0 + du (u - u0) + dv (v - v0) by Cramer's rule.
+    # The plane of a triangle is z = z0 + du (u - u0) + dv (v - v0), solved by Cramer's rule.
     (u1, u2), (v1, v2), (z1, z2) = [(w[1] - w[0], w[2] - w[0]) for w in (u, v, z)]
     area = u1 * v2 - u2 * v1
     first, rows = list_integers_between(u.min(axis=0) - EDGE_PX, u.max(axis=0) + EDGE_PX, grid.rows)
@@ -48,7 +77,7 @@ def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[n
     low, high = _find_column_intervals(row, spans, u, v)
     first, count = list_integers_between(low - EDGE_PX, high + EDGE_PX, grid.cols)
     col = concatenate_ranges(first, count)
-    # Along a row the height is linear: start + slope_v col.
+    # Along a row, the height is linear in the column: start + slope_v col.
     start, along_u, along_v, lowest, highest = np.repeat(plane, spans, axis=1)
     height = np.repeat(start + along_u * row, count) + np.repeat(along_v, count) * col
     if np.abs(slope_u).max(initial=0) > STEEP or np.abs(slope_v).max(initial=0) > STEEP:
@@ -59,11 +88,12 @@ def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[n
 def _find_column_intervals(
     row: np.ndarray, spans: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high column coordinate of triangles in pixel rows (s,); spans (t,): how many of the rows are each one's.
+    """Return the lowest and highest column coordinate of triangles in pixel rows (s,).
 
-    u, v (3, t): row and column coordinates of the corners, in pixels, a centre at each integer.
+    spans (t,) is the number of rows per triangle. u and v (3, t) are the row and column coordinates of the corners in
+    pixels; pixel centres have integer coordinates.
     """
-    u_end, v_end = u[[1, 2, 0]], v[[1, 2, 0]]  # an edge goes from a corner to the next
+    u_end, v_end = u[[1, 2, 0]], v[[1, 2, 0]]  # Edge k leads from corner k to the next corner.
     per_row = (v_end - v) / np.where(u == u_end, 1.0, u_end - u)
     edges = [u, v, per_row, np.minimum(u, u_end), np.maximum(u, u_end)]
     u, v, per_row, top, bottom = np.repeat(edges, spans, axis=2)
@@ -76,9 +106,16 @@ def _find_column_intervals(
 def fill_triangles(
     pixel: np.ndarray, owner: np.ndarray, value: np.ndarray, height: np.ndarray, winner: np.ndarray
 ) -> None:
-    """Draws hits (m,) over what is there, in place: each pixel keeps the highest value and its owner.
+    """Draw hits into images in place: each pixel keeps the highest value and its owner.
 
-    Of equal values the last one wins, and any of them over what was there.
+    Among equal values of the hits, the last hit wins. A hit also wins over an equal value that the image already holds.
+
+    Args:
+        pixel: (m,) flat pixel index of each hit.
+        owner: (m,) value to write to `winner`.
+        value: (m,) height or depth of each hit.
+        height: (pixels,) highest value so far; changed in place.
+        winner: (pixels,) owner of the highest value; changed in place.
     """
     np.maximum.at(height, pixel, value)
     wins = value == height.take(pixel)
@@ -88,12 +125,19 @@ def fill_triangles(
 def cast_rays_down(
     triangles_m: np.ndarray, grid: Grid, layer: np.ndarray | None = None, num_layers: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Highest hit of a vertical ray through each pixel centre, per layer.
+    """Find the highest hit of the vertical ray through each pixel centre, per layer.
 
-    triangles_m (t, 3, 3): corners (x, y, z) in the grid's frame; layer (t,): which of num_layers each belongs to.
-    Returns height_m (num_layers, H, W) float64, -inf where nothing is hit, and triangle (num_layers, H, W) int64,
-    the index of the triangle hit, -1 for none. Of equal heights the last triangle wins. Vertical triangles cast no
-    shadow and are skipped.
+    Among equal heights, the last triangle wins. Vertical triangles have no area seen from above and are skipped.
+
+    Args:
+        triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
+        grid: Pixel grid.
+        layer: (t,) layer of each triangle, in 0 .. num_layers - 1 (default: 0).
+        num_layers: Number of layers.
+
+    Returns:
+        height_m (num_layers, H, W) float64, -inf without a hit. triangle (num_layers, H, W) int64: index of the
+        triangle, -1 without a hit.
     """
     pixel, triangle, value = find_hits(triangles_m, grid, np.arange(len(triangles_m)))
     if layer is not None:
@@ -105,7 +149,17 @@ def cast_rays_down(
 
 
 def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
-    """(num_layers, H, W) float32 of `cast_rays_down`: the heights alone, in half the memory and less time."""
+    """Return only the heights of `cast_rays_down`, in half the memory and less time.
+
+    Args:
+        triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
+        grid: Pixel grid.
+        layer: (t,) layer of each triangle, in 0 .. num_layers - 1.
+        num_layers: Number of layers.
+
+    Returns:
+        (num_layers, H, W) float32 height (m), -inf without a hit.
+    """
     pixel, layer_start, value = find_hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
     np.maximum.at(height.reshape(-1), layer_start + pixel, value.astype(np.float32))
@@ -113,13 +167,22 @@ def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, nu
 
 
 def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """(H, W) bool: pixel centres inside a closed outline (n, 2), by the even-odd rule; any simple polygon."""
+    """Return the pixels whose centres lie inside a polygon, by the even-odd rule.
+
+    Args:
+        outline_m: (n, 2) vertices (x, y) of any simple polygon (m); the last vertex connects to the first.
+        grid: Pixel grid.
+
+    Returns:
+        (H, W) bool.
+    """
     u = (grid.front_m - outline_m[:, 0]) / grid.resolution_m - 0.5
     v = (grid.left_m - outline_m[:, 1]) / grid.resolution_m - 0.5
     u_next, v_next = np.roll(u, -1), np.roll(v, -1)
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
-    beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)  # half-open: a vertex on a row counts once
+    # The interval is half-open, so a vertex on a row counts once.
+    beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)
     row, edge = concatenate_ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])
     col = np.ceil(crossing).clip(0, grid.cols).astype(np.int64)

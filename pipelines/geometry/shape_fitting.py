@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
-FIT_M = 0.01  # a vertex this close to its box or ellipsoid belongs to it
-LIMITS_M = (1e-3, 1e3)  # of sizes
-SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij")).reshape(3, 8)  # corners of the unit box
+FIT_M = 0.01  # Maximum distance of a vertex from the fitted box or ellipsoid
+LIMITS_M = (1e-3, 1e3)  # Smallest and largest valid size
+SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij")).reshape(3, 8)  # Corners of the unit box
 
-Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]  # center_m (n, 3), rotation (n, 3, 3), size_m (n, 3); not canonical
+# center_m (n, 3), rotation (n, 3, 3), size_m (n, 3); axes in any order
+Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit boxes to edge vectors.
 
-    The longest edge of a box determines its first axis, because rounding turns a short edge most and would move the far
-    corners of a long box.
+    The longest edge determines the first axis of the box. Rounding changes the direction of a short edge most, which
+    would displace the corners of a long box.
 
     Args:
-        edges_m: (n, 3, 3); columns are the edge vectors of a box.
-        center_m: (n, 3) centres, for error messages.
+        edges_m: (n, 3, 3); columns are the edge vectors of a box (m).
+        center_m: (n, 3) centres for error messages (m).
 
     Returns:
         rotation (n, 3, 3) and size_m (n, 3).
 
     Raises:
-        ValueError: Edges are so far from square that a corner moves by more than FIT_M, or a size is beyond LIMITS_M.
+        ValueError: The edges are not perpendicular, so that a corner moves by more than FIT_M; or a size lies outside
+            LIMITS_M.
     """
     order = np.argsort(-np.linalg.norm(edges_m, axis=1), axis=1, kind="stable")[:, None, :]
     first, second, third = np.moveaxis(np.take_along_axis(edges_m, order, axis=2), 2, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):  # no edge, no direction: refused below
+    # An edge of length 0 gives NaN, which the check below rejects.
+    with np.errstate(invalid="ignore", divide="ignore"):
         u = first / np.linalg.norm(first, axis=1, keepdims=True)
         second = second - (second * u).sum(axis=1, keepdims=True) * u
         v = second / np.linalg.norm(second, axis=1, keepdims=True)
@@ -39,16 +42,25 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
     np.put_along_axis(rotation, np.broadcast_to(order, rotation.shape), np.stack([u, v, w], axis=2), axis=2)
     size_m = (rotation * edges_m).sum(axis=1)
     off_m = np.linalg.norm(edges_m - rotation * size_m[:, None], axis=1).sum(axis=1) / 2
-    _refuse(~(off_m <= FIT_M), center_m, "has no square corners: no box")
+    _refuse(~(off_m <= FIT_M), center_m, "is no box, because its corners are not square")
     _refuse_sizes(size_m, center_m)
     return rotation, size_m
 
 
 def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
-    """Fit boxes to their eight corners, (n, 8, 3), in any order.
+    """Fit boxes to their eight corners.
 
     The two shortest vectors from one corner to the others are edges. The third edge is the vector to the opposite
-    corner minus these two. Raises ValueError if eight points are not the corners of a box.
+    corner minus these two.
+
+    Args:
+        corners_m: (n, 8, 3) corners of each box in any order (m).
+
+    Returns:
+        Centre, rotation and size of each box.
+
+    Raises:
+        ValueError: Eight points are not the corners of a box.
     """
     center_m, start_m = corners_m.mean(axis=1), corners_m[:, 0]
     ways_m = corners_m[:, 1:] - start_m[:, None]
@@ -64,7 +76,17 @@ def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
 
 
 def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
-    """Fit an ellipsoid to the points of each cloud (k, 3), k >= 9. Raises ValueError if no ellipsoid fits."""
+    """Fit an ellipsoid to each point cloud.
+
+    Args:
+        clouds: Points (k, 3) of each ellipsoid, k >= 9 (m).
+
+    Returns:
+        Centre, rotation and size of each ellipsoid.
+
+    Raises:
+        ValueError: No ellipsoid fits a cloud within FIT_M.
+    """
     fits = [_fit_ellipsoid(points) for points in clouds]
     center_m, rotation, size_m = (
         np.array([fit[k] for fit in fits]).reshape(shape) for k, shape in enumerate([(-1, 3), (-1, 3, 3), (-1, 3)])
@@ -74,11 +96,13 @@ def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
 
 
 def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
-    """Fit the quadric x^T M x + 2 b^T x = 1 to the points, in coordinates in which they resemble a ball."""
+    """Fit the quadric x^T M x + 2 b^T x = 1 to points, in coordinates where the points have equal spread along each
+    axis.
+    """
     mean_m = points_m.mean(axis=0)
     _, spread, axes = np.linalg.svd(points_m - mean_m, full_matrices=False)
     if not spread[-1] > 1e-9 * spread[0]:
-        raise _make_refusal(mean_m, "is flat: no ellipsoid")
+        raise _make_refusal(mean_m, "is flat and therefore no ellipsoid")
     world_from_local = axes.T * (spread / np.sqrt(len(points_m) / 3))
     local = np.linalg.solve(world_from_local, (points_m - mean_m).T).T
     x, y, z = local.T
@@ -93,7 +117,7 @@ def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
         square_m2, rotation = np.linalg.eigh(scatter_m2)
         if np.abs(beyond).max() * np.sqrt(square_m2.mean()) <= FIT_M:
             return mean_m + world_from_local @ center, rotation, 2 * np.sqrt(square_m2)
-    raise _make_refusal(mean_m, f"has {len(points_m)} vertices that lie neither on a box nor an ellipsoid")
+    raise _make_refusal(mean_m, f"has {len(points_m)} vertices that lie neither on a box nor on an ellipsoid")
 
 
 def _refuse_sizes(size_m: np.ndarray, center_m: np.ndarray) -> None:
@@ -107,7 +131,7 @@ def _refuse(bad: np.ndarray, center_m: np.ndarray, what: str) -> None:
 
 
 def _make_refusal(center_m: np.ndarray, what: str, count: int = 1) -> ValueError:
-    """The error for the piece at center_m (3,), one of `count` with the same defect."""
+    """Return the error for the piece at center_m (3,), one of `count` pieces with the same defect."""
     x, y, z = center_m
     return ValueError(
         f"the piece at x {x:.2f}, y {y:.2f}, z {z:.2f} m {what} ({count} such pieces); export primitives as"

@@ -1,18 +1,18 @@
-"""Scenes as semantic voxels: the form in which layouts of any kind compare (paper, Sec. 4.1 Metrics, Tab. 1).
+"""Convert scenes to semantic voxels, in which layouts of any method are comparable (paper, Sec. 4.1 Metrics, Tab. 1).
 
-The class of a voxel, defined here and nowhere else:
+Only this module defines the class of a voxel:
 
-* A primitive fills a voxel if the voxel's centre lies in it: exact for boxes and ellipsoids at any rotation, the
-  boundary (EDGE_M) included. Of several primitives the one of the finer category wins (PRECEDENCE); the order of
-  primitives never matters.
-* Ground is one voxel per column: the one that the fused surface (`Scene.surface`) passes through under the column's
-  centre, unless a primitive fills it.
-* All else is EMPTY. Class ids are the palette's.
+* A primitive fills a voxel if it contains the centre of the voxel. The test is exact for rotated boxes and ellipsoids
+  and includes the boundary (EDGE_M). Of several primitives, the finer category wins (PRECEDENCE). The order of
+  primitives has no effect.
+* Ground fills one voxel per column: the voxel at the height of the fused surface (`Scene.surface`) under the centre of
+  the column. Primitives take precedence over ground.
+* All other voxels are EMPTY. Class ids are those of the palette.
 
-The paper leaves open: range in z, thickness of the ground and which of overlapping primitives counts.
+The paper does not define the range in z, the thickness of the ground, or the precedence of overlapping primitives.
 
-A column of voxels is one integer with a bit per level, and a primitive meets a column in one run of levels, so a
-scene is a few hundred thousand runs and not millions of voxels.
+A column of voxels is one integer with one bit per level. A primitive meets a column in one run of levels. A scene
+therefore consists of a few hundred thousand runs instead of millions of voxels.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
 from pipelines.geometry.rasterize import concatenate_ranges
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
-# Fine before coarse: a sign in a crown stays a sign, a hedge in a building is the building's.
+# Fine categories come before coarse ones. A traffic sign inside a tree crown is kept, and a hedge inside a building is
+# not.
 PRECEDENCE = (
     "human",
     "two_wheelers",
@@ -41,21 +42,28 @@ PRECEDENCE = (
     "vegetation_cuboid",
     "construction_big",
 )
-EDGE_M = 1e-9  # a centre this close to a primitive's boundary is inside
-LEVEL_AXIS = 1e-12  # |z| of an axis that counts as horizontal
+EDGE_M = 1e-9  # A voxel centre this close to the boundary of a primitive counts as inside.
+LEVEL_AXIS = 1e-12  # An axis with a smaller |z| counts as horizontal.
 NUM_CLASSES = len(CLASS_COLORS)
 CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
-MAX_LEVELS = 64  # bits of a column
-PART_COLUMNS = 2**20  # at a time: 100 MB
+MAX_LEVELS = 64  # Number of bits in the integer of a column
+PART_COLUMNS = 2**20  # Number of columns that are processed together, which takes 100 MB.
 
 assert sorted(PRECEDENCE) == sorted(CATEGORIES) and EMPTY == 0
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Voxels over a grid's pixels: `levels` of equal height from bottom_m to top_m. The paper's 256 x 256 x 32.
+    """Voxels over the pixels of a grid: `levels` of equal height between bottom_m and top_m.
 
-    The paper leaves open: the range in z. Voxels are cubes of 0.25 m by default.
+    By default, the grid has the paper's 256 x 256 x 32 voxels, and voxels are cubes of 0.25 m. The paper does not
+    define the range in z.
+
+    Attributes:
+        columns: Horizontal grid; one column of voxels per pixel.
+        bottom_m: Lower end of the range in z, in the scene frame (m).
+        top_m: Upper end of the range in z, in the scene frame (m).
+        levels: Number of levels, at most 64.
     """
 
     columns: Grid = field(default_factory=Grid)
@@ -71,21 +79,31 @@ class VoxelGrid:
 
     @property
     def step_m(self) -> float:
+        """Height of a voxel (m)."""
         return (self.top_m - self.bottom_m) / self.levels
 
     @property
     def shape(self) -> tuple[int, int, int]:
+        """Number of rows, columns and levels."""
         return self.columns.rows, self.columns.cols, self.levels
 
     def z_m(self) -> np.ndarray:
-        """(levels,) z of the voxel centres, ascending."""
+        """Return the z of the voxel centres (levels,), ascending, in the scene frame (m)."""
         return self.bottom_m + (np.arange(self.levels) + 0.5) * self.step_m
 
 
 def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
-    """(rows, cols, levels) uint8 class ids: rows and columns as in the rasters, levels upwards."""
+    """Convert a scene to voxels.
+
+    Args:
+        scene: Scene.
+        voxels: Voxel grid in the scene frame.
+
+    Returns:
+        (rows, cols, levels) uint8 class ids. Rows and columns have the order of the rasters; levels ascend.
+    """
     rows, cols, levels = voxels.shape
-    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # the bits below level k
+    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # entry k has the bits of all levels below k
     place = np.empty(len(CATEGORIES), np.int64)
     place[[CATEGORY_INDEX[name] for name in PRECEDENCE]] = np.arange(len(PRECEDENCE))
     filled = np.zeros((len(PRECEDENCE), rows * cols), np.uint64)
@@ -95,7 +113,7 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
             layer = (place * rows * cols)[part.category].take(runs.primitive)
             np.bitwise_or.at(filled.reshape(-1), layer + runs.column, below.take(beyond) & ~below.take(first))
 
-    planes = np.zeros((CLASS_BITS, rows * cols), np.uint64)  # bit b of every voxel's class id
+    planes = np.zeros((CLASS_BITS, rows * cols), np.uint64)  # Plane b holds bit b of the class id of every voxel.
     taken = np.zeros(rows * cols, np.uint64)
     for column, name in zip(filled, PRECEDENCE, strict=True):
         _set_class(planes, column & ~taken, int(CATEGORY_IDS[CATEGORY_INDEX[name]]))
@@ -109,7 +127,10 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 
 def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | int) -> None:
-    """Give the voxels of `column` (columns,), empty so far, their class id: one for all, or one per column."""
+    """Write a class id to the empty voxels in `column` (columns,).
+
+    The class id is one number for all columns, or one number per column.
+    """
     for bit, plane in enumerate(planes):
         has_bit = (class_id >> bit) & 1
         if isinstance(has_bit, np.ndarray):
@@ -119,7 +140,7 @@ def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | in
 
 
 def _unpack_grid(planes: np.ndarray, levels: int) -> np.ndarray:
-    """(columns, levels) uint8 from bit planes (bits, columns)."""
+    """Return (columns, levels) uint8 class ids from bit planes (bits, columns)."""
     out = np.zeros((planes.shape[1], levels), np.uint8)
     for bit, plane in enumerate(planes):
         octets = plane.astype("<u8").view(np.uint8).reshape(-1, 8)[:, : -(-levels // 8)]
@@ -128,14 +149,17 @@ def _unpack_grid(planes: np.ndarray, levels: int) -> np.ndarray:
 
 
 def _find_levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """First level with its centre in [low, high] and the one beyond the last; equal where there is none."""
+    """Return the first level with its centre in [low, high] and the level after the last; equal if there is none."""
     first = np.ceil((low_m - EDGE_M - voxels.bottom_m) / voxels.step_m - 0.5).clip(0, voxels.levels)
     beyond = np.floor((high_m + EDGE_M - voxels.bottom_m) / voxels.step_m + 0.5).clip(0, voxels.levels)
     return first.astype(np.int8), np.maximum(first, beyond).astype(np.int8)
 
 
 def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """(columns,) height of the fused surface under each column's centre, NaN where there is none, and its class id."""
+    """Return the height of the fused surface under each column's centre (columns,) and its class id.
+
+    The height is NaN where the scene has no ground.
+    """
     grid = voxels.columns
     row, col = scene.grid.pixel(grid.x_m(), grid.y_m())
     within = ((row >= 0) & (row < scene.grid.rows))[:, None] & ((col >= 0) & (col < scene.grid.cols))
@@ -149,16 +173,19 @@ def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.nd
 
 
 class _Runs(NamedTuple):
-    """What vertical lines through the columns' centres have in common with primitives; m runs."""
+    """Intersections of m vertical lines through column centres with primitives."""
 
-    column: np.ndarray  # (m,) flat index
-    primitive: np.ndarray  # (m,) index into the scene
-    low_m: np.ndarray  # (m,) z of the ends; by rounding the low one may lie above the high one
-    high_m: np.ndarray  # (m,)
+    column: np.ndarray  # (m,) flat index of the column
+    primitive: np.ndarray  # (m,) index of the primitive in the scene
+    low_m: np.ndarray  # (m,) z of the lower end; rounding errors can place it above high_m
+    high_m: np.ndarray  # (m,) z of the upper end
 
 
 def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
-    """The scene in parts of about PART_COLUMNS columns under primitives: what an untrained model says is large."""
+    """Yield the scene in parts that cover about PART_COLUMNS columns.
+
+    The parts limit the memory, because an untrained model predicts large primitives.
+    """
     step_m = voxels.columns.resolution_m
     shadow_px = (np.abs(scene.rotation[:, :2]) @ scene.size_m[:, :, None])[..., 0] / step_m + 1
     columns = np.minimum(shadow_px.prod(axis=1, dtype=np.float64), voxels.columns.rows * voxels.columns.cols)
@@ -170,9 +197,9 @@ def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
 def _list_pixels(
     middle_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, first_m: float, step_m: float, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels along an axis whose centres lie in [middle + low, middle + high], and the index of the interval of each.
+    """Return pixels along an axis with centres in [middle + low, middle + high], and the interval index of each pixel.
 
-    Pixels count against the axis: their centres lie at first_m - (pixel + .5) step_m.
+    Pixel numbers increase against the axis: the centre of a pixel lies at first_m - (pixel + .5) step_m.
     """
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
@@ -182,11 +209,12 @@ def _list_pixels(
 
 
 def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
-    """Runs of all boxes: over a column of its shadow, a box is what its three slabs have in common."""
+    """Compute the runs of all boxes: in a column, a box is the intersection of its three slabs."""
     grid, chosen = voxels.columns, np.flatnonzero(scene.category != ELLIPSOID)
     center_m, rotation = scene.center_m[chosen].astype(np.float64), scene.rotation[chosen].astype(np.float64)
     half_m = scene.size_m[chosen].astype(np.float64) / 2
-    edges_m = np.swapaxes(rotation[:, :2] * half_m[:, None], 1, 2)  # (n, 3, 2): half edges seen from above
+    # (n, 3, 2): half edges, projected to the ground plane
+    edges_m = np.swapaxes(rotation[:, :2] * half_m[:, None], 1, 2)
     reach_m = np.abs(edges_m[:, :, 0]).sum(axis=1)
 
     row, box = _list_pixels(center_m[:, 0], -reach_m, reach_m, grid.front_m, grid.resolution_m, grid.rows)
@@ -195,8 +223,8 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     col, span = _list_pixels(center_m[box, 1], low_m, high_m, grid.left_m, grid.resolution_m, grid.cols)
     dy = grid.y_m()[col] - center_m[box, 1].take(span)
 
-    # Slab j holds z within center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j|. Where R_2j is 0, it says no more
-    # than the shadow.
+    # Slab j covers z within center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j|. If R_2j is 0, the slab adds no limit
+    # to the vertical projection of the box.
     leans = np.abs(rotation[:, 2]) > LEVEL_AXIS
     inverse = np.where(leans, 1.0, 0.0) / np.where(leans, rotation[:, 2], 1.0)
     reach_m = np.where(leans, half_m * np.abs(inverse), np.inf)
@@ -211,18 +239,19 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 
 def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends in y of the shadow of box[i] at dx_m[i] from its centre, (m,) both, relative to the centre.
+    """Return the y range of the vertical projection of box[i] at dx_m[i] from its centre, (m,) both.
 
-    The shadow of a box with half edges (n, 3, 2) is a hexagon that is its own mirror image in the centre. Its upper
-    side starts at the rearmost corner and walks along the three edges, steepest first.
+    The result is relative to the centre. The projection of a box with half edges (n, 3, 2) is a hexagon that is
+    point-symmetric about the centre. Its upper side starts at the rearmost corner and follows the three edges, the
+    steepest first.
     """
     backward = (edges_m[..., 0] < 0) | ((edges_m[..., 0] == 0) & (edges_m[..., 1] < 0))
     edges_m = np.where(backward[..., None], -edges_m, edges_m)
     steepest_first = np.argsort(-np.arctan2(edges_m[..., 1], edges_m[..., 0]), axis=1)
-    x, y = np.moveaxis(np.take_along_axis(edges_m, steepest_first[..., None], axis=1), -1, 0)  # (n, 3) each
+    x, y = np.moveaxis(np.take_along_axis(edges_m, steepest_first[..., None], axis=1), -1, 0)  # each is (n, 3)
     start = 2 * (np.cumsum(x, axis=1) - x) - x.sum(axis=1, keepdims=True)
     start, step, y = start[box], np.where(x > 0, 2 * x, 1)[box], y[box]
-    upright = (x == 0)[box]  # walked in full wherever the walk begins
+    upright = (x == 0)[box]  # An edge without extent in x always counts in full.
 
     def upper(dx: np.ndarray) -> np.ndarray:
         walked = np.where(upright, 1.0, ((dx[:, None] - start) / step).clip(0, 1))
@@ -232,10 +261,11 @@ def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) 
 
 
 def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
-    """Runs of all ellipsoids.
+    """Compute the runs of all ellipsoids.
 
-    With L the Cholesky factor of R diag(size / 2)^2 R^T an ellipsoid is center + L s, |s| <= 1. L is lower triangular:
-    x gives the first entry of s, y then the second, and the third goes from one root to the other.
+    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| <= 1. L is
+    lower triangular. Therefore x determines the first entry of s, and y then determines the second. The third entry
+    lies between the two roots.
     """
     grid, chosen = voxels.columns, np.flatnonzero((scene.category == ELLIPSOID) & (scene.size_m > 0).all(axis=1))
     center_m = scene.center_m[chosen].astype(np.float64)
@@ -261,23 +291,35 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 @dataclass(frozen=True)
 class OutsideCounts:
-    """What lies above or below a voxel grid, in counts that add up over scenes."""
+    """Counts of ground and primitives above or below a voxel grid; counts of several scenes add up.
 
-    ground: np.ndarray  # (2,) int64: pixels with ground, of these the ones outside
-    objects: (
-        np.ndarray
-    )  # (11, 3) int64: primitives per category, of these those partly or wholly and those wholly outside
+    Attributes:
+        ground: (2,) int64: number of columns with ground, and number of these whose ground lies outside.
+        objects: (11, 3) int64: per category, the number of primitives, of those partly or wholly outside, and of those
+            wholly outside.
+    """
+
+    ground: np.ndarray
+    objects: np.ndarray
 
     def __add__(self, other: OutsideCounts) -> OutsideCounts:
         return OutsideCounts(self.ground + other.ground, self.objects + other.objects)
 
 
 def count_outside(scene: Scene, voxels: VoxelGrid) -> OutsideCounts:
-    """Columns with ground and primitives of one scene beyond the range in z."""
+    """Count columns with ground, and primitives, that lie outside the range in z.
+
+    Args:
+        scene: Scene.
+        voxels: Voxel grid in the scene frame.
+
+    Returns:
+        The counts of one scene.
+    """
     surface_m, _ = _voxelize_ground(scene, voxels)
     known = np.isfinite(surface_m)
     beyond = known & ((surface_m < voxels.bottom_m) | (surface_m >= voxels.top_m))
-    half_m = np.abs(scene.rotation[:, 2]).astype(np.float64) * scene.size_m / 2  # of each axis along z
+    half_m = np.abs(scene.rotation[:, 2]).astype(np.float64) * scene.size_m / 2  # Extent of each half axis along z
     reach_m = np.where(scene.category == ELLIPSOID, np.sqrt((half_m**2).sum(axis=1)), half_m.sum(axis=1))
     low_m, high_m = scene.center_m[:, 2] - reach_m, scene.center_m[:, 2] + reach_m
     partly = (low_m < voxels.bottom_m) | (high_m > voxels.top_m)
