@@ -1,10 +1,13 @@
-"""Primitives read off the latent cells they were scattered to: an object decoder without queries.
+"""An object decoder without queries: each latent cell proposes the primitives in and around itself.
 
-Differs from the paper, whose DETR decoder searches the whole latent for every query. The encoder puts a primitive into
-the cell under its centre, so that cell already knows it: here every cell proposes a few primitives per category,
-with centres in and around itself. Same latent, same outputs, same losses; matching counts distance in cells and lets
-existence decide only between proposals of about the same place, or the surest cell would be trained on everybody's
-primitive.
+Differs from the paper, whose DETR decoder searches the whole latent for every query. The encoder writes a primitive
+into
+the cell under its centre, so this cell has the information about it. Here each cell therefore makes a few proposals per
+category.
+
+The latent, the outputs and the losses are those of the paper. Matching measures distances in cells. Existence
+probabilities decide only between proposals at almost the same position. Otherwise the cell with the highest existence
+probability would be trained on primitives of all other cells.
 """
 
 from __future__ import annotations
@@ -21,15 +24,17 @@ from models.vae.matching import MatchWeights
 
 REACH_CELLS = 0.5  # how far outside its cell a proposal's centre may lie
 MAX_PER_CELL = 4
-SPARE = 16  # proposals per slot, where MAX_PER_CELL allows them: primitives crowd
+SPARE = 16  # proposals per slot, if MAX_PER_CELL allows it: many primitives can lie in one cell
 
 
 class CellDecoder(nn.Module):
-    """Object latent -> normalised features in [0, 1] and existence logits of `proposals[k]` primitives per category.
+    """Decode an object latent to features and existence logits of `proposals[k]` primitives per category k.
 
-    SPARE times as many proposals as slots where cells allow it, `min_proposals_per_cell` to MAX_PER_CELL per cell and
-    category: rare things, too, come in groups. Cells are read one by one, by the same small network: its neighbours
-    know nothing of a primitive that the cell does not.
+    Features are normalised to [0, 1]. There are SPARE proposals per slot, within the limits of `min_proposals_per_cell`
+    and
+    MAX_PER_CELL proposals per cell and category. The minimum exists because rare objects also occur in groups. One
+    small
+    network decodes each cell separately, because the encoder writes a primitive into one cell only.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:
@@ -48,7 +53,7 @@ class CellDecoder(nn.Module):
             nn.Linear(hidden, hidden),
         )
         self.head = nn.Linear(hidden, sum(self.per_cell) * (1 + FEATURES))
-        # Normalised (x, y) of each cell's middle, row-major: row 0 is farthest ahead, column 0 leftmost.
+        # Normalised (x, y) of each cell's centre, row-major: row 0 is farthest ahead, column 0 is leftmost.
         middle = 1 - (torch.arange(latent_size, dtype=torch.float32) + 0.5) / latent_size
         self.register_buffer("middle", torch.cartesian_prod(middle, middle)[:, None], persistent=False)
         self.reach = (1 + 2 * REACH_CELLS) / latent_size
@@ -56,16 +61,29 @@ class CellDecoder(nn.Module):
     def forward(
         self, latent: Float[Tensor, "batch c h w"]
     ) -> tuple[Float[Tensor, "batch n 9"], Float[Tensor, "batch n"]]:
+        """Decode object latents.
+
+        Args:
+            latent: Object latents.
+
+        Returns:
+            Normalised features and existence logits; proposals are ordered by category.
+        """
         cells = latent.flatten(2).transpose(1, 2)
         out = self.head(self.net(cells)).unflatten(2, (-1, 1 + FEATURES))  # (b, cells, k, 10)
         values = out[..., 1:].sigmoid()
         center_xy = (self.middle + (values[..., :2] - 0.5) * self.reach).clamp(0, 1)
         features = torch.cat([center_xy, values[..., 2:]], dim=-1)  # (b, cells, k, 9)
-        # (b, k, cells) in this order: category by category, since k is.
+        # Order (b, k, cells): k is ordered by category, so the proposals are, too.
         return features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1)
 
     def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
-        """Set the last bias: the middle of the cell, mean height and shape per category, existence by `count`."""
+        """Set the output biases: cell centres, mean height and shape per category, and mean existence.
+
+        Args:
+            feature_logit: Logit of the mean normalised features per category.
+            count: Mean number of primitives per scene and category.
+        """
         existence = (count / count.new_tensor(self.proposals)).clamp(0.001, 0.99).logit()
         bias = torch.cat([existence[:, None], torch.zeros_like(feature_logit[:, :2]), feature_logit[:, 2:]], dim=1)
         self.head.bias.copy_(bias.repeat_interleave(torch.tensor(self.per_cell), dim=0).flatten())

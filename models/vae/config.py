@@ -1,4 +1,4 @@
-"""Options of the layout VAE's two branches; no torch, so that presets can be read without it."""
+"""Options of the layout VAE's two branches. This module does not import torch, because presets.py uses it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ Branches = Literal["both", "ground", "objects"]
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """Ground branch: a convolutional autoencoder of raster maps (models/vae/ground.py).
+    """Options of the ground branch: a convolutional autoencoder of rasters (models/vae/ground.py).
 
-    Args:
-        channels: Width of each block; all blocks but the last halve the resolution. Four blocks give the paper's
-            factor 8.
-        norm_groups: Groups of each group normalisation.
-        pixel_unshuffle: Side of the pixel blocks that become channels first; 1 in the paper, none.
-        attention: Self-attention over all cells in the middle of both networks, as in the paper.
+    Attributes:
+        channels: Number of channels of each block. All blocks but the last halve the resolution. Four blocks give the
+            paper's factor of 8.
+        norm_groups: Number of groups of each group normalisation.
+        pixel_unshuffle: Side of the pixel blocks that pixel unshuffle converts to channels before the first
+            convolution.
+            1 means none, as in the paper.
+        attention: Self-attention over all cells in the middle block of encoder and decoder, as in the paper.
     """
 
     channels: tuple[int, ...] = (64, 128, 256, 512)
@@ -28,19 +30,22 @@ class GroundConfig:
 
     @property
     def cell_px(self) -> int:
-        """Side of a latent cell in raster pixels."""
+        """Side of a latent cell in pixels."""
         return self.pixel_unshuffle * 2 ** (len(self.channels) - 1)
 
 
 @dataclass(frozen=True)
 class ObjectConfig:
-    """Object branch: a transformer encoder (models/vae/objects.py) and one of two decoders.
+    """Options of the object branch: a transformer encoder (models/vae/objects.py) and one of two decoders.
 
-    Args:
-        width, layers, heads, hidden: Of the transformer; `hidden` is the width of its feed-forward networks.
+    Attributes:
+        width: Width of the transformer tokens.
+        layers: Number of transformer layers.
+        heads: Number of attention heads.
+        hidden: Width of the feed-forward networks of the transformer.
         head_hidden: Width of the output networks.
-        decoder: "detr", the paper's, or "cells" (models/vae/cell_decoder.py).
-        min_proposals_per_cell: With "cells", the least number of proposals of each category in each cell.
+        decoder: "detr", the paper's decoder, or "cells" (models/vae/cell_decoder.py).
+        min_proposals_per_cell: Minimum number of proposals per category and cell, for the decoder "cells".
     """
 
     width: int = 512
@@ -54,14 +59,17 @@ class ObjectConfig:
 
 @dataclass(frozen=True)
 class LayoutVAEConfig:
-    """Architecture of a `LayoutVAE` apart from its layout.
+    """Architecture of a `LayoutVAE`, except its layout.
 
-    Args:
-        latent_channels: Channels of the latent per branch.
-        ground, objects: Options of the branches.
-        shortcut: Linear maps past the ground networks and a small network past the object encoder; not in the paper.
-        split_latent: Each decoder reads its own half of the latent's channels, as in the paper; without, both read all.
-        branches: The branches that exist. An ablation of the paper has one of them.
+    Attributes:
+        latent_channels: Number of latent channels per branch.
+        ground: Options of the ground branch.
+        objects: Options of the object branch.
+        shortcut: Add linear maps parallel to the ground networks and a small network parallel to the object encoder.
+            The
+            paper has none.
+        split_latent: Each decoder reads its own half of the latent channels, as in the paper. If False, both read all.
+        branches: "both", or the only branch of an ablation model.
     """
 
     latent_channels: int = 32
@@ -72,7 +80,7 @@ class LayoutVAEConfig:
     branches: Branches = "both"
 
 
-# Entries of configs that versions before 0.2 wrote, flat -> branch and name.
+# Config entries of versions before 0.2: flat name -> branch and current name.
 _FLAT_NAMES = {
     **{name: ("ground", name) for name in ("channels", "norm_groups", "attention")},
     "fold": ("ground", "pixel_unshuffle"),
@@ -82,7 +90,14 @@ _FLAT_NAMES = {
 
 
 def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
-    """Options of `LayoutVAE` with those of its branches nested, from a flat config or one that is nested already."""
+    """Nest the options of the branches under `ground` and `objects`.
+
+    Args:
+        config: Stored config. Versions before 0.2 wrote a flat one; a nested config is accepted, too.
+
+    Returns:
+        Options of `LayoutVAE`, with one dictionary per branch.
+    """
     nested: dict[str, Any] = {}
     for name, value in config.items():
         if name in _FLAT_NAMES:
@@ -94,7 +109,13 @@ def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_options(config: dict[str, Any]) -> dict[str, Any]:
-    """Keyword arguments of `LayoutVAE` from a stored config, nested or flat.
+    """Convert a stored config, nested or flat, to keyword arguments of `LayoutVAE`.
+
+    Args:
+        config: Stored config.
+
+    Returns:
+        Keyword arguments with one dataclass per branch.
 
     Raises:
         ValueError: An option of a branch is unknown.
@@ -111,7 +132,15 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def override_options(options: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
-    """Keyword arguments of `LayoutVAE` with changes; a mapping changes entries of a branch's dataclass."""
+    """Return keyword arguments of `LayoutVAE` with changes.
+
+    Args:
+        options: Keyword arguments of `LayoutVAE`.
+        changes: New values by name. A mapping replaces fields of the dataclass of a branch.
+
+    Returns:
+        The changed keyword arguments.
+    """
     return dict(options) | {
         name: replace(options[name], **value) if isinstance(value, Mapping) else value
         for name, value in changes.items()

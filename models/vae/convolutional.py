@@ -1,8 +1,9 @@
 """Convolutional encoder and decoder of image autoencoders (Rombach et al., 2022), for the ground branch.
 
-Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`, and outputs agree to
-the last bit (tests/unit/test_convolutional.py). They stand here because importing diffusers costs each process two to
-three seconds.
+Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`. Outputs equal those
+of
+diffusers bit for bit (tests/unit/test_convolutional.py). This module replaces diffusers because its import costs each
+process two to three seconds.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-EPSILON = 1e-6  # of every group normalisation
+EPSILON = 1e-6  # for every group normalisation
 
 
 class ResnetBlock(nn.Module):
-    """Two normalised 3 x 3 convolutions next to a skip connection, which is 1 x 1 if the number of channels changes."""
+    """Two normalised 3 x 3 convolutions with a skip connection.
+
+    The skip connection is a 1 x 1 convolution if the number of channels changes.
+    """
 
     def __init__(self, in_channels: int, out_channels: int, norm_groups: int) -> None:
         super().__init__()
@@ -28,10 +32,18 @@ class ResnetBlock(nn.Module):
         self.conv_shortcut = nn.Conv2d(in_channels, out_channels, 1) if in_channels != out_channels else None
 
     def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h w"]:
+        """Apply the block.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of the same resolution.
+        """
         y = self.conv1(F.silu(self.norm1(x)))
         y = self.conv2(F.silu(self.norm2(y)))
         if self.conv_shortcut is not None:
-            x = self.conv_shortcut(x.contiguous() if self.training else x)  # DDP expects the strides of a dense input
+            x = self.conv_shortcut(x.contiguous() if self.training else x)  # DDP needs dense strides
         return x + y
 
 
@@ -47,6 +59,14 @@ class CellAttention(nn.Module):
         self.to_out = nn.ModuleList([nn.Linear(channels, channels)])
 
     def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h w"]:
+        """Apply attention over all cells.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of the same shape.
+        """
         cells = self.group_norm(x.flatten(2)).transpose(1, 2)
         query, key, value = (layer(cells)[:, None] for layer in (self.to_q, self.to_k, self.to_v))
         attended = F.scaled_dot_product_attention(query, key, value)[:, 0]
@@ -54,29 +74,45 @@ class CellAttention(nn.Module):
 
 
 class Downsample(nn.Module):
-    """Halve the resolution: a 3 x 3 convolution of stride 2, padded below and to the right."""
+    """Halve the resolution with a 3 x 3 convolution of stride 2, padded at the bottom and the right."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.conv = nn.Conv2d(channels, channels, 3, stride=2)
 
     def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h2 w2"]:
+        """Halve the resolution.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of half the resolution.
+        """
         return self.conv(F.pad(x, (0, 1, 0, 1)))
 
 
 class Upsample(nn.Module):
-    """Double the resolution: nearest neighbours, then a 3 x 3 convolution."""
+    """Double the resolution by nearest neighbour, then apply a 3 x 3 convolution."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.conv = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h2 w2"]:
+        """Double the resolution.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of twice the resolution.
+        """
         return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
 
 
 class DownBlock(nn.Module):
-    """One residual block, then a `Downsample` unless it is the last block."""
+    """One residual block, followed by a `Downsample` unless it is the last block."""
 
     def __init__(self, in_channels: int, out_channels: int, norm_groups: int, last: bool) -> None:
         super().__init__()
@@ -84,13 +120,21 @@ class DownBlock(nn.Module):
         self.downsamplers = nn.ModuleList([] if last else [Downsample(out_channels)])
 
     def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h2 w2"]:
+        """Apply the block.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of half the resolution, or of the same resolution for the last block.
+        """
         for layer in (*self.resnets, *self.downsamplers):
             x = layer(x)
         return x
 
 
 class UpBlock(nn.Module):
-    """Two residual blocks, then an `Upsample` unless it is the last block."""
+    """Two residual blocks, followed by an `Upsample` unless it is the last block."""
 
     def __init__(self, in_channels: int, out_channels: int, norm_groups: int, last: bool) -> None:
         super().__init__()
@@ -98,13 +142,21 @@ class UpBlock(nn.Module):
         self.upsamplers = nn.ModuleList([] if last else [Upsample(out_channels)])
 
     def forward(self, x: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 h2 w2"]:
+        """Apply the block.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of twice the resolution, or of the same resolution for the last block.
+        """
         for layer in (*self.resnets, *self.upsamplers):
             x = layer(x)
         return x
 
 
 class MidBlock(nn.Module):
-    """Two residual blocks with attention between them, if there is any."""
+    """Two residual blocks with optional attention between them."""
 
     def __init__(self, channels: int, norm_groups: int, attention: bool) -> None:
         super().__init__()
@@ -113,6 +165,14 @@ class MidBlock(nn.Module):
         self.resnets = nn.ModuleList([first, ResnetBlock(channels, channels, norm_groups)])
 
     def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h w"]:
+        """Apply the block.
+
+        Args:
+            x: Feature map.
+
+        Returns:
+            Feature map of the same shape.
+        """
         first, second = self.resnets
         for layer in (first, *self.attentions, second):
             x = layer(x)
@@ -120,7 +180,7 @@ class MidBlock(nn.Module):
 
 
 class ConvolutionalEncoder(nn.Module):
-    """Maps (batch, in_channels, H, W) -> (batch, out_channels, h, w); all blocks but the last halve the resolution."""
+    """Encode maps (batch, in_channels, H, W); all blocks but the last halve the resolution."""
 
     def __init__(
         self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
@@ -136,6 +196,14 @@ class ConvolutionalEncoder(nn.Module):
         self.conv_out = nn.Conv2d(channels[-1], out_channels, 3, padding=1)
 
     def forward(self, maps: Float[Tensor, "batch c1 rows cols"]) -> Float[Tensor, "batch c2 h w"]:
+        """Encode maps.
+
+        Args:
+            maps: Input maps.
+
+        Returns:
+            (batch, out_channels, h, w) features.
+        """
         x = self.conv_in(maps)
         for block in self.down_blocks:
             x = block(x)
@@ -143,7 +211,7 @@ class ConvolutionalEncoder(nn.Module):
 
 
 class ConvolutionalDecoder(nn.Module):
-    """Maps (batch, in_channels, h, w) -> (batch, out_channels, H, W); all blocks but the last double the resolution."""
+    """Decode latents (batch, in_channels, h, w); all blocks but the last double the resolution."""
 
     def __init__(
         self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
@@ -151,9 +219,8 @@ class ConvolutionalDecoder(nn.Module):
         super().__init__()
         upward = tuple(reversed(channels))
         self.conv_in = nn.Conv2d(in_channels, upward[0], 3, padding=1)
-        self.up_blocks = (
-            nn.ModuleList()
-        )  # before the middle in the order of parameters, after it in that of random numbers
+        # diffusers registers `up_blocks` before `mid_block` but initialises them after it; this order is kept.
+        self.up_blocks = nn.ModuleList()
         self.mid_block = MidBlock(upward[0], norm_groups, attention)
         self.up_blocks.extend(
             UpBlock(before, after, norm_groups, last=k == len(upward) - 1)
@@ -163,6 +230,14 @@ class ConvolutionalDecoder(nn.Module):
         self.conv_out = nn.Conv2d(upward[-1], out_channels, 3, padding=1)
 
     def forward(self, latent: Float[Tensor, "batch c1 h w"]) -> Float[Tensor, "batch c2 rows cols"]:
+        """Decode latents.
+
+        Args:
+            latent: Input latents.
+
+        Returns:
+            (batch, out_channels, H, W) maps.
+        """
         x = self.mid_block(self.conv_in(latent))
         for block in self.up_blocks:
             x = block(x)

@@ -1,4 +1,4 @@
-"""Ground branch of the layout VAE: a convolutional autoencoder of raster maps (paper, supplement B.2)."""
+"""Ground branch of the layout VAE: a convolutional autoencoder of rasters (paper, supplement B.2)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from torch.nn import functional as F
 from models.vae.config import GroundConfig
 from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
 
-LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # of distance from the border: the linear start takes the best
-HEIGHT_WEIGHT = 10.0  # of a normalised height against a distance of half a cell, in the linear start
+# Candidates for the occupancy logit per pixel of distance from an edge; `init_from_data` selects the best one.
+LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+HEIGHT_WEIGHT = 10.0  # weight of normalised heights relative to signed distances in `init_from_data`
 
 
 class GroundEncoder(nn.Module):
-    """Raster maps [H; B] -> mean and log-variance of the ground latent, stacked along the channels.
+    """Encode rasters [H; B] to mean and log-variance of the ground latent, stacked along the channels.
 
-    With `shortcut`, the mean is the network's plus a linear map of the cell's `compute_smooth_maps`, solved in closed
-    form (`init_from_data`). Not in the paper.
+    With `shortcut`, the mean is the sum of the network's output and a linear map of each cell's `compute_smooth_maps`.
+    `init_from_data` computes this map in closed form. The paper has no shortcut.
     """
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
@@ -37,6 +38,14 @@ class GroundEncoder(nn.Module):
         self.shortcut = nn.Conv2d(2 * num_classes, latent_channels, cell, stride=cell) if shortcut else None
 
     def forward(self, maps: Float[Tensor, "batch maps rows cols"]) -> Float[Tensor, "batch moments h w"]:
+        """Encode rasters.
+
+        Args:
+            maps: Normalised heights and masks, stacked along the channels, in [0, 1].
+
+        Returns:
+            Mean and log-variance, stacked along the channels.
+        """
         moments = self.net(self.unshuffle(maps * 2 - 1))
         if self.shortcut is None:
             return moments
@@ -47,7 +56,7 @@ class GroundEncoder(nn.Module):
 
 
 class GroundDecoder(nn.Module):
-    """Ground latent -> normalised heights and occupancy logits, stacked along the channels."""
+    """Decode a ground latent to normalised heights and occupancy logits, stacked along the channels."""
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
         super().__init__()
@@ -63,6 +72,14 @@ class GroundDecoder(nn.Module):
         self.shortcut = nn.ConvTranspose2d(latent_channels, 2 * num_classes, cell, stride=cell) if shortcut else None
 
     def forward(self, latent: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch maps rows cols"]:
+        """Decode ground latents.
+
+        Args:
+            latent: Ground latents.
+
+        Returns:
+            Normalised heights and occupancy logits, stacked along the channels.
+        """
         maps = self.shuffle(self.net(latent))
         return maps if self.shortcut is None else maps + self.shortcut(latent)
 
@@ -74,12 +91,18 @@ def init_from_data(
     height: Float[Tensor, "batch ground rows cols"],
     occupied: Float[Tensor, "batch ground rows cols"],
 ) -> None:
-    """Initialise outputs to their means; with shortcuts, initialise to the best linear autoencoder.
+    """Initialise the outputs to their means, and the shortcuts to the best linear autoencoder.
 
-    The shortcuts become the principal components of a cell's `compute_smooth_maps`, scaled to unit variance, with
-    distances read as logits; the networks' outputs start at zero. On the town at 256 pixels the initial ground IoU is
-    99.4 % (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights on the objects' channels
-    become zero.
+    The shortcuts become the principal components of each cell's `compute_smooth_maps`, scaled to unit variance. Signed
+    distances are converted to logits. The outputs of the networks start at zero. On the town at 256 pixels, the initial
+    ground IoU is 99.4 % (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights for the object
+    channels become zero.
+
+    Args:
+        encoder: Encoder to initialise.
+        decoder: Decoder to initialise.
+        height: Normalised heights of training scenes.
+        occupied: Masks of training scenes, 0 or 1.
     """
     count = occupied.sum(dim=(0, 2, 3)).clamp(min=1)
     mean_height = (height * occupied).sum(dim=(0, 2, 3)) / count
@@ -92,7 +115,7 @@ def init_from_data(
     cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
     maps = _split_cells(compute_smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
     heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
-    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # in the principal components
+    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # weights for the principal components
     mean = maps.mean(dim=0)
     components, deviation = compute_principal_components((maps - mean) * weight, latent)
     encode = weight[:, None] * components / deviation
@@ -105,9 +128,10 @@ def init_from_data(
         )
         for logit in LOGITS_PER_PX
     }
+    # Scale from smooth maps to the decoder's outputs.
     unit = torch.cat(
         [heights, min(error, key=lambda logit: float(error[logit])) * compute_edge_reach_px(cell) * distances]
-    )  # of the decoder's outputs
+    )
     encoder.shortcut.weight.copy_(encode.T.reshape(latent, -1, cell, cell))
     cast(Tensor, encoder.shortcut.bias).copy_(-mean @ encode)
     decoder.shortcut.weight[:latent].copy_((decode * unit).reshape(latent, -1, cell, cell))
@@ -121,29 +145,55 @@ def init_from_data(
 def compute_smooth_maps(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch maps rows cols"]:
-    """Smooth raster maps: heights that continue where nothing is occupied, signed distances instead of 0 and 1.
+    """Compute smooth maps from rasters: heights without gaps, and signed distances instead of masks.
 
-    A border through a cell is a step in occupancy, which takes many linear components, and a plane in distance from
-    the border, which takes three. Distances are in units of `reach`, within [-1, 1].
+    Within a cell, the mask of an edge is a step, which needs many linear components. The distance from an edge is a
+    plane,
+    which needs three.
+
+    Args:
+        height: Normalised heights.
+        occupied: Masks, 0 or 1.
+        cell: Side of a latent cell in pixels.
+
+    Returns:
+        Filled heights and signed distances in [-1, 1], stacked along the channels. A distance of 1 is
+        `compute_edge_reach_px` pixels.
     """
     distance = compute_signed_distance_px(occupied > 0.5, compute_edge_reach_px(cell)) / compute_edge_reach_px(cell)
     return torch.cat([fill_heights(height, occupied, cell), distance.to(height.dtype)], dim=1)
 
 
 def compute_edge_reach_px(cell: int) -> int:
-    """Pixels from a border up to which distances are told apart: half a cell."""
+    """Return the largest distance from an edge that smooth maps represent: half a cell.
+
+    Args:
+        cell: Side of a latent cell in pixels.
+
+    Returns:
+        Distance in pixels, at least 1.
+    """
     return max(1, cell // 2)
 
 
 def compute_signed_distance_px(
     inside: Bool[Tensor, "*batch rows cols"], most: int
 ) -> Float[Tensor, "*batch rows cols"]:
-    """Euclidean distance from pixel centres to the border, positive inside, exact up to `most` pixels and cut there.
+    """Compute the Euclidean distance from pixel centres to the edge of a mask, positive inside the mask.
 
-    The border lies half a pixel before the nearest pixel of the other kind (Felzenszwalb & Huttenlocher 2012, on a
-    bounded window).
+    The edge lies half a pixel before the nearest pixel with the other value. The method is that of Felzenszwalb &
+    Huttenlocher (2012) on a bounded window.
+
+    Args:
+        inside: Masks.
+        most: Distance in pixels up to which the result is exact; larger distances are clipped.
+
+    Returns:
+        Signed distances in pixels.
     """
-    squared = torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2  # to the nearest pixel outside, inside
+    squared = (
+        torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2
+    )  # squared distance to the nearest pixel outside, inside
     for axis in (-1, -2):
         padded = F.pad(squared, (most, most, 0, 0) if axis == -1 else (0, 0, most, most), value=(most + 0.5) ** 2)
         nearest = squared
@@ -156,7 +206,7 @@ def compute_signed_distance_px(
 
 
 def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
-    """The pixels of each latent cell, (map, row, col) in C order, float64."""
+    """Return the pixels of each latent cell in the order (map, row, col), as float64."""
     pixels = F.pixel_unshuffle(maps, cell)
     return pixels.permute(0, 2, 3, 1).reshape(-1, pixels.shape[1]).double()
 
@@ -164,7 +214,18 @@ def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Floa
 def fill_heights(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch ground rows cols"]:
-    """Heights, and where nothing is occupied and so any height will do, the cell's mean or the scene's."""
+    """Fill the heights of unoccupied pixels, where any height is valid, with a mean height.
+
+    The value is the mean over the cell's occupied pixels, or the mean over the scene if the cell has none.
+
+    Args:
+        height: Normalised heights.
+        occupied: Masks, 0 or 1.
+        cell: Side of a latent cell in pixels.
+
+    Returns:
+        Normalised heights without gaps.
+    """
     total, count = (F.avg_pool2d(v.sum(dim=1, keepdim=True), cell) for v in (height * occupied, occupied))
     scene = (height * occupied).sum(dim=(1, 2, 3)) / occupied.sum(dim=(1, 2, 3)).clamp(min=1)
     mean = torch.where(count > 0, total / count.clamp(min=1e-6), scene[:, None, None, None])
@@ -175,6 +236,14 @@ def fill_heights(
 def compute_principal_components(
     centred: Float[Tensor, "n p"], count: int
 ) -> tuple[Float[Tensor, "p count"], Float[Tensor, " count"]]:
-    """The directions of largest variance, and the standard deviations along them (at least 0.01)."""
+    """Compute the directions of largest variance and the standard deviations along them.
+
+    Args:
+        centred: n samples with zero mean.
+        count: Number of directions.
+
+    Returns:
+        Directions as columns, and standard deviations, at least 0.01.
+    """
     variance, directions = torch.linalg.eigh(centred.T @ centred / len(centred))
     return directions[:, -count:], variance[-count:].clamp(min=1e-4).sqrt()

@@ -35,7 +35,16 @@ OBJECT_WEIGHTS = {
 
 @dataclass(frozen=True)
 class LVAELoss:
-    """The parts of the training objective, weighted as they enter the total."""
+    """Weighted parts of the training objective of the layout VAE.
+
+    Attributes:
+        occupancy: Occupancy loss.
+        height: Height loss.
+        existence: Existence loss.
+        center: Centre loss.
+        cholesky: Cholesky loss.
+        kl: KL loss.
+    """
 
     occupancy: Tensor
     height: Tensor
@@ -46,21 +55,40 @@ class LVAELoss:
 
     @property
     def total(self) -> Tensor:
+        """Sum of all parts."""
         return self.occupancy + self.height + self.existence + self.center + self.cholesky + self.kl
 
     def items(self) -> dict[str, Tensor]:
+        """Return the parts by name, and the total as `loss`."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__} | {"loss": self.total}
 
 
 def compute_occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]) -> Float[Tensor, ""]:
-    """Binary cross-entropy, mean over pixels, classes and batch."""
+    """Compute the binary cross-entropy of the occupancy: mean over pixels, classes and batch.
+
+    Args:
+        logit: Occupancy logits.
+        occupied: Masks, 0 or 1.
+
+    Returns:
+        Scalar loss.
+    """
     return F.binary_cross_entropy_with_logits(logit, occupied)
 
 
 def compute_height_loss(
     height: Float[Tensor, "b g h w"], truth: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]
 ) -> Float[Tensor, ""]:
-    """L1 over occupied pixels, per sample, mean over the batch."""
+    """Compute the L1 loss of the heights: mean over the occupied pixels of a sample, then over the batch.
+
+    Args:
+        height: Predicted normalised heights.
+        truth: True normalised heights.
+        occupied: True masks, 0 or 1.
+
+    Returns:
+        Scalar loss.
+    """
     total = ((height - truth).abs() * occupied).sum(dim=(1, 2, 3))
     return (total / occupied.sum(dim=(1, 2, 3)).clamp(min=1)).mean()
 
@@ -74,9 +102,23 @@ def compute_object_losses(
     spec: LayoutSpec,
     proposals: tuple[int, ...],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Existence, centre and Cholesky terms after matching, weighted (supplement Eqs. "match", "line").
+    """Compute the weighted existence, centre and Cholesky losses (supplement Eqs. "match", "line").
 
-    Sums over proposals, divided per sample and category by max(n_c, 1), summed over categories, mean over the batch.
+    Each loss is summed over the proposals of a category and divided by max(n_c, 1), where n_c is the number of
+    primitives.
+    The result is summed over categories and averaged over the batch.
+
+    Args:
+        features: Features of the proposals.
+        existence_logit: Existence logits of the proposals.
+        truth: Features of the true primitives.
+        real: True where a slot holds a primitive.
+        assignment: Slot of each proposal, -1 for padding (`match_primitives`).
+        spec: Gives categories and slots.
+        proposals: Number of proposals per category.
+
+    Returns:
+        Existence, centre and Cholesky loss.
     """
     matched = assignment >= 0
     target = truth.gather(1, assignment.clamp(min=0)[..., None].expand(-1, -1, truth.shape[-1]))
@@ -94,9 +136,15 @@ def compute_object_losses(
 
 
 def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
-    """KL to the standard normal: sum over channels and positions, mean over the batch.
+    """Compute the KL divergence to the standard normal: sum over channels and cells, mean over the batch.
 
-    The paper leaves open what happens to the positions; they are summed, as latent diffusion does.
+    The paper does not specify the reduction over cells. They are summed, as in latent diffusion.
+
+    Args:
+        posterior: Posterior of the encoders.
+
+    Returns:
+        Scalar loss.
     """
     mean, logvar = posterior.mean, posterior.logvar
     return -0.5 * (1 + logvar - mean.square() - logvar.exp()).sum(dim=(1, 2, 3)).mean()
@@ -105,7 +153,18 @@ def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
 def compute_lvae_loss(
     output: LayoutOutput, posterior: Posterior, batch: LayoutBatch, spec: LayoutSpec, kl_weight: float = KL_WEIGHT
 ) -> LVAELoss:
-    """The total objective of stage 1 and its parts; zero where the ground branch is left out."""
+    """Compute the training objective of stage 1 and its parts.
+
+    Args:
+        output: Output of the decoders.
+        posterior: Posterior of the encoders.
+        batch: True layouts.
+        spec: Gives categories and slots.
+        kl_weight: Weight of the KL loss.
+
+    Returns:
+        The weighted parts. The ground parts are 0 if the model has no ground branch.
+    """
     ground = float(output.branches != "objects")
     unit = batch.features.new_tensor(output.feature_unit)
     proposed, truth = (output.features / unit, output.existence_logit), batch.features / unit

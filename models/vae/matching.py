@@ -1,11 +1,13 @@
-"""Bipartite matching of predicted and true primitives, per category (paper, supplement Eqs. "permutation", "match").
+"""Bipartite matching of proposals and true primitives per category (paper, supplement Eqs. "permutation", "match").
 
-Only real primitives are assigned. A padded truth costs 6 BCE(0, p_j) wherever it lands, so the padded rows add a
-constant and a column cost: choosing slot j for a real primitive i changes the total by
+Only real primitives are assigned, although the paper matches the padded list. A padded slot costs 6 BCE(0, p_j) for any
+proposal j. The padded slots therefore add a constant and a cost per proposal. If proposal j is assigned to the real
+primitive i, the total changes by
 
-    6 [BCE(1, p_j) - BCE(0, p_j)] + 3 |t_i - t_j| + 3 |c_i - c_j|,    BCE(1, p) - BCE(0, p) = -logit(p),
+    6 [BCE(1, p_j) - BCE(0, p_j)] + 3 |t_i - t_j| + 3 |c_i - c_j|,    BCE(1, p) - BCE(0, p) = -logit(p).
 
-and a rectangular assignment over the n real rows is the square problem of the paper, solved exactly.
+A rectangular assignment over the n real primitives is therefore equivalent to the paper's square problem. It is solved
+exactly.
 """
 
 from __future__ import annotations
@@ -23,11 +25,17 @@ from torch import Tensor
 
 
 class NonFiniteCostError(ValueError):
-    """Predictions that are not numbers cannot be matched."""
+    """Raised when predictions are not finite, because they cannot be matched."""
 
 
 class MatchWeights(NamedTuple):
-    """Category-agnostic weights of the matching cost; the defaults are the paper's (supplement B.2)."""
+    """Weights of the matching cost, equal for all categories; the defaults are the paper's (supplement B.2).
+
+    Attributes:
+        existence: Weight of the existence logit.
+        center: Weight of the L1 distance of the centres.
+        cholesky: Weight of the L1 distance of the Cholesky parameters.
+    """
 
     existence: float = 6.0
     center: float = 3.0
@@ -43,7 +51,17 @@ def compute_match_cost(
     truth: Float[Tensor, "batch m 9"],
     weights: MatchWeights = PAPER_WEIGHTS,
 ) -> Float[Tensor, "batch m n"]:
-    """Cost of giving slot n to real primitive m, up to a constant per sample."""
+    """Compute the cost of assigning each proposal to each real primitive, up to a constant per sample.
+
+    Args:
+        features: Features of the proposals.
+        existence_logit: Existence logits of the proposals.
+        truth: Features of the real primitives.
+        weights: Weights of the cost.
+
+    Returns:
+        Cost per real primitive m and proposal n.
+    """
     weight = features.new_tensor([weights.center] * 3 + [weights.cholesky] * 6)
     return torch.cdist(truth * weight, features * weight, p=1) - weights.existence * existence_logit[:, None, :]
 
@@ -58,11 +76,26 @@ def match_primitives(
     proposals: tuple[int, ...],
     weights: MatchWeights = PAPER_WEIGHTS,
 ) -> Int[Tensor, "batch proposals"]:
-    """For every proposal the index of the true slot it is matched with, -1 where with padding.
+    """Assign each proposal to a true slot or to padding.
 
-    Per category, `proposals[k]` >= `slots[k]`; real primitives come first in their category's slots (tensors.py).
-    Costs are made on the tensors' device and leave it in one piece; samples are solved in threads, as scipy's solver
-    lets go of Python's lock. Raises NotFiniteError, a ValueError, for predictions that are not finite.
+    `proposals[k]` must be at least `slots[k]` for each category k. Within a category, real primitives come first
+    (tensors.py). Costs are computed on the device of the tensors and copied to the CPU in one piece. Threads solve the
+    samples in parallel, because scipy's solver releases Python's global interpreter lock.
+
+    Args:
+        features: Features of the proposals.
+        existence_logit: Existence logits of the proposals.
+        truth: Features of the slots.
+        real: True where a slot holds a primitive.
+        slots: Number of slots per category.
+        proposals: Number of proposals per category.
+        weights: Weights of the cost.
+
+    Returns:
+        Index of the slot that each proposal is assigned to, or -1 for padding.
+
+    Raises:
+        NonFiniteCostError: A prediction is not finite.
     """
     counts = torch.stack([group.sum(dim=1) for group in real.split(slots, dim=1)]).tolist()  # [category][sample]
     first_slot, first_proposal = (np.cumsum([0, *sizes[:-1]]).tolist() for sizes in (slots, proposals))
@@ -83,7 +116,7 @@ def match_primitives(
         return torch.from_numpy(assignment).to(real.device)
     flat = torch.cat(costs).cpu().double().numpy()
     if not np.isfinite(flat).all():
-        raise NonFiniteCostError("predicted primitives are not finite; lower the learning rate or look at this batch")
+        raise NonFiniteCostError("predicted primitives are not finite; lower the learning rate or inspect this batch")
 
     def solve(sample: int) -> None:
         for k, most, start in blocks:

@@ -1,7 +1,10 @@
-"""Object branch of the layout VAE (paper, supplement B.2): a transformer encoder whose outputs are scattered onto a
-grid, and a DETR-style decoder that reads primitives back from it.
+"""Object branch of the layout VAE (paper, supplement B.2).
 
-Shapes: N slots over all categories, d the width, (h, w) the latent grid.
+A transformer encoder computes one feature per primitive and scatters these features onto the latent grid. A DETR
+decoder
+predicts primitives from the latent.
+
+Shapes: N slots over all categories, width d, latent grid (h, w).
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ CATEGORY_EMBEDDING = 10  # paper, Sec. 3.2: 9 features + 10 + padding flag = 20
 
 
 class Attention(nn.Module):
-    """Multi-head attention with separate projections, on torch's fused kernel."""
+    """Multi-head attention with separate projections, computed by torch's fused kernel."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -32,16 +35,43 @@ class Attention(nn.Module):
             nn.init.zeros_(projection.bias)
 
     def split(self, x: Float[Tensor, "batch n d"]) -> Float[Tensor, "batch heads n dh"]:
+        """Split the channels into heads.
+
+        Args:
+            x: Projected tokens.
+
+        Returns:
+            Tokens per head.
+        """
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None) -> Tensor:
-        """query (b, n, d), key and value (b, m, d), mask (b, m) True where a key may be seen."""
+        """Attend from queries to keys.
+
+        Args:
+            query: (b, n, d) queries.
+            key: (b, m, d) keys.
+            value: (b, m, d) values.
+            mask: (b, m) True where a key is visible (default: all are).
+
+        Returns:
+            (b, n, d) tokens.
+        """
         q, k, v = self.split(self.query(query)), self.split(self.key(key)), self.split(self.value(value))
         mask = None if mask is None else mask[:, None, None, :]
         return self.out(F.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2))
 
 
 def make_feed_forward(width: int, hidden: int) -> nn.Sequential:
+    """Make a two-layer network with ReLU.
+
+    Args:
+        width: Width of input and output.
+        hidden: Width of the hidden layer.
+
+    Returns:
+        The network.
+    """
     return nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width))
 
 
@@ -54,12 +84,21 @@ class EncoderLayer(nn.Module):
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
 
     def forward(self, x: Float[Tensor, "batch n d"], mask: Bool[Tensor, "batch n"]) -> Float[Tensor, "batch n d"]:
+        """Apply the layer.
+
+        Args:
+            x: Tokens.
+            mask: True where a token is visible.
+
+        Returns:
+            Tokens of the same shape.
+        """
         x = self.norm1(x + self.attention(x, x, x, mask))
         return self.norm2(x + self.mlp(x))
 
 
 class DecoderLayer(nn.Module):
-    """Post-norm DETR decoder layer: positions are added to queries and keys, never to values."""
+    """Post-norm DETR decoder layer: positions are added to queries and keys, not to values."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -68,7 +107,17 @@ class DecoderLayer(nn.Module):
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
 
     def forward(self, x: Tensor, query_position: Tensor, memory: Tensor, memory_key: Tensor) -> Tensor:
-        """x (b, n, d), query_position (n, d), memory (b, hw, d), memory_key = memory + its positions."""
+        """Apply the layer.
+
+        Args:
+            x: (b, n, d) tokens.
+            query_position: (n, d) learned position of each query.
+            memory: (b, hw, d) projected latent cells.
+            memory_key: (b, hw, d) sum of `memory` and the positions of the cells.
+
+        Returns:
+            (b, n, d) tokens.
+        """
         placed = x + query_position
         x = self.norm1(x + self.self_attention(placed, placed, x))
         x = self.norm2(x + self.cross_attention(x + query_position, memory_key, memory))
@@ -76,9 +125,17 @@ class DecoderLayer(nn.Module):
 
 
 def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -> tuple[Tensor, Tensor]:
-    """Row and column of the latent cell under each normalised centre (x forward = up, y left = left).
+    """Find the latent cell under each normalised centre.
 
-    The latent grid lies like the rasters: row 0 farthest ahead, column 0 leftmost.
+    The latent grid is oriented like the rasters: row 0 is farthest ahead and column 0 is leftmost.
+
+    Args:
+        centers: Centres, normalised to [0, 1]; x points forward and y to the left.
+        rows: Number of rows of the latent grid.
+        cols: Number of columns of the latent grid.
+
+    Returns:
+        Row and column (batch, n) of each cell.
     """
     row = ((1 - centers[..., 0]) * rows).long().clamp(0, rows - 1)
     col = ((1 - centers[..., 1]) * cols).long().clamp(0, cols - 1)
@@ -86,12 +143,16 @@ def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -
 
 
 class ObjectEncoder(nn.Module):
-    """Primitives -> mean and log-variance of the object latent, by scatter-mean onto a learnable grid.
+    """Encode primitives to mean and log-variance of the object latent.
 
-    A cell is the learnable grid's value plus the mean of the features that fall into it. Padded slots are masked in
-    attention and never scattered. With `shortcut`, a primitive also writes into its cell what it knows of itself:
-    its place in the cell, shape and category through a small network of its own, past the transformer, whose norms
-    blur numbers. Not in the paper.
+    A cell is the sum of a learned value and the mean of the features of its primitives. Padded slots are masked in the
+    attention and are not scattered.
+
+    With `shortcut`, a small network adds a function of each primitive alone to the mean: its position in the cell, its
+    shape
+    and its category. This network bypasses the transformer, whose normalisations reduce the numerical precision. The
+    paper
+    has no shortcut.
     """
 
     slot_category: Tensor
@@ -126,12 +187,21 @@ class ObjectEncoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch n features"], real: Bool[Tensor, "batch n"]
     ) -> Float[Tensor, "batch moments h w"]:
+        """Encode primitives.
+
+        Args:
+            features: Normalised features of the slots.
+            real: True where a slot holds a primitive.
+
+        Returns:
+            Mean and log-variance, stacked along the channels.
+        """
         features, real, category = self.drop_padding(features, real)
         batch = len(features)
         moments, rows, cols = self.grid.shape
         category = self.category(category)  # (b, n, 10)
         x = self.project_in(torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1))  # (b, n, d)
-        # A scene without primitives may attend to its first padding: nothing of it is scattered.
+        # In a scene without primitives, attention needs one visible token. The first padded slot is not scattered.
         visible = real.clone()
         visible[:, 0] |= ~real.any(dim=1)
         for layer in self.layers:
@@ -149,15 +219,34 @@ class ObjectEncoder(nn.Module):
         return self.grid + mean.transpose(1, 2).unflatten(2, (rows, cols))
 
     def encode_in_cell(self, features: Tensor, row: Tensor, col: Tensor, category: Tensor) -> Tensor:
-        """(b, n, 19): centre from the middle of its cell, in cells; the rest of the features in [-2, 2]; category."""
+        """Compute the input of the shortcut.
+
+        Args:
+            features: (b, n, 9) normalised features.
+            row: (b, n) row of each primitive's cell.
+            col: (b, n) column of each primitive's cell.
+            category: (b, n, 10) category embeddings.
+
+        Returns:
+            (b, n, 19): x and y relative to the cell centre in cells, the other features scaled to [-2, 2], and the
+            category.
+        """
         _, rows, cols = self.grid.shape
         down, right = (1 - features[..., 0]) * rows - row - 0.5, (1 - features[..., 1]) * cols - col - 0.5
         return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, category], dim=-1)
 
     def drop_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features, padding flags and categories with real primitives first, cut to the fullest scene of the batch.
+        """Move real primitives to the front and drop slots that are padding in the whole batch.
 
-        Masked slots change nothing but cost as much as real ones: half of the paper's 514 are empty on average.
+        Masked slots do not change the result but cost as much as real ones. On average, half of the paper's 514 slots
+        are empty.
+
+        Args:
+            features: (b, N, 9) normalised features.
+            real: (b, N) True where a slot holds a primitive.
+
+        Returns:
+            Features, `real` and categories (b, n), where n is the largest number of primitives of a scene in the batch.
         """
         most = max(int(real.sum(dim=1).max()), 1)
         order = real.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :most]  # (b, most)
@@ -166,7 +255,16 @@ class ObjectEncoder(nn.Module):
 
 
 def make_sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]:
-    """DETR's normalised sine positions of a grid, row-major: half the channels for the row, half for the column."""
+    """Make DETR's normalised sine positions of a grid.
+
+    Args:
+        rows: Number of rows.
+        cols: Number of columns.
+        width: Number of channels; half of them encode the row and half the column.
+
+    Returns:
+        Positions of the cells in row-major order.
+    """
 
     def axis(n: int) -> Tensor:
         position = (torch.arange(n, dtype=torch.float32) + 1) / n * 2 * torch.pi
@@ -179,7 +277,7 @@ def make_sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cell
 
 
 class OutputHeads(nn.Module):
-    """One category's outputs: a 3-layer network for the nine features, a linear layer for existence."""
+    """Output networks of one category: a 3-layer network for nine features and a linear layer for existence."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -190,7 +288,7 @@ class OutputHeads(nn.Module):
 
 
 class ObjectDecoder(nn.Module):
-    """Object latent -> normalised features in [0, 1] and existence logits for every slot (DETR)."""
+    """Decode an object latent to normalised features in [0, 1] and an existence logit per slot (DETR)."""
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:
         super().__init__()
@@ -206,9 +304,17 @@ class ObjectDecoder(nn.Module):
     def forward(
         self, latent: Float[Tensor, "batch c h w"]
     ) -> tuple[Float[Tensor, "batch n features"], Float[Tensor, "batch n"]]:
+        """Decode object latents.
+
+        Args:
+            latent: Object latents.
+
+        Returns:
+            Normalised features and existence logits of all slots.
+        """
         memory = self.project_in(latent.flatten(2).transpose(1, 2))  # (b, hw, d)
         memory_key = memory + self.positions
-        x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d), DETR's zero targets
+        x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d): DETR starts from zeros
         for layer in self.layers:
             x = layer(x, self.queries, memory, memory_key)
         groups = list(zip(self._list_heads(), x.split(self.proposals, dim=1), strict=True))
@@ -222,7 +328,12 @@ class ObjectDecoder(nn.Module):
     def init_from_data(
         self, feature_logit: Float[Tensor, "categories features"], count: Float[Tensor, " categories"]
     ) -> None:
-        """Set the last biases: mean features per category, existence as often as `count` per scene."""
+        """Set the output biases to mean features and mean existence per category.
+
+        Args:
+            feature_logit: Logit of the mean normalised features per category.
+            count: Mean number of primitives per scene and category.
+        """
         for head, mean, expected, offered in zip(self._list_heads(), feature_logit, count, self.proposals, strict=True):
             cast(Tensor, head.features[-1].bias).copy_(mean)
             head.existence.bias.copy_((expected / offered).clamp(0.01, 0.99).logit())

@@ -1,4 +1,4 @@
-"""What the layout VAE computes: the posterior of its encoders and the output of its decoders."""
+"""Outputs of the layout VAE: the posterior of its encoders and the layouts of its decoders."""
 
 from __future__ import annotations
 
@@ -15,25 +15,47 @@ from models.vae.matching import MatchWeights
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Diagonal Gaussian over the joint layout latent: the first half of the channels is ground, the second objects."""
+    """Diagonal Gaussian over the joint layout latent.
+
+    The first half of the channels belongs to the ground, the second half to the objects.
+
+    Attributes:
+        mean: Mean.
+        logvar: Log-variance.
+    """
 
     mean: Float[Tensor, "batch c2 h w"]
     logvar: Float[Tensor, "batch c2 h w"]
 
     def float(self) -> Posterior:
-        """In single precision: losses are not for bf16."""
+        """Convert to single precision, because losses need more precision than bf16."""
         return Posterior(self.mean.float(), self.logvar.float())
 
     def sample(self, noise: Float[Tensor, "batch c2 h w"]) -> Float[Tensor, "batch c2 h w"]:
-        """Reparameterised sample for standard normal noise."""
+        """Sample latents by reparameterisation.
+
+        Args:
+            noise: Standard normal noise.
+
+        Returns:
+            Latents.
+        """
         return self.mean + (0.5 * self.logvar).exp() * noise
 
 
 @dataclass(frozen=True, eq=False)
 class LayoutOutput:
-    """What the decoders say, normalised as in LayoutBatch; logits where a probability is meant.
+    """Output of the decoders, normalised as in LayoutBatch.
 
-    The object decoder proposes `proposals[k]` primitives of category k: the spec's slots (DETR) or more (cells).
+    Attributes:
+        height: Normalised heights.
+        occupancy_logit: Logit of the probability that a pixel is occupied.
+        features: Normalised features of the proposals, ordered by category.
+        existence_logit: Logit of the existence probability of the proposals.
+        proposals: Number of proposals per category: the spec's slots for "detr", at least as many for "cells".
+        match_weights: Weights of the matching cost.
+        feature_unit: Unit of each normalised feature for matching and losses.
+        branches: Branches of the model. The values of a missing branch are placeholders.
     """
 
     height: Float[Tensor, "batch ground rows cols"]
@@ -42,16 +64,16 @@ class LayoutOutput:
     existence_logit: Float[Tensor, "batch proposals"]
     proposals: tuple[int, ...]
     match_weights: MatchWeights
-    feature_unit: tuple[float, ...] = (1.0,) * FEATURES  # normalised features are matched and compared in these
-    branches: str = "both"  # which of them were decoded; the other's values are placeholders
+    feature_unit: tuple[float, ...] = (1.0,) * FEATURES
+    branches: str = "both"
 
     def float(self) -> LayoutOutput:
-        """In single precision: losses are not for bf16."""
+        """Convert to single precision, because losses need more precision than bf16."""
         names = ("height", "occupancy_logit", "features", "existence_logit")
         return replace(self, **{name: getattr(self, name).float() for name in names})
 
     def layouts(self) -> list[DecodedLayout]:
-        """One numpy layout per sample, probabilities instead of logits."""
+        """Return one numpy layout per sample, with probabilities instead of logits."""
         parts = (self.occupancy_logit.sigmoid(), self.height, self.features, self.existence_logit.sigmoid())
         category = np.repeat(np.arange(len(self.proposals)), self.proposals)
         occupancy, height, features, existence = (part.float().cpu().numpy() for part in parts)
