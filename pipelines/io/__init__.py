@@ -1,1 +1,1 @@
-"""Readers and writers of other programs' formats."""
+"""Readers and writers for file formats of other programs."""

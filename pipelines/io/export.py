@@ -1,4 +1,4 @@
-"""Export scenes to files for other programs: GLB, PLY, voxels, OpenDRIVE; one Ray task per shard."""
+"""Export scenes as GLB, PLY, voxels or OpenDRIVE, in one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def export_scenes(
     overwrite: bool = False,
     on_scene: Callable[[int], None] | None = None,
 ) -> tuple[dict[Format, int], dict[str, str]]:
-    """Write output/<format>/<scene_id>.<format>.
+    """Export each scene to output/<format>/<scene_id>.<format>.
 
-    A scene that a format cannot hold, such as one without roads, is listed in `rejects` of the output; the export
-    continues with the other scenes.
+    If a format cannot hold a scene, such as OpenDRIVE for a scene without roads, the scene is listed in the table
+    `rejects` of the output. The export continues with the next scene.
 
     Args:
         selection: Scenes.
-        formats: Formats of the files.
-        output: Directory.
-        overwrite: Whether to replace files that exist.
-        on_scene: Receives the number of scenes of each finished shard.
+        formats: File formats.
+        output: Output directory.
+        overwrite: Whether to replace existing files.
+        on_scene: Called after each shard with the number of its scenes.
 
     Returns:
-        Number of files per format, and the reasons per scene that was not written.
+        Number of files per format, and the reason per scene that was not written.
     """
     parts = selection.shards()
 

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0 -> placed meshes, of files that nobody vouches for.
+"""Read binary glTF 2.0 files from untrusted sources as meshes with their transforms applied.
 
-The JSON chunk and the binary chunk, and nothing else: no address is followed, no texture decoded, no compression
-undone. Colours come as they are stored.
+The reader uses only the JSON chunk and the binary chunk. It follows no URI, decodes no texture and decompresses
+nothing. Colours are returned as stored.
 """
 
 from __future__ import annotations
@@ -17,31 +17,50 @@ JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 POINTS, TRIANGLES = 0, 4
-HARMLESS = {"KHR_materials_unlit", "KHR_mesh_quantization"}  # extensions that may be required
+HARMLESS = {"KHR_materials_unlit", "KHR_mesh_quantization"}  # Required extensions that do not affect the reader
 MOVES_VERTICES = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing"}
 FAR_M = 1e6
-MAX_NUMBERS = 2**25  # vertices and corners of triangles, placed: a small file can place one mesh a million times
+# Limit on vertices and triangle corners after placement, because a small file can place one mesh a million times.
+MAX_NUMBERS = 2**25
 
 
 class MeshPart(NamedTuple):
-    """One mesh primitive of one node, placed by the transforms above it."""
+    """One mesh primitive of one node, transformed to the frame of the file.
 
-    extras: dict  # of the node
+    Attributes:
+        extras: Extras of the node.
+        file_from_mesh: Transform from the mesh to the file.
+        vertices: Vertices in the frame of the file.
+        triangles: Vertex indices; (0, 3) for points.
+        color: Stored colours in [0, 1]: the vertex colour times the colour of the material.
+    """
+
+    extras: dict
     file_from_mesh: np.ndarray  # (4, 4)
-    vertices: np.ndarray  # (v, 3) float64, in the file's frame
-    triangles: np.ndarray  # (t, 3) int64; none for points
-    color: np.ndarray  # (v, 3) float64 in [0, 1], as stored: vertex colours times the material's
+    vertices: np.ndarray  # (v, 3) float64
+    triangles: np.ndarray  # (t, 3) int64
+    color: np.ndarray  # (v, 3) float64
 
 
 class Glb(NamedTuple):
-    """What a file shows: the extras of its scene, and its parts in the order of the file's tree."""
+    """Content of a file: the extras of its default scene, and its mesh parts in the order of the node tree."""
 
     extras: dict
     parts: list[MeshPart]
 
 
 def read_glb(data: bytes) -> Glb:
-    """The default scene of a binary glTF 2.0 file. Raises ValueError that says what is wrong with it."""
+    """Read the default scene of a binary glTF 2.0 file.
+
+    Args:
+        data: Content of the file.
+
+    Returns:
+        Extras and mesh parts of the scene.
+
+    Raises:
+        ValueError: The file is invalid or uses a feature that is not read; the message names the fault.
+    """
     try:
         tree, binary = _read_chunks(data)
         _refuse(tree)
@@ -52,25 +71,27 @@ def read_glb(data: bytes) -> Glb:
                 read = [primitive["attributes"]["POSITION"], primitive.get("indices")]
                 total += sum(tree["accessors"][index]["count"] for index in read if index is not None)
                 if total > MAX_NUMBERS:
-                    raise ValueError(f"places more than {MAX_NUMBERS} vertices; export one scene per file")
+                    raise ValueError(f"the file holds more than {MAX_NUMBERS} vertices; export one scene per file")
                 parts.append(_read_part(tree, binary, node, primitive, file_from_mesh))
         return Glb(dict(scene.get("extras", {})), parts)
     except (LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"not well-formed glTF ({error!r}); export it again") from error
+        raise ValueError(f"the file is not well-formed glTF ({error!r}); export it again") from error
 
 
 def _read_chunks(data: bytes) -> tuple[dict, bytes]:
-    """The JSON chunk, read, and the binary one, empty if there is none."""
+    """Return the parsed JSON chunk and the binary chunk, which is empty if absent."""
     if data[:4] != b"glTF" or len(data) < 20:
-        raise ValueError(f"begins with {data[:4]!r}, not a binary glTF file; export as .glb")
+        raise ValueError(f"the file begins with {data[:4]!r} and is not a binary glTF file; export as .glb")
     version, length = np.frombuffer(data, "<u4", 2, 4).tolist()
     if version != 2 or length > len(data):
-        raise ValueError(f"glTF version {version}, {len(data)} of {length} bytes; expected a whole file of version 2")
+        raise ValueError(
+            f"glTF version {version} with {len(data)} of {length} bytes; expected a whole file of version 2"
+        )
     chunks, start = {}, 12
     while start + 8 <= length:
         size, kind = np.frombuffer(data, "<u4", 2, start).tolist()
         if start + 8 + size > length:
-            raise ValueError(f"a chunk of {size} bytes runs over the end of the file; copy or export it again")
+            raise ValueError(f"a chunk of {size} bytes exceeds the end of the file; copy or export it again")
         chunks.setdefault(kind, data[start + 8 : start + 8 + size])
         start += 8 + size
     return json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY_CHUNK, b"")
@@ -82,16 +103,16 @@ def _refuse(tree: dict) -> None:
             raise ValueError(f"{kind} lie outside the file; export as one self-contained .glb")
     unread = set(tree.get("extensionsRequired", [])) - HARMLESS | MOVES_VERTICES & set(tree.get("extensionsUsed", []))
     if unread:
-        raise ValueError(f"uses {', '.join(sorted(unread))}, which is not read; export without it")
+        raise ValueError(f"the reader does not support {', '.join(sorted(unread))}; export without it")
 
 
 def _list_placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarray]]:
-    """Nodes and their (4, 4) file_from_node, parents first."""
+    """Yield the nodes and their (4, 4) file_from_node transforms, parents first."""
     seen, todo = set(), [(root, np.eye(4)) for root in reversed(roots)]
     while todo:
         index, file_from_parent = todo.pop()
         if index in seen:
-            raise ValueError(f"node {index} has two parents; export it again")
+            raise ValueError(f"node {index} has two parents, which glTF forbids; export it again")
         seen.add(index)
         node = tree["nodes"][index]
         file_from_node = file_from_parent @ _compute_node_transform(node)
@@ -101,7 +122,7 @@ def _list_placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.
 
 def _compute_node_transform(node: dict) -> np.ndarray:
     if "matrix" in node:
-        return np.array(node["matrix"], float).reshape(4, 4).T  # column by column in the file
+        return np.array(node["matrix"], float).reshape(4, 4).T  # The file stores a matrix column by column.
     transform = np.eye(4)
     rotation = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
     transform[:3, :3] = rotation * np.array(node.get("scale", [1, 1, 1]), float)
@@ -112,32 +133,37 @@ def _compute_node_transform(node: dict) -> np.ndarray:
 def _read_part(tree: dict, binary: bytes, node: dict, primitive: dict, file_from_mesh: np.ndarray) -> MeshPart:
     attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
     if mode not in (POINTS, TRIANGLES):
-        raise ValueError(f"a mesh is drawn in mode {mode}; export triangles")
+        raise ValueError(f"a mesh has the drawing mode {mode}, which is not read; export triangles")
     local = _read_accessor(tree, binary, attributes["POSITION"])
     vertices = local @ file_from_mesh[:3, :3].T + file_from_mesh[:3, 3]
     if not (np.abs(vertices) < FAR_M).all():
-        raise ValueError(f"vertices hold NaN or lie beyond {FAR_M:.0f} m; export it again, in metres")
+        raise ValueError(f"vertices are NaN or lie beyond {FAR_M:.0f} m; export the scene in metres")
     corner = (
         _read_accessor(tree, binary, primitive["indices"])[:, 0] if "indices" in primitive else np.arange(len(local))
     )
     triangles = corner[: len(corner) * (mode == TRIANGLES)].astype(np.int64).reshape(-1, 3)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
-        raise ValueError(f"triangles name vertex {triangles.max()} of {len(vertices)}; export it again")
+        raise ValueError(
+            f"triangles refer to vertex {triangles.max()}, but the mesh has {len(vertices)} vertices; export it again"
+        )
     material = tree["materials"][primitive["material"]] if "material" in primitive else {}
     base = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0, 1.0, 1.0])[:3]
     color = np.tile(np.array(base, float), (len(vertices), 1))
     if "COLOR_0" in attributes:
         color *= _read_accessor(tree, binary, attributes["COLOR_0"])[:, :3]
     if not ((color >= 0) & (color <= 1)).all():
-        raise ValueError("colours lie outside 0 to 1; export 8-bit colours")
+        raise ValueError("colours lie outside [0, 1]; export 8-bit colours")
     return MeshPart(dict(node.get("extras", {})), file_from_mesh, vertices, triangles, color)
 
 
 def _read_accessor(tree: dict, binary: bytes, index: int) -> np.ndarray:
-    """(count, width) numbers: float64 for floats and normalised integers, else as stored."""
+    """Return the values (count, width) of an accessor.
+
+    Floats and normalised integers are returned as float64; other integers keep their stored type.
+    """
     accessor = tree["accessors"][index]
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise ValueError(f"accessor {index} is sparse, which is not read; export without it")
+        raise ValueError(f"accessor {index} is sparse, which the reader does not support; export dense buffers")
     view, kind = tree["bufferViews"][accessor["bufferView"]], np.dtype(COMPONENTS[accessor["componentType"]])
     count, width = accessor["count"], WIDTHS[accessor["type"]]
     item = kind.itemsize * width

@@ -1,8 +1,8 @@
-"""Meshes of a Scene: layout reconstruction (paper, supplement B.2) and GLB files.
+"""Convert a Scene to meshes: layout reconstruction (paper, supplement B.2), GLB files and PLY files.
 
-The ground is one fused surface: each occupied pixel becomes a vertex at its centre, coloured by the class
-that won the pixel, and each 2 x 2 block of occupied pixels becomes two triangles along one consistent
-diagonal. A primitive is a unit cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
+The ground is one fused surface. Each occupied pixel becomes a vertex at its centre, in the colour of the class that won
+the pixel. Each 2 x 2 block of occupied pixels becomes two triangles along the same diagonal. A primitive is a unit
+cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
 """
 
 from __future__ import annotations
@@ -23,41 +23,58 @@ import trimesh.visual
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
-GROUND = -1  # "primitive" of a ground triangle
-ABOUT = (  # what a file says of the scene as a whole
+GROUND = -1  # Value of `primitive` for a ground triangle
+ABOUT = (  # Scene-level fields that a file holds
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
     *("vegetation_density", "vehicle_density", "ground_classes"),
 )
 
-# Cyclic, hence a proper rotation: glTF's +z is forward, +y up and +x left, ours are x, z and y.
+# The glTF axes are +z forward, +y up and +x left; the scene axes are x, z and y. The permutation is cyclic and
+# therefore a proper rotation.
 GLTF_FROM_SCENE = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF: vertices, indices
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF constants for buffers of vertices and of indices
 
 
 class Triangles(NamedTuple):
-    """Triangle soup in the scene frame; corners counter-clockwise seen from outside (ground: from above)."""
+    """A triangle soup in the scene frame.
+
+    Attributes:
+        corners_m: Corners, counter-clockwise seen from outside or, for ground, from above (m).
+        class_id: Class id of the palette; a ground triangle has the class of its first corner.
+        primitive: Index of the primitive in the scene, GROUND for ground.
+    """
 
     corners_m: np.ndarray  # (t, 3, 3) float64
-    class_id: np.ndarray  # (t,) uint8, see palette; a ground triangle has the class of its first corner
-    primitive: np.ndarray  # (t,) int64, index into the scene's primitives, GROUND for the ground
+    class_id: np.ndarray  # (t,) uint8
+    primitive: np.ndarray  # (t,) int64
 
 
 @cache
 def make_unit_cuboid() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (8, 3) at ±0.5 and triangles (12, 3), outward."""
+    """Return the unit cuboid: vertices (8, 3) at ±0.5 and triangles (12, 3) that face outwards."""
     mesh = trimesh.creation.box()
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
 @cache
 def make_unit_ellipsoid() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (642, 3) on the sphere of diameter 1 and triangles (1280, 3), outward; volume 0.99 of pi/6."""
+    """Return the sphere of diameter 1: vertices (642, 3) and triangles (1280, 3) that face outwards.
+
+    The mesh has 0.99 of the volume pi/6 of the sphere.
+    """
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
 def compute_placements(scene: Scene) -> np.ndarray:
-    """(n, 4, 4) T = [R diag(l, w, h) | t] of each primitive (paper, supplement B.2)."""
+    """Compute the transform of each primitive (paper, supplement B.2).
+
+    Args:
+        scene: Scene with n primitives.
+
+    Returns:
+        (n, 4, 4) T = [R diag(l, w, h) | t], from the unit shape to the scene frame (m).
+    """
     transform = np.zeros((len(scene), 4, 4))
     transform[:, :3, :3] = scene.rotation * scene.size_m[:, None, :]
     transform[:, :3, 3] = scene.center_m
@@ -66,10 +83,16 @@ def compute_placements(scene: Scene) -> np.ndarray:
 
 
 def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The fused ground surface (paper, supplement B.2).
+    """Build the mesh of the fused ground surface (paper, supplement B.2).
 
-    Returns vertices_m (v, 3), one per occupied pixel; triangles (t, 3), facing up, two per 2 x 2 block of
-    occupied pixels, cut along the diagonal (i, j + 1) - (i + 1, j); vertex_class_id (v,).
+    The mesh has two triangles per 2 x 2 block of occupied pixels, cut along the diagonal (i, j + 1) - (i + 1, j).
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        vertices_m (v, 3), one per occupied pixel, in the scene frame; triangles (t, 3), facing up; vertex_class_id
+        (v,).
     """
     height, winner = scene.surface()
     occupied = winner >= 0
@@ -83,23 +106,51 @@ def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def triangulate_ground(scene: Scene) -> Triangles:
-    """The triangles of `build_ground_mesh`."""
+    """Return the triangles of `build_ground_mesh`.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Triangles of the ground.
+    """
     vertices, triangles, class_id = build_ground_mesh(scene)
     return Triangles(vertices[triangles], class_id[triangles[:, 0]], np.full(len(triangles), GROUND))
 
 
 def triangulate_cuboids(scene: Scene) -> Triangles:
-    """Twelve triangles for each primitive that is a cuboid."""
+    """Return twelve triangles for each cuboid.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Triangles of all cuboids.
+    """
     return _add_instances(scene, np.flatnonzero(scene.category != ELLIPSOID), *make_unit_cuboid())
 
 
 def triangulate_ellipsoids(scene: Scene) -> Triangles:
-    """1280 triangles for each primitive that is an ellipsoid."""
+    """Return 1280 triangles for each ellipsoid.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Triangles of all ellipsoids.
+    """
     return _add_instances(scene, np.flatnonzero(scene.category == ELLIPSOID), *make_unit_ellipsoid())
 
 
 def triangulate_scene(scene: Scene) -> Triangles:
-    """Everything in the scene as triangles: ground, cuboids, ellipsoids."""
+    """Return the triangles of the ground, the cuboids and the ellipsoids of a scene.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        All triangles.
+    """
     parts = triangulate_ground(scene), triangulate_cuboids(scene), triangulate_ellipsoids(scene)
     return Triangles(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -113,20 +164,30 @@ def _add_instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, tr
 
 
 def export_glb(scene: Scene) -> bytes:
-    """Export the scene to a binary glTF 2.0 file, y up, metres.
+    """Export a scene to a binary glTF 2.0 file (y up, metres).
 
-    Node `scene` holds the rotation from z up to y up, so that its children are in the scene frame: `ground` (vertex
-    colours; absent without occupied pixels) and one node per primitive, `<category>_<index>`, with category, class id,
-    colour, label, instance id and the exact parameters in its extras. The extras of the file hold the grid and the
-    fields of ABOUT. mesh_import.py reads the same scene from it, except that only the fused ground remains. Colours are
-    in linear light, as glTF demands, so a viewer shows the palette's sRGB values.
+    The node `scene` holds the rotation from z up to y up. Its children are therefore in the scene frame:
+
+    * `ground` has vertex colours. It is absent if no pixel is occupied.
+    * `<category>_<index>` is the node of a primitive. Its extras hold category, class id, colour, label, instance id
+      and the exact parameters.
+
+    The extras of the file hold the grid and the fields of ABOUT. mesh_import.py reads the same scene from the file,
+    except that only the fused ground is kept. Colours are in linear light, as glTF requires. A viewer then shows the
+    sRGB values of the palette.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Content of the .glb file.
     """
     about = {name: getattr(scene, name) for name in ABOUT} | {"grid": asdict(scene.grid)}
     world = trimesh.Scene(metadata=about)
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = build_ground_mesh(scene)
     if len(vertices):
-        # A triangle without area keeps pixels that have no neighbours: files leave meshes without triangles out.
+        # A triangle without area keeps isolated pixels in the file, because trimesh omits meshes without triangles.
         triangles = triangles if len(triangles) else np.zeros((1, 3), int)
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
@@ -141,7 +202,7 @@ def export_glb(scene: Scene) -> bytes:
 
 
 def _set_buffer_targets(tree: dict) -> None:
-    """glTF's hints for the GPU: which buffer views hold vertices, which indices."""
+    """Set the glTF hints for the GPU that distinguish buffer views of vertices from those of indices."""
     for mesh in tree.get("meshes", ()):
         for part in mesh["primitives"]:
             targets = {index: ARRAY_BUFFER for index in part["attributes"].values()}
@@ -150,9 +211,15 @@ def _set_buffer_targets(tree: dict) -> None:
 
 
 def export_ply(scene: Scene) -> bytes:
-    """Export the scene to one binary PLY mesh in the scene frame, z up, metres.
+    """Export a scene to one binary PLY mesh in the scene frame (z up, metres).
 
-    Vertices have palette colours (sRGB), `class_id` and `primitive` (its number, GROUND for the ground).
+    Vertices have palette colours (sRGB), `class_id` and `primitive` (index of the primitive, or GROUND).
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Content of the .ply file.
     """
     ground_m, triangles, class_id = build_ground_mesh(scene)
     vertices, faces, classes, primitives = [ground_m], [triangles], [class_id], [np.full(len(ground_m), GROUND)]
@@ -173,7 +240,15 @@ def export_ply(scene: Scene) -> bytes:
 
 
 def write_glb(scene: Scene, path: str | Path) -> None:
-    """Write `export_glb` to a temporary file next to `path` and move it into place."""
+    """Write a scene to a .glb file.
+
+    The function writes a temporary file next to `path` and renames it. An interruption therefore leaves no partial
+    file.
+
+    Args:
+        scene: Scene.
+        path: Local path of the .glb file.
+    """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     temporary.write_bytes(export_glb(scene))
@@ -185,12 +260,12 @@ def _make_unit_mesh(category: int) -> trimesh.Trimesh:
     if category != ELLIPSOID:
         return trimesh.Trimesh(*make_unit_cuboid(), visual=visual, process=False)
     vertices, triangles = make_unit_ellipsoid()
-    # With normals viewers shade smoothly, without them each facet flatly.
+    # Viewers shade a mesh with normals smoothly, and a mesh without normals facet by facet.
     return trimesh.Trimesh(vertices, triangles, vertex_normals=2 * vertices, visual=visual, process=False)
 
 
 def _paint_mesh(vertices_m: np.ndarray, triangles: np.ndarray, class_id: np.ndarray) -> trimesh.Trimesh:
-    # White: a viewer multiplies the material's colour by the vertex's.
+    # The material is white, because a viewer multiplies the colours of material and vertex.
     visual = trimesh.visual.TextureVisuals(material=_make_material("ground", EMPTY))
     opaque = np.full((len(vertices_m), 1), 255, np.uint8)
     visual.vertex_attributes["color"] = np.hstack([_convert_to_linear(CLASS_COLORS)[class_id], opaque])
@@ -205,7 +280,7 @@ def _make_material(name: str, class_id: int) -> trimesh.visual.material.PBRMater
 
 
 def _convert_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """uint8 sRGB as uint8 linear light (IEC 61966-2-1)."""
+    """Convert uint8 sRGB to uint8 linear light (IEC 61966-2-1)."""
     value = np.asarray(srgb) / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)

@@ -1,23 +1,26 @@
-"""Import binary glTF meshes as Scenes: our export, and meshes in class colours like those of the paper's authors.
+"""Import binary glTF meshes as Scenes: exports of this project, and meshes in class colours like those of the authors.
 
-The extras of our export (`mesh_export.export_glb`) identify it. Its nodes are the primitives: transforms give centre,
-rotation and size, and extras the rest. A scene that was edited in a mesh editor is therefore read with its changes.
+The extras of a file written by `mesh_export.export_glb` identify it as an export of this project. Its nodes are the
+primitives: the transforms give centre, rotation and size, and the extras give the other fields. Changes that a user
+makes in a mesh editor are therefore imported.
 
-Any other mesh is read in the authors' form (docs/imports.md), with these assumptions:
+Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), with these assumptions:
 
-* x is forward, y right, z down, in metres, unless `axes` gives other directions. The frame includes pitch and roll of
-  the authors' IMU.
-* A class is a colour of palette.py within COLOR_TOLERANCE (mesh_segmentation.py), of vertices or of materials. The
-  colours of a file decide whether it stores sRGB or, as glTF demands, linear light. Textures are not read.
-* Ground has one vertex per occupied pixel, with or without triangles. Pixel (i, j) has its vertex at its corner
-  x = 64 - .25 i, y = -32 + .25 j (y right), as in the authors' grid, or at its centre, as in ours. A vertex with an
-  averaged colour on the border of two classes gets the class of the nearest vertex that has one.
-* Primitives are connected pieces of one class, any number per mesh; pieces that repeat vertices along edges are joined
-  first. Eight vertices are a box, fitted to its edges. More vertices are an ellipsoid, fitted as a quadric, regardless
-  of the sphere's triangulation. Boxes of vegetation are vegetation_cuboid.
+* x is forward, y right and z down, in metres, unless `axes` gives other directions. The frame includes the pitch and
+  roll of the authors' IMU.
+* The class of a vertex is the palette colour within COLOR_TOLERANCE (mesh_segmentation.py) of its vertex or material
+  colour. The reader chooses between sRGB and linear light (the glTF standard) by comparing the colours of the file with
+  the palette. It ignores textures.
+* Ground has one vertex per occupied pixel, with or without triangles. The vertex of pixel (i, j) lies at the corner x =
+  64 - .25 i, y = -32 + .25 j (y right) as in the authors' grid, or at the pixel centre as in this project's exports. On
+  the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the nearest vertex
+  with a class colour.
+* Primitives are connected pieces of one class. A mesh may hold any number of primitives. The reader first merges
+  vertices that are repeated along edges. A piece with eight vertices is a box, fitted to its edges. A piece with more
+  vertices is an ellipsoid, fitted as a quadric for any triangulation. Boxes of vegetation become vegetation_cuboid.
 
-An imported box has the corners of the mesh. An imported ellipsoid has its shape, but no yaw that the shape does not
-determine. Pieces that fit neither within FIT_M (shape_fitting.py) are refused.
+An imported box has the corners of the mesh. An imported ellipsoid has the shape of the mesh. A yaw that the shape does
+not determine is lost. The reader raises an error for a piece that fits neither shape within FIT_M (shape_fitting.py).
 """
 
 from __future__ import annotations
@@ -53,18 +56,30 @@ from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
-UNMOVED = 1e-4  # change of a size, relative, and of a yaw, in rad, that is rounding and not an edit
-MAX_PIXELS = 2**24  # of a grid that a file names
+# Changes below this value are rounding errors and no edits: relative change of a size, or change of a yaw (rad).
+UNMOVED = 1e-4
+MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid
 
 
 def import_glb(
     source: bytes | str | os.PathLike, scene_id: str = "", axes: Axes = AUTHORS_AXES, grid: Grid | None = None
 ) -> Scene:
-    """The Scene that a .glb shows, given as its bytes or its path.
+    """Import a .glb file as a Scene.
 
-    Our own export brings its ids, grid and ground classes, and the fused ground: one class per pixel. Other meshes lie
-    on `grid` (default: the paper's), in a frame of `axes`, and get source "imported", split "generated" and the ids of
-    their file. Raises ValueError that names the file, what was found and what to do.
+    An export of this project keeps its ids, grid, ground classes and fused ground, which has one class per pixel. Any
+    other mesh gets source "imported" and split "generated".
+
+    Args:
+        source: Content of the file as bytes, or its path or URI.
+        scene_id: Id of the scene (default: the id in an export, or the file name without ".glb").
+        axes: Directions of the file's axes, for a mesh that is no export of this project.
+        grid: Raster grid, for a mesh that is no export of this project (default: the paper's).
+
+    Returns:
+        The scene.
+
+    Raises:
+        ValueError: The file is invalid. The message names the file, the fault and the remedy.
     """
     name = "GLB" if isinstance(source, bytes) else os.fspath(source)
     orientation = compute_scene_from_axes(axes)
@@ -97,14 +112,14 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
             )
         )
     except (LookupError, TypeError, OverflowError) as error:
-        raise ValueError(f"is our export, but its extras are incomplete ({error!r}); export it again") from error
+        raise ValueError(f"the extras of this export are incomplete ({error!r}); export it again") from error
     if not ((existence >= 0) & (existence <= 1)).all() or (np.abs(heading) > 2 * np.pi).any():
-        raise ValueError("existence lies outside 0 to 1, or heading_rad outside ±2π; export it again")
+        raise ValueError("existence lies outside [0, 1], or heading_rad lies outside ±2π; export it again")
     scene_from_gltf = np.linalg.inv(GLTF_FROM_SCENE)
     scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
     center_m = scene_from_unit[:, :3, 3]
     rotation, size_m = fit_boxes_to_edges(scene_from_unit[:, :3, :3], center_m)
-    # A square's length and width must not change places by rounding.
+    # Keep the stored sizes where they agree, so that rounding does not swap length and width of a square.
     size_said_m = size_said_m.reshape(-1, 3)
     size_m = np.where(np.isclose(size_m, size_said_m, rtol=UNMOVED, atol=0), size_said_m, size_m)
     rotation, size_m = canonicalize_boxes(rotation, size_m)
@@ -115,7 +130,9 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     ids = np.array([GROUND_CLASS_ID[name] for name in about["ground_classes"]])
     class_id, off = find_nearest_class(_join_meshes([part.color for part in ground], (0, 3)), True, ids)
     if (off > COLOR_TOLERANCE).any():
-        raise ValueError(f"{(off > COLOR_TOLERANCE).sum()} ground vertices have the colour of none of its classes")
+        raise ValueError(
+            f"{(off > COLOR_TOLERANCE).sum()} ground vertices match the colour of no ground class; export it again"
+        )
     height_m, occupied = rasterize_ground(vertices_m, class_id, about["ground_classes"], about["grid"])
     if scene_id:
         about["scene_id"] = scene_id
@@ -135,18 +152,23 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
 
 
 def _read_metadata(extras: dict) -> dict[str, Any]:
-    """Read and check the fields of a Scene as a whole. Raises LookupError, TypeError or ValueError."""
+    """Read and check the scene-level fields of a Scene.
+
+    The function raises LookupError, TypeError or ValueError for missing or invalid fields.
+    """
     said, classes = extras["grid"], tuple(extras["ground_classes"])
     lengths = front_m, left_m, resolution_m = tuple(float(said[name]) for name in ("front_m", "left_m", "resolution_m"))
     grid = Grid(front_m, left_m, resolution_m, int(said["rows"]), int(said["cols"]))
     sound = np.isfinite(lengths).all() and grid.resolution_m > 0 < min(grid.rows, grid.cols)
     if not sound or grid.rows * grid.cols > MAX_PIXELS:
-        raise ValueError(f"its grid is {said}; export it again")
+        raise ValueError(f"the grid {said} is invalid; export it again")
     if not set(classes) <= set(GROUND_CLASSES) or len(set(classes)) < len(classes):
-        raise ValueError(f"its ground classes are {classes}, expected some of {', '.join(GROUND_CLASSES)}")
+        raise ValueError(f"the ground classes are {classes}, expected some of {', '.join(GROUND_CLASSES)}")
     densities = {name: extras[name] for name in ("vegetation_density", "vehicle_density")}
     if not set(densities.values()) <= {*DENSITIES, None}:
-        raise ValueError(f"its densities are {densities}, expected some of {', '.join(DENSITIES)}; export it again")
+        raise ValueError(
+            f"the density labels are {densities}, expected some of {', '.join(DENSITIES)}; export it again"
+        )
     x, y, z = extras["world_xyz_m"]
     return densities | {
         **{name: str(extras[name]) for name in ("scene_id", "source", "sequence", "split")},
@@ -160,7 +182,7 @@ def _read_metadata(extras: dict) -> dict[str, Any]:
 
 def _import_foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: Grid) -> Scene:
     if not glb.parts:
-        raise ValueError("holds no mesh; export the scene's meshes with it")
+        raise ValueError("the file holds no mesh; export the scene with its meshes")
     linear = convert_to_stored_linear(np.concatenate([part.color for part in glb.parts]))
     found = [segment_mesh(part.vertices @ scene_from_file.T, part.triangles, part.color, linear) for part in glb.parts]
     ground_m, ground_id, corners_m, box_id = (np.concatenate([part[k] for part in found]) for k in range(4))

@@ -1,4 +1,4 @@
-"""A mesh in class colours, taken apart: ground vertices, boxes, ellipsoids."""
+"""Segment a mesh in class colours into ground vertices, boxes and ellipsoids."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from models.scene import ELLIPSOID, Grid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY, GROUND_CLASS_ID
 
-COLOR_TOLERANCE = 12  # of 255, per channel: dark colours kept as 8 bits of linear light are off by up to 7
-FAR = 64  # of 255: how far from every class a colour counts at most
-ON_GRID_PX = 0.02  # of a ground vertex from a pixel's corner or centre
-MAX_MIXED = 0.5  # share of ground vertices between the colours of two classes
-VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # of one colour
+COLOR_TOLERANCE = 12  # Tolerance per channel, of 255. Dark colours stored as 8-bit linear light are off by up to 7.
+FAR = 64  # Limit on the colour distance of one vertex (of 255) in the comparison of sRGB with linear light
+ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre
+MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes
+VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # Both classes have the same colour.
 CLASS_IDS = np.array(sorted(set(CLASS_ID.values()) - {VEGETATION[1]}))
 IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values()))
 
@@ -25,13 +25,29 @@ IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values())
 
 
 def convert_to_stored_linear(color: np.ndarray) -> bool:
-    """Whether colours (v, 3) in [0, 1] fit the classes better as linear light than as sRGB."""
+    """Return whether colours match the palette better as linear light than as sRGB.
+
+    Args:
+        color: (v, 3) colours in [0, 1].
+
+    Returns:
+        True for linear light.
+    """
     off = [np.minimum(find_nearest_class(color, linear, CLASS_IDS)[1], FAR).sum() for linear in (True, False)]
     return bool(off[0] < off[1])
 
 
 def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The class id of nearest colour for each of (v, 3) in [0, 1], and how far off its worst channel is, of 255."""
+    """Find the class with the nearest colour for each vertex.
+
+    Args:
+        color: (v, 3) colours in [0, 1].
+        linear: Whether the colours are linear light instead of sRGB.
+        class_ids: Class ids to choose from.
+
+    Returns:
+        Class id (v,), and the largest difference of a colour channel (v,), of 255.
+    """
     levels = np.round(color * 65535).astype(np.int64).clip(0, 65535)
     code, place = np.unique(levels @ np.array([2**32, 2**16, 1], np.int64), return_inverse=True)
     value = np.stack([code >> 32, code >> 16 & 65535, code & 65535], axis=1) / 65535
@@ -45,20 +61,41 @@ def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -
 
 
 class MeshPieces(NamedTuple):
-    """What a mesh shows, in the scene frame."""
+    """Content of a mesh in the scene frame: ground vertices, boxes and ellipsoids.
 
-    ground_m: np.ndarray  # (v, 3) one vertex per pixel
-    ground_id: np.ndarray  # (v,) class id
-    corners_m: np.ndarray  # (b, 8, 3) of boxes
-    box_id: np.ndarray  # (b,) class id
-    clouds: list[np.ndarray]  # (k, 3) vertices of each ellipsoid
+    Attributes:
+        ground_m: One vertex per pixel (m).
+        ground_id: Class id of each ground vertex.
+        corners_m: Corners of each box (m).
+        box_id: Class id of each box.
+        clouds: Vertices (k, 3) of each ellipsoid (m).
+    """
+
+    ground_m: np.ndarray  # (v, 3)
+    ground_id: np.ndarray  # (v,)
+    corners_m: np.ndarray  # (b, 8, 3)
+    box_id: np.ndarray  # (b,)
+    clouds: list[np.ndarray]  # (k, 3) each
 
 
 def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarray, linear: bool) -> MeshPieces:
-    """A mesh taken apart into its connected pieces; a piece is ground if most of its coloured vertices are.
+    """Segment a mesh into its connected pieces.
 
-    Of vertices without triangles those in a ground class's colour count. Raises ValueError that says where a piece lies
-    that is neither ground nor box nor ellipsoid, and what is wrong with it.
+    A piece is ground if most of its coloured vertices have the colour of a ground class. In a mesh without triangles,
+    each vertex is a piece.
+
+    Args:
+        vertices_m: (v, 3) vertices in the scene frame (m).
+        triangles: (t, 3) vertex indices; (0, 3) for a point cloud.
+        color: (v, 3) colours in [0, 1].
+        linear: Whether the colours are linear light instead of sRGB.
+
+    Returns:
+        Ground, boxes and ellipsoids.
+
+    Raises:
+        ValueError: A vertex has no class colour, or a piece is neither ground nor box nor ellipsoid. The message gives
+            the position of the piece and the fault.
     """
     class_id, off = find_nearest_class(color, linear, CLASS_IDS)
     class_id = np.where(off <= COLOR_TOLERANCE, class_id, EMPTY)
@@ -68,19 +105,20 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
     votes[:, EMPTY] = 0
     unknown = ~np.any(votes, axis=1)[piece]
     if len(triangles):
-        unknown[np.setdiff1d(np.arange(len(unknown)), triangles)] = False  # unused, and of no colour: not there
+        # Vertices that no triangle uses need no class colour.
+        unknown[np.setdiff1d(np.arange(len(unknown)), triangles)] = False
     if unknown.any():
         stored = "".join(f"{round(255 * value):02x}" for value in color[unknown][0])
         raise ValueError(
-            f"colour #{stored} ({'linear' if linear else 'sRGB'}) of {unknown.sum()} vertices is no class's; paint"
-            " vertices or materials in the palette's colours (textures are not read)"
+            f"colour #{stored} ({'linear' if linear else 'sRGB'}) of {unknown.sum()} vertices is no class colour;"
+            " paint vertices or materials in palette colours (textures are not read)"
         )
     on_ground = IS_GROUND[votes.argmax(axis=1)][piece]
     if not len(triangles) and not on_ground.all():
-        raise ValueError("primitives are points without triangles; export boxes and spheres as meshes")
+        raise ValueError("the primitives are points without triangles; export boxes and spheres as meshes")
     ground_m, ground_id = vertices_m[on_ground], class_id[on_ground]
     faces = triangles[~on_ground[triangles[:, 0]]]
-    used, faces = np.unique(faces, return_inverse=True)  # a sphere's poles may lie there unused
+    used, faces = np.unique(faces, return_inverse=True)  # The poles of a sphere may be unused vertices.
     boxes, clouds = _find_primitives(vertices_m[used], class_id[used], faces.reshape(-1, 3))
     return MeshPieces(
         ground_m, _split_mixed(ground_m, np.where(IS_GROUND[ground_id], ground_id, EMPTY)), *boxes, clouds
@@ -88,17 +126,22 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
 
 
 def _split_connected(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
-    """(v,) number of the connected piece of each vertex."""
+    """Return the number of the connected piece of each vertex (v,)."""
     start, end = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
     graph = coo_array((np.ones(len(start), bool), (start, end)), shape=(num_vertices, num_vertices))
     return connected_components(graph, directed=False)[1] if num_vertices else np.zeros(0, int)
 
 
 def _split_mixed(ground_m: np.ndarray, class_id: np.ndarray) -> np.ndarray:
-    """Class ids of ground vertices, those between two classes' colours filled in from the nearest that has one."""
+    """Return the class ids of ground vertices.
+
+    A vertex whose colour lies between two classes gets the class of the nearest vertex with a class colour.
+    """
     mixed = class_id == EMPTY
     if mixed.sum() > MAX_MIXED * len(mixed):
-        raise ValueError(f"{mixed.sum()} of {len(mixed)} ground vertices have no class's colour; turn smoothing off")
+        raise ValueError(
+            f"{mixed.sum()} of {len(mixed)} ground vertices have no class colour; turn off colour smoothing"
+        )
     if mixed.any():
         _, nearest = cKDTree(ground_m[~mixed, :2]).query(ground_m[mixed, :2])
         class_id = class_id.copy()
@@ -109,9 +152,9 @@ def _split_mixed(ground_m: np.ndarray, class_id: np.ndarray) -> np.ndarray:
 def _find_primitives(
     points_m: np.ndarray, class_id: np.ndarray, faces: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[np.ndarray]]:
-    """(corners_m (b, 8, 3), class ids (b,)) of the boxes, and the vertices of each ellipsoid."""
+    """Return corners_m (b, 8, 3) and class ids (b,) of the boxes, and the vertices of each ellipsoid."""
     piece = _split_connected(faces, len(points_m))
-    if (np.bincount(piece) < 8).any():  # vertices are repeated along edges: sew
+    if (np.bincount(piece) < 8).any():  # The mesh repeats vertices along edges, so merge equal vertices.
         keys, place = np.unique(np.column_stack([points_m, class_id]), axis=0, return_inverse=True)
         points_m, class_id, faces = keys[:, :3], keys[:, 3].astype(np.int64), place.ravel()[faces]
         piece = _split_connected(faces, len(points_m))
@@ -122,7 +165,12 @@ def _find_primitives(
     _refuse(lowest != highest, points_m, start, "is painted in several colours")
     _refuse(size < 8, points_m, start, "has fewer than eight vertices")
     round_ = size > 8
-    _refuse(round_ & (lowest != VEGETATION[0]), points_m, start, "is no box, but not vegetation either")
+    _refuse(
+        round_ & (lowest != VEGETATION[0]),
+        points_m,
+        start,
+        "has more than eight vertices but is no vegetation",
+    )
     boxes = start[~round_]
     clouds = [points_m[first : first + count] for first, count in zip(start[round_], size[round_], strict=True)]
     return (points_m[boxes[:, None] + np.arange(8)], lowest[~round_]), clouds
@@ -143,10 +191,22 @@ def _refuse(bad: np.ndarray, points_m: np.ndarray, start: np.ndarray, what: str)
 def rasterize_ground(
     vertices_m: np.ndarray, class_id: np.ndarray, classes: tuple[str, ...], grid: Grid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """height_m (G, H, W) float32 and occupied (G, H, W) from ground vertices, one per pixel, all at corners or centres.
+    """Rasterise ground vertices that lie at the corner or the centre of a pixel, one per pixel.
 
-    A vertex at a pixel's corner is the far left one (x = front_m - row resolution_m). Of several vertices of one class
-    in a pixel the highest counts. Raises ValueError if they lie on neither, or outside.
+    A vertex at a corner belongs to the pixel whose far left corner it is (x = front_m - row resolution_m). Of several
+    vertices of one class in a pixel, the highest counts.
+
+    Args:
+        vertices_m: (v, 3) vertices in the scene frame (m), all at corners or all at centres.
+        class_id: (v,) class id of each vertex.
+        classes: G ground classes of the raster.
+        grid: Raster grid.
+
+    Returns:
+        height_m (G, H, W) float32 and occupied (G, H, W) bool.
+
+    Raises:
+        ValueError: The vertices lie neither at corners nor at centres, or they lie outside the grid.
     """
     at_px = (np.array([grid.front_m, grid.left_m]) - vertices_m[:, :2]) / grid.resolution_m
     from_corner, from_center = (np.abs(at - np.round(at)).max(initial=0) for at in (at_px, at_px - 0.5))

@@ -1,8 +1,9 @@
-"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes, junctions.
+"""Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes and junctions.
 
-Each line of centerlines.py becomes a road of cubics through points of its centreline, with one or more driving lanes on
-either side. Where lines meet, each road ends before the node, and a connecting road leads from it to every other road.
-OpenDRIVE's inertial frame is the scene frame; the header's offset is its position in the world. Right-hand traffic.
+Each road of centerlines.py becomes a road of cubic curves through points of its centreline, with at least one driving
+lane per side. Each road ends before its node. A connecting road then leads from each road at the node to every other
+road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header is the position of the scene in the
+world frame. Traffic keeps to the right.
 """
 
 from __future__ import annotations
@@ -18,27 +19,44 @@ from scipy.interpolate import CubicSpline
 from models.scene import Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
-KNOT_M = 5.0  # between points of a reference line
-LANE_M = 3.5  # half a road of about this width is one lane
-LEAST_ROAD_M = 2.0  # what is left of a road between its junctions
-CLEAR = 1.3  # half widths of the widest road that every road stops short of a node
-SAMPLES = 64  # of a cubic, for its length
+KNOT_M = 5.0  # Distance between points of a reference line
+LANE_M = 3.5  # One lane per side for about this half width of a road
+LEAST_ROAD_M = 2.0  # Minimum length of a road between its junctions
+CLEAR = 1.3  # Distance of road ends from a node, in half widths of the widest road
+SAMPLES = 64  # Number of samples per cubic that measure its length
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceLine:
-    """A smooth line through knots (k, 3); its parameter is the length of the chords."""
+    """A smooth curve through k knots, parametrised by chord length.
 
-    curve: CubicSpline  # chord length -> x, y, z
-    breaks: np.ndarray  # (k,) chord lengths of the knots
-    lengths_m: np.ndarray  # (k - 1,) of each piece, seen from above
-    width_m: np.ndarray  # (k,) of the whole road at the knots
+    Attributes:
+        curve: Map from chord length to x, y and z in the scene frame (m).
+        breaks: Chord length at each knot (m).
+        lengths_m: Length of each piece, seen from above (m).
+        width_m: Width of the whole road at each knot (m).
+    """
+
+    curve: CubicSpline
+    breaks: np.ndarray  # (k,)
+    lengths_m: np.ndarray  # (k - 1,)
+    width_m: np.ndarray  # (k,)
 
     @staticmethod
     def through(xyz_m: np.ndarray, width_m: np.ndarray, tangents: np.ndarray | None = None) -> ReferenceLine:
-        """Through points (k, 3); `tangents` (2, 2): the directions at both ends seen from above, if they are given."""
+        """Fit a curve through points.
+
+        Args:
+            xyz_m: (k, 3) points in the scene frame (m), k >= 2.
+            width_m: (k,) width of the whole road at the points (m).
+            tangents: (2, 2) unit directions at the first and last point, seen from above (default: free ends).
+
+        Returns:
+            The curve.
+        """
         breaks = np.append(0, np.cumsum(np.linalg.norm(np.diff(xyz_m[:, :2], axis=0), axis=1)))
-        ends: Any = "natural" if len(xyz_m) > 2 else "not-a-knot"  # scipy annotates a string; tuples are documented
+        # The annotation of scipy allows only a string; its documentation also allows tuples.
+        ends: Any = "natural" if len(xyz_m) > 2 else "not-a-knot"
         if tangents is not None:
             slope = (xyz_m[-1, 2] - xyz_m[0, 2]) / breaks[-1]
             ends = tuple((1, np.append(tangent, slope)) for tangent in tangents)
@@ -49,21 +67,36 @@ class ReferenceLine:
 
     @property
     def length_m(self) -> float:
+        """Length seen from above (m)."""
         return float(self.lengths_m.sum())
 
     @property
     def starts_m(self) -> np.ndarray:
-        """(k,) length of the line up to each knot."""
+        """(k,) length of the line up to each knot (m)."""
         return np.append(0, np.cumsum(self.lengths_m))
 
     def end(self, which: int) -> tuple[np.ndarray, np.ndarray]:
-        """Point (3,) and direction (2,), along the line, of its start (0) or end (-1)."""
+        """Return the position and direction of an end.
+
+        Args:
+            which: 0 for the first point, -1 for the last point.
+
+        Returns:
+            Point (3,) in the scene frame (m), and unit direction (2,) along the line.
+        """
         direction = self.curve(self.breaks[which], 1)[:2]
         return self.curve(self.breaks[which]), direction / np.linalg.norm(direction)
 
 
 def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
-    """A line for each road, cut short where a junction begins."""
+    """Fit a curve to each road, shortened where a junction begins.
+
+    Args:
+        network: Roads and nodes.
+
+    Returns:
+        One curve per road, in the order of the roads.
+    """
     clear_m = [
         CLEAR * max(float(np.median(road.width_m)) for road in network.list_leaving(node)) / 2
         for node in range(len(network.nodes_m))
@@ -80,18 +113,35 @@ def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> Referen
     low, high = from_start_m * min(1, spare_m), along[-1] - from_end_m * min(1, spare_m)
     at = np.linspace(low, high, max(2, round((high - low) / KNOT_M) + 1))
     xyz_m = np.stack([np.interp(at, along, road.xyz_m[:, axis]) for axis in range(3)], axis=1)
-    usual_m = np.median(road.width_m)  # at forks the mask is wider than any road there
+    usual_m = np.median(road.width_m)  # At forks, the mask is wider than any of the roads.
     width_m = np.interp(at, along, np.minimum(road.width_m, 1.15 * usual_m))
     return ReferenceLine.through(xyz_m, width_m)
 
 
 def list_lanes(line: ReferenceLine) -> int:
-    """Driving lanes on either side."""
+    """Return the number of driving lanes per side.
+
+    Args:
+        line: Reference line of a road.
+
+    Returns:
+        Half the median width divided by LANE_M, rounded, at least 1.
+    """
     return max(1, round(float(np.median(line.width_m)) / 2 / LANE_M))
 
 
 def export_opendrive(scene: Scene) -> bytes:
-    """The scene's roads as an OpenDRIVE file. Raises ValueError for a scene without a road."""
+    """Export the roads of a scene as an OpenDRIVE file.
+
+    Args:
+        scene: Scene with a road class.
+
+    Returns:
+        Content of the .xodr file.
+
+    Raises:
+        ValueError: The scene has no road.
+    """
     network = extract_road_network(scene)
     if not network.roads:
         raise ValueError(f"scene {scene.scene_id} has no road to export")
@@ -106,7 +156,7 @@ def export_opendrive(scene: Scene) -> bytes:
                 ET.SubElement(link, name, elementType="junction", elementId=_make_junction_id(node))
         _make_road_body(element, line, left=list_lanes(line), right=list_lanes(line))
     junctions = [_make_junction(root, network, lines, node) for node in range(len(network.nodes_m))]
-    root.extend(junctions)  # after all roads
+    root.extend(junctions)  # Junctions follow all roads.
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -143,14 +193,18 @@ def _make_road(root: ET.Element, number: int, line: ReferenceLine, junction: int
 def _make_road_body(
     road: ET.Element, line: ReferenceLine, left: int, right: int, links: tuple[int, int] | None = None
 ) -> None:
-    """Plan, elevation and lanes; `links`: signs of the lane numbers before and after a connecting road's."""
+    """Write plan, elevation and lanes of a road.
+
+    For a connecting road, `links` holds the signs of the lane numbers of the previous and the next road.
+    """
     ET.SubElement(ET.SubElement(road, "type", s="0", type="town"), "speed", max="50", unit="km/h")
     plan, profile = ET.SubElement(road, "planView"), ET.Element("elevationProfile")
     for piece, (start, s, length_m) in enumerate(
         zip(line.breaks[:-1], line.starts_m[:-1], line.lengths_m, strict=True)
     ):
         chord = line.breaks[piece + 1] - start
-        cubic = line.curve.c[::-1, piece] * chord ** np.arange(4)[:, None]  # (4, 3), of a parameter from 0 to 1
+        # (4, 3) coefficients for a parameter in [0, 1]
+        cubic = line.curve.c[::-1, piece] * chord ** np.arange(4)[:, None]
         x, y, z = cubic.T
         heading = float(np.arctan2(y[1], x[1]))
         cos, sin = np.cos(heading), np.sin(heading)
@@ -192,7 +246,7 @@ def _make_road_body(
 
 
 def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
-    """The width of one of a side's lanes, linear from knot to knot."""
+    """Write the width of a lane, piecewise linear between knots."""
     width_m = line.width_m / 2 / lanes
     slope = np.diff(width_m) / line.lengths_m
     for s, a, b in zip(line.starts_m[:-1], width_m[:-1], slope, strict=True):
@@ -200,7 +254,7 @@ def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
 
 
 def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[ReferenceLine], node: int) -> ET.Element:
-    """A junction, and in `root` the roads that lead through it."""
+    """Return the element of a junction, and add its connecting roads to `root`."""
     junction = ET.Element("junction", id=_make_junction_id(node), name="", type="default")
     ends = [
         (road.number, end)
@@ -221,7 +275,8 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         points = ["end" if come_end else "start", "end" if go_end else "start"]
         for name, other, point in zip(("predecessor", "successor"), (come, go), points, strict=True):
             ET.SubElement(link, name, elementType="road", elementId=str(other), contactPoint=point)
-        # Traffic keeps right. It leaves a road's end on the negative lanes, and a road's start on the positive lanes.
+        # Traffic keeps to the right. It leaves a road on negative lanes at the road's end, and on positive lanes at its
+        # start.
         signs = (-1 if come_end else 1), (1 if go_end else -1)
         _make_road_body(road, line, left=0, right=lanes, links=signs)
         about = {"incomingRoad": str(come), "connectingRoad": str(number), "contactPoint": "start"}

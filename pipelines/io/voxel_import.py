@@ -1,12 +1,14 @@
-"""Voxel grids of any method <-> .npz files, and their pictures from above.
+"""Read and write voxel grids of any method as .npz files, and draw them from above.
 
-One scene per file: the array `voxels`, or the only one, of integer class ids, the authors' (docs/imports.md; our
-palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4 parking, 5 road, 6 vegetation_cuboid, 7 vegetation_ellipsoid,
-8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human, 12 construction_big, 13 construction_small, 14 pole,
-15 traffic_control, 16 object; 17, crossing, is ours. 256 x 256 x 32 over the 64 x 64 m of the crop, or 128 x 128 x 16,
-or 64 x 64 x 8: coarse voxels are repeated (nearest neighbour), as the paper does with its baselines.
+A file holds one scene: the array `voxels`, or the only array, of integer class ids. The ids are those of the authors
+(docs/how_to/import_scenes.md; palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4 parking, 5 road, 6
+vegetation_cuboid, 7 vegetation_ellipsoid, 8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human, 12
+construction_big, 13 construction_small, 14 pole, 15 traffic_control, 16 object. This project adds 17, crossing. An
+array has 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 voxels over the 64 x 64 m of the crop. Coarse voxels are
+repeated (nearest neighbour), as the paper does with its baselines.
 
-Our axes: rows backwards (row 0 farthest ahead), columns to the right (column 0 leftmost), levels upwards.
+In this project's axis order, rows point backwards (row 0 is farthest ahead), columns point to the right (column 0 is
+leftmost), and levels point upwards.
 """
 
 from __future__ import annotations
@@ -27,13 +29,21 @@ VOXEL_AXES: Axes = ("x-", "y-", "z+")
 ARRAY = "voxels"
 FULL = VoxelGrid().shape
 SHAPES = tuple(tuple(n // factor for n in FULL) for factor in (1, 2, 4))
-MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # of 64-bit numbers, and the array's header
+MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size of an array of 64-bit numbers with its header
 
 
 def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
-    """(256, 256, 32) uint8 class ids of one scene, in our axes, from an .npz file whose axes point as `axes` says.
+    """Read the voxels of one scene from an .npz file.
 
-    Raises ValueError that names the file, what was found and what is expected.
+    Args:
+        uri: Path or URI of the file.
+        axes: Directions of the axes of the array in the file.
+
+    Returns:
+        (256, 256, 32) uint8 class ids in this project's axis order.
+
+    Raises:
+        ValueError: The file is invalid. The message names the file, its content and the expected content.
     """
     shown = " or ".join(" x ".join(map(str, shape)) for shape in SHAPES)
     try:
@@ -46,7 +56,10 @@ def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
         raise ValueError(f"{uri}: holds {found} of {voxels.dtype}; expected {shown} integers in axes {' '.join(axes)}")
     if voxels.min() < 0 or voxels.max() >= NUM_CLASSES:
         wrong = np.unique(voxels[(voxels < 0) | (voxels >= NUM_CLASSES)])[:5].tolist()
-        raise ValueError(f"{uri}: class ids {wrong}; expected 0 (empty) to {NUM_CLASSES - 1}, as in docs/imports.md")
+        raise ValueError(
+            f"{uri}: holds the class ids {wrong}; expected 0 (empty) to {NUM_CLASSES - 1},"
+            " as in docs/how_to/import_scenes.md"
+        )
     voxels = voxels.astype(np.uint8)
     for axis, factor in enumerate(np.array(FULL) // voxels.shape):
         voxels = voxels.repeat(factor, axis=axis)
@@ -60,13 +73,24 @@ def _read_only_array(content: bytes) -> np.ndarray:
     if name != ARRAY and len(sizes) != 1:
         raise ValueError(f"holds {', '.join(sizes) or 'nothing'}")
     if sizes[name] > MAX_BYTES:
-        raise ValueError(f"{name!r} takes {sizes[name]} bytes, more than one scene")
+        raise ValueError(f"{name!r} has {sizes[name]} bytes, more than one scene needs")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return arrays[name]
 
 
 def convert_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
-    """A view of voxels with rows backwards, columns to the right and levels upwards. Raises ValueError."""
+    """Reorder voxels so that rows point backwards, columns to the right and levels upwards.
+
+    Args:
+        voxels: Three-dimensional array in the axis order of a file.
+        axes: Directions of the axes of `voxels`.
+
+    Returns:
+        A view of `voxels` in this project's axis order.
+
+    Raises:
+        ValueError: The array is not three-dimensional, or the axes are invalid.
+    """
     ours_from_file = compute_scene_from_axes(VOXEL_AXES).T @ compute_scene_from_axes(axes)
     if voxels.ndim != 3:
         raise ValueError(f"holds an array of shape {voxels.shape}")
@@ -75,28 +99,49 @@ def convert_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
 
 
 def export_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
-    """The scene's voxels as `read_voxels` takes them: a compressed .npz, the same bytes on every call.
+    """Export the voxels of a scene in the format that `read_voxels` reads.
 
-    Raises ValueError if the grid's shape is none of SHAPES.
+    Args:
+        scene: Scene.
+        grid: Voxel grid (default: 256 x 256 x 32).
+
+    Returns:
+        Content of a compressed .npz file; equal input gives equal bytes.
+
+    Raises:
+        ValueError: `read_voxels` does not accept the shape of the grid.
     """
     voxels = voxelize(scene, grid or VoxelGrid())
     if voxels.shape not in SHAPES:
-        raise ValueError(f"a voxel grid of {voxels.shape} cannot be read back, expected one of {SHAPES}")
+        raise ValueError(f"a voxel grid of shape {voxels.shape} cannot be read back, expected one of {SHAPES}")
     content = io.BytesIO()
-    np.savez_compressed(
-        content, **cast("dict[str, Any]", {ARRAY: voxels})
-    )  # the annotation covers allow_pickle as well
+    # The cast is needed because numpy's annotation of keyword arguments includes allow_pickle.
+    np.savez_compressed(content, **cast("dict[str, Any]", {ARRAY: voxels}))
     return content.getvalue()
 
 
 def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
-    """Writes `export_voxels_npz`."""
+    """Write the voxels of a scene to an .npz file.
+
+    Args:
+        uri: Path or URI of the file.
+        scene: Scene.
+        grid: Voxel grid (default: 256 x 256 x 32).
+    """
     content = export_voxels_npz(scene, grid)
     storage.write_whole(uri, lambda stream: stream.write(content))
 
 
 def draw_voxels(voxels: np.ndarray) -> np.ndarray:
-    """(rows, cols, 3) uint8 sRGB from above: the colour of each column's topmost filled voxel, white where none is."""
+    """Draw voxels from above: each pixel has the colour of the topmost filled voxel in its column.
+
+    Args:
+        voxels: (rows, cols, levels) uint8 class ids.
+
+    Returns:
+        (rows, cols, 3) uint8 sRGB, white for empty columns.
+    """
     filled = voxels != EMPTY
-    top = voxels.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)  # the highest level, empty, where nothing is
+    # In an empty column, this is the highest level, which is EMPTY.
+    top = voxels.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)
     return CLASS_COLORS[np.take_along_axis(voxels, top[:, :, None], axis=2)[:, :, 0]]

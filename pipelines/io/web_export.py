@@ -1,4 +1,4 @@
-"""A Scene as what web/viewer.js shows: JSON of primitives, ground heights and a picture of the ground."""
+"""Convert a Scene to JSON for web/viewer.js: primitives, ground heights and an image of the ground."""
 
 from __future__ import annotations
 
@@ -14,11 +14,20 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.masks import find_nearest_true
 from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
-NODES = 65  # of the ground's heights along the longer side, 1 m apart in a crop
+NODES = 65  # Number of ground heights along the longer side; they are 1 m apart in a crop.
 
 
 def export_web_scene(scene: Scene) -> dict:
-    """JSON for the viewer. Ground heights are rounded to centimetres and thinned; primitives are whole."""
+    """Convert a scene to JSON for the viewer.
+
+    Ground heights are rounded to centimetres and resampled to a coarser grid. All primitives are included.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Dictionary with the keys scene_id, grid, ground and primitives.
+    """
     return {
         "scene_id": scene.scene_id,
         "grid": asdict(scene.grid),
@@ -39,7 +48,14 @@ def _export_ground(scene: Scene) -> dict:
 
 
 def draw_ground(scene: Scene) -> str:
-    """The ground's classes from above as a PNG data URI, transparent where nothing is known."""
+    """Draw the ground classes from above.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        PNG image as a data URI, transparent where the scene has no ground.
+    """
     class_id = list_ground_ids(scene)[scene.surface()[1]]
     image = Image.fromarray(class_id, "P")
     image.putpalette(CLASS_COLORS.ravel().tolist())

@@ -21,7 +21,7 @@ def compute_scene_from_axes(axes: Axes) -> np.ndarray:
     """
     if sorted(word[:1] for word in axes) != ["x", "y", "z"] or any(word[1:] not in ("+", "-") for word in axes):
         raise ValueError(
-            f"axes {' '.join(axes)!r} is no axis order; name x (forward), y (left) and z (up) once each with a sign,"
+            f"axes {' '.join(axes)!r} are invalid; name x (forward), y (left) and z (up) once each with a sign,"
             " as in: x+ y- z-"
         )
     matrix = np.zeros((3, 3))

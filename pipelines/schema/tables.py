@@ -3,7 +3,7 @@
 A dataset directory holds the tables `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`. Hive directories
 `source=.../split=.../part-<shard>.parquet` partition each table. Part k of every table holds the same scenes in the
 same order, so a reader needs no join. Column names contain units, and the metadata of every file describes its columns.
-docs/tables.md documents the tables for users.
+docs/reference/tables.md documents the tables for users.
 """
 
 from __future__ import annotations

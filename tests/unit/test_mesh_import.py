@@ -327,14 +327,20 @@ FAULTS = {
     "many": (lambda: with_json(lambda t: t["accessors"][0].update(count=10**12)), "more than"),
     "missing": (lambda: with_json(lambda t: t.pop("accessors")), "not well-formed"),
     "number": (lambda: with_json(lambda t: t.update(nodes=7)), "not well-formed"),
-    "grid": (lambda: with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)), "its grid is"),
-    "extras": (lambda: with_json(lambda t: t["nodes"][-1]["extras"].pop("label")), "extras are incomplete"),
-    "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class's"),
-    "colour": (green, r"colour #0ac80a \(sRGB\) of 8 vertices is no class's"),
+    "grid": (
+        lambda: with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)),
+        "the grid .* is invalid",
+    ),
+    "extras": (
+        lambda: with_json(lambda t: t["nodes"][-1]["extras"].pop("label")),
+        "extras of this export are incomplete",
+    ),
+    "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class colour"),
+    "colour": (green, r"colour #0ac80a \(sRGB\) of 8 vertices is no class colour"),
     "sheared": (sheared, "eight vertices that are not the corners of a box|corners are not square"),
-    "welded": (lambda: welded_boxes("vehicle_small"), "no box, but not vegetation"),
+    "welded": (lambda: welded_boxes("vehicle_small"), "more than eight vertices but is no vegetation"),
     "bush": (lambda: welded_boxes("vegetation_cuboid"), "neither on a box nor on an ellipsoid"),
-    "ball": (lambda: one_mesh(*three_sphere(), "vehicle_small"), "no box, but not vegetation"),
+    "ball": (lambda: one_mesh(*three_sphere(), "vehicle_small"), "more than eight vertices but is no vegetation"),
     "flat": (lambda: one_mesh(three_box()[0] * [1, 1, 0], three_box()[1]), "thinner than 1 mm"),
     "triangle": (lambda: one_mesh(np.eye(3), [[0, 1, 2]]), "fewer than eight"),
     "nan": (lambda: one_mesh(np.full((8, 3), np.nan), three_box()[1]), "NaN"),
@@ -354,7 +360,7 @@ def test_scene_from_glb_rejects_wrong_frame_and_axes(town_scenes):
     glb = authors_glb(town_scenes[0])
     with pytest.raises(ValueError, match=r"ground vertices, x .* are not one per pixel .*check the axes"):
         import_glb(glb, axes=("y+", "x+", "z+"))
-    with pytest.raises(ValueError, match=r"axes 'x\+ x\+ z\+': name x"):
+    with pytest.raises(ValueError, match=r"axes 'x\+ x\+ z\+' are invalid; name x"):
         import_glb(glb, axes=("x+", "x+", "z+"))
 
 
