@@ -1,1 +1,1 @@
-"""Edits and repair of single scenes."""
+"""Edit and repair single scenes."""

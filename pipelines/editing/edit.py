@@ -1,7 +1,7 @@
-"""Edits of a scene's primitives: choose some, change their parameters exactly, keep the list of what was done.
+"""Edit the primitives of a scene: select primitives, change their parameters exactly, and record the changes.
 
-A list of edits is data: the same list replayed on the same scene gives the same scene, bit for bit, and it can be
-replayed on any other. As JSON it is a list of objects such as
+A list of edits is data. The same list applied to the same scene gives a bit-identical result. The list can also be
+applied to other scenes. In JSON, it is a list of objects such as
 
     {"edit": "translate", "select": {"category": ["vehicle_small"], "where": "length_m > 4"}, "by_m": [5, 0, 0]}
 """
@@ -32,42 +32,56 @@ from pipelines.editing.repair import GroundFaults, find_removable_objects, separ
 from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.schema.tables import PRIMITIVES, make_primitives_table
 
-SIZES_M = (1e-3, 1e3)  # what an edit may leave
+SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit
 
 
 @dataclass(frozen=True)
 class Select:
-    """Primitives of a scene: those that fit everything that is named."""
+    """Selection of primitives that satisfy all given conditions."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     category: tuple[str, ...] = ()
-    """Of one of these categories."""
+    """Categories of the primitives."""
     primitives: tuple[int, ...] = ()
-    """By number, as in the scene's rows of the primitives table, from 0."""
+    """Numbers of the primitives (from 0), in the order of the scene's rows in the primitives table."""
     instances: tuple[int, ...] = ()
-    """By instance_id."""
+    """Values of instance_id."""
     polygon_m: tuple[float, ...] = ()
-    """Centre inside a polygon: x y of its corners in metres, x ahead, y left."""
+    """Polygon that contains the centre: x y of each corner in the scene frame (m), x forward, y left."""
     where: str = ""
-    """A condition in SQL on columns of the primitives table, such as "length_m > 4 and y_m < 0"; "true" for all."""
+    """SQL condition on columns of the primitives table, such as "length_m > 4 and y_m < 0"; "true" selects all."""
 
     def check(self) -> None:
-        """Raises ValueError for what no scene can answer: nothing named, no such category, a condition that is none."""
+        """Check the conditions without a scene.
+
+        Raises:
+            ValueError: No condition is given, a category is unknown, or the SQL condition is invalid.
+        """
         self._check_names()
         if self.where:
             _evaluate_where(PRIMITIVES.empty_table(), self.where)
 
     def _check_names(self) -> None:
         if self == Select():
-            raise ValueError("no primitives are chosen: give category, primitives, instances, polygon-m or where")
+            raise ValueError("the selection has no condition; give category, primitives, instances, polygon-m or where")
         for name in self.category:
             _parse_category(name)
         if len(self.polygon_m) % 2:
-            raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
+            raise ValueError(f"the polygon has {len(self.polygon_m)} numbers, expected pairs x y x y ... in metres")
 
     def select_primitives(self, scene: Scene) -> np.ndarray:
-        """(n,) bool. Raises ValueError as `check` does, or for primitives the scene does not have."""
+        """Select primitives of a scene.
+
+        Args:
+            scene: Scene with n primitives.
+
+        Returns:
+            (n,) bool.
+
+        Raises:
+            ValueError: The conditions are invalid, or a number names no primitive of the scene.
+        """
         self._check_names()
         fits = np.ones(len(scene), bool)
         if self.category:
@@ -75,7 +89,9 @@ class Select:
         if self.primitives:
             numbers = ", ".join(map(str, self.primitives))
             if not -1 < min(self.primitives) <= max(self.primitives) < len(scene):
-                raise ValueError(f"scene {scene.scene_id} has {len(scene)} primitives, from 0 on, not {numbers}")
+                raise ValueError(
+                    f"scene {scene.scene_id} has {len(scene)} primitives, numbered from 0; got the numbers {numbers}"
+                )
             fits &= np.isin(np.arange(len(scene)), self.primitives)
         if self.instances:
             fits &= np.isin(scene.instance_id, self.instances)
@@ -87,7 +103,7 @@ class Select:
 
 
 def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
-    """(n,) bool: rows of a primitives table that a condition in SQL holds for."""
+    """Return (n,) bool: the rows of a primitives table that satisfy an SQL condition."""
     table = table.append_column("row", pa.array(np.arange(len(table))))
     with duckdb.connect(config={"enable_external_access": False}) as connection:
         try:
@@ -95,14 +111,15 @@ def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
             raise ValueError(
-                f"where {condition!r}: {first}; docs/tables.md names the columns, text stands in 'single quotes'"
+                f"the where condition {condition!r} is invalid: {first}; docs/reference/tables.md lists the columns;"
+                " write text in 'single quotes'"
             ) from error
     return np.isin(np.arange(len(table)), rows)
 
 
 @dataclass(frozen=True)
 class Edit(ABC):
-    """One change of the primitives that `select` names."""
+    """One change of selected primitives."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -110,28 +127,57 @@ class Edit(ABC):
 
     @property
     def name(self) -> str:
+        """Name of the edit in JSON."""
         return type(self).__name__.lower()
 
     def check(self) -> None:
-        """Raises ValueError for an edit that no scene can take, or that changes none."""
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The edit is invalid for every scene, or it changes nothing.
+        """
         self.select.check()
 
     @abstractmethod
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
-        """Return the scene with its chosen (n,) primitives changed, and the previous number (m,) of each primitive.
+        """Apply the edit to selected primitives of a scene.
 
-        Raises ValueError for a broken result.
+        Args:
+            scene: Scene with n primitives.
+            chosen: (n,) bool; the selected primitives.
+
+        Returns:
+            The edited scene, and the number (m,) that each of its primitives has in `scene`.
+
+        Raises:
+            ValueError: A primitive of the result has an invalid position or size.
         """
 
 
 class ObjectEdit(Edit):
-    """An edit after which every primitive is still there, in its place of the list."""
+    """An edit that keeps the number and the order of the primitives."""
 
     @abstractmethod
     def transform(self, part: Scene) -> Scene:
-        """A scene of the chosen primitives only -> what they become. Its ground is the whole scene's."""
+        """Change primitives.
+
+        Args:
+            part: Scene with only the selected primitives; its ground is that of the whole scene.
+
+        Returns:
+            The same primitives after the edit, in the same order.
+        """
 
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        """Apply the edit to selected primitives of a scene.
+
+        Args:
+            scene: Scene with n primitives.
+            chosen: (n,) bool; the selected primitives.
+
+        Returns:
+            The edited scene, and the numbers 0 .. n - 1.
+        """
         part = require_valid_objects(self.transform(scene.select(chosen)))
         place = np.arange(len(scene))
         place[chosen] = len(scene) + np.arange(len(part))
@@ -139,33 +185,68 @@ class ObjectEdit(Edit):
 
 
 def require_valid_objects(part: Scene) -> Scene:
-    """The same scene. Raises ValueError if a primitive is nowhere, or no size for a thing."""
+    """Check the positions and sizes of primitives.
+
+    Args:
+        part: Scene after an edit.
+
+    Returns:
+        The same scene.
+
+    Raises:
+        ValueError: A position is not finite, or a size lies outside 1 mm to 1 km.
+    """
     size_m = part.size_m
     if not (np.isfinite(part.center_m).all() and ((size_m >= SIZES_M[0]) & (size_m <= SIZES_M[1])).all()):
-        raise ValueError(f"a primitive of scene {part.scene_id} would be thinner than 1 mm, beyond 1 km or nowhere")
+        raise ValueError(
+            f"a primitive of scene {part.scene_id} would be thinner than 1 mm, longer than 1 km or not finite"
+        )
     return part
 
 
 @dataclass(frozen=True)
 class Remove(Edit):
-    """Take primitives out."""
+    """Remove the selected primitives."""
 
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        """Remove the selected primitives.
+
+        Args:
+            scene: Scene with n primitives.
+            chosen: (n,) bool; the selected primitives.
+
+        Returns:
+            The scene without these primitives, and the previous number of each remaining primitive.
+        """
         return scene.select(~chosen), np.flatnonzero(~chosen)
 
 
 @dataclass(frozen=True)
 class Duplicate(Edit):
-    """Put copies at the end of the list, moved along the scene's axes; a copy has no instance_id."""
+    """Append copies of the selected primitives, displaced along the scene axes; a copy has no instance_id."""
 
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """x (ahead), y (left), z (up) in metres."""
+    """Displacement of the copies in the scene frame: x (forward), y (left), z (up), in metres."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, or the displacement is 0 or not finite.
+        """
         super().check()
         _check_way(self.by_m)
 
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        """Append copies of the selected primitives.
+
+        Args:
+            scene: Scene with n primitives.
+            chosen: (n,) bool; the selected primitives.
+
+        Returns:
+            The edited scene, and the number of each primitive or of its original in `scene`.
+        """
         copies = require_valid_objects(Translate(by_m=self.by_m).transform(scene.select(chosen)))
         copies = replace(copies, instance_id=np.full(len(copies), -1, np.int64))
         return replace(scene, **concatenate_primitives([scene, copies])), np.append(
@@ -175,22 +256,36 @@ class Duplicate(Edit):
 
 @dataclass(frozen=True)
 class Translate(ObjectEdit):
-    """Move."""
+    """Move the selected primitives."""
 
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """x (ahead), y (left), z (up) in metres."""
+    """Displacement along the three axes that `along` names, in metres."""
     along: Literal["scene", "own"] = "scene"
-    """Along the scene's axes, or each primitive's own: length (the way it heads, if known), width, height."""
+    """Axes of the displacement. "scene" means x (forward), y (left) and z (up) of the scene frame. "own" means the
+    length, width and height axes of each primitive; a known heading sets the sign of the length axis."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, or the displacement is 0 or not finite.
+        """
         super().check()
         _check_way(self.by_m)
 
     def transform(self, part: Scene) -> Scene:
+        """Move primitives.
+
+        Args:
+            part: Scene with only the selected primitives.
+
+        Returns:
+            The moved primitives.
+        """
         way_m = np.broadcast_to(np.array(self.by_m, float), (len(part), 3))
         if self.along == "own":
             ahead = np.stack([np.cos(part.heading_rad), np.sin(part.heading_rad), np.zeros(len(part))], axis=1)
-            backward = (part.rotation[:, :, 0] * ahead).sum(axis=1) < 0  # NaN, an unknown heading, is not
+            backward = (part.rotation[:, :, 0] * ahead).sum(axis=1) < 0  # An unknown heading (NaN) is not backward.
             turned = part.rotation * np.where(backward[:, None], [-1, -1, 1], 1)[:, None, :]
             way_m = (turned @ way_m[:, :, None])[:, :, 0]
         return replace(part, center_m=(part.center_m + way_m).astype(np.float32))
@@ -198,18 +293,32 @@ class Translate(ObjectEdit):
 
 @dataclass(frozen=True)
 class Rotate(ObjectEdit):
-    """Turn about the vertical, counter-clockwise seen from above."""
+    """Rotate the selected primitives about the vertical axis, counter-clockwise seen from above."""
 
     by_deg: float = 0.0
+    """Angle in degrees."""
     about_m: tuple[float, float] | None = None
-    """x and y of the axis (default: each primitive's own centre)."""
+    """Position x y of the vertical axis in the scene frame, in metres (default: the centre of each primitive)."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, or the angle is not finite or a multiple of 360 degrees.
+        """
         super().check()
         if not np.isfinite(self.by_deg) or self.by_deg % 360 == 0:
-            raise ValueError(f"rotate by {self.by_deg} degrees turns nothing")
+            raise ValueError(f"a rotation by {self.by_deg} degrees changes nothing")
 
     def transform(self, part: Scene) -> Scene:
+        """Rotate primitives.
+
+        Args:
+            part: Scene with only the selected primitives.
+
+        Returns:
+            The rotated primitives.
+        """
         by_rad = np.deg2rad(self.by_deg)
         turn = make_yaw_rotation(by_rad)
         rotation, size_m = canonicalize_boxes(turn @ part.rotation.astype(float), part.size_m)
@@ -229,19 +338,32 @@ class Rotate(ObjectEdit):
 
 @dataclass(frozen=True)
 class Scale(ObjectEdit):
-    """Make larger or smaller along a primitive's own axes."""
+    """Scale the selected primitives along their own axes."""
 
     by: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors of length, width and height."""
+    """Scale factors of length, width and height."""
     hold: Literal["bottom", "centre"] = "bottom"
-    """What stays where it is."""
+    """Point of each primitive that keeps its position."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, a factor is not above 0, or all factors are 1.
+        """
         super().check()
         if not all(np.isfinite(self.by)) or min(self.by) <= 0 or set(self.by) == {1}:
-            raise ValueError(f"scale by {list(self.by)}: expected factors above 0, not all of them 1")
+            raise ValueError(f"the scale factors are {list(self.by)}, expected values above 0 that are not all 1")
 
     def transform(self, part: Scene) -> Scene:
+        """Scale primitives.
+
+        Args:
+            part: Scene with only the selected primitives.
+
+        Returns:
+            The scaled primitives.
+        """
         rotation, size_m = canonicalize_boxes(part.rotation, part.size_m * np.array(self.by, np.float32))
         part_scaled = replace(part, rotation=rotation, size_m=size_m)
         if self.hold == "centre":
@@ -252,29 +374,51 @@ class Scale(ObjectEdit):
 
 @dataclass(frozen=True)
 class Relabel(ObjectEdit):
-    """Give another category; vegetation_ellipsoid makes ellipsoids, every other cuboids."""
+    """Change the category; the category vegetation_ellipsoid makes ellipsoids, and all others make cuboids."""
 
     category: str = "object"
+    """New category."""
     label: str | None = None
-    """The dataset's own class name (default: the category's)."""
+    """Class name in the source dataset (default: the name of the category)."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, or the category is unknown.
+        """
         super().check()
         _parse_category(self.category)
 
     def transform(self, part: Scene) -> Scene:
+        """Change the category and the label of primitives.
+
+        Args:
+            part: Scene with only the selected primitives.
+
+        Returns:
+            The relabelled primitives.
+        """
         index, label = _parse_category(self.category), self.label or self.category
         return replace(part, category=np.full_like(part.category, index), label=np.full(len(part), label, object))
 
 
 @dataclass(frozen=True)
 class Snap(ObjectEdit):
-    """Put the lowest point on the ground under the centre; what is over no known ground stays."""
+    """Move the lowest point to the ground under the centre; a primitive without ground below keeps its position."""
 
     slab_offset_m: float = SLAB_OFFSET_M
-    """How far the ground's heights lie above the surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2."""
+    """Height of the ground raster above the real surface, in m: 0.3 for KITTI-360 and the town, 0 for Argoverse 2."""
 
     def transform(self, part: Scene) -> Scene:
+        """Move primitives vertically to the ground.
+
+        Args:
+            part: Scene with only the selected primitives and the ground of the whole scene.
+
+        Returns:
+            The moved primitives.
+        """
         height_m, _ = part.ground_under()
         above_m = part.bottom_m - (height_m - self.slab_offset_m)
         return replace(part, center_m=_raise_objects(part, -np.nan_to_num(above_m)))
@@ -282,30 +426,48 @@ class Snap(ObjectEdit):
 
 @dataclass(frozen=True)
 class Repair(Edit):
-    """Mend faults (metrics/validity.py) by as little as it takes: onto the ground, apart, else out."""
+    """Repair faults (metrics/validity.py): snap to the ground, separate overlaps, or remove primitives."""
 
     slab_offset_m: float = SLAB_OFFSET_M
-    """As for snap."""
+    """Height of the ground raster above the real surface, in metres, as for snap."""
     ground: GroundFaults = "both"
-    """What to put on the ground."""
+    """Primitives to move to the ground: floating ones, sunken ones, both or none."""
     push_m: float = 0.25
-    """How far overlapping things may be pushed, each."""
+    """Maximum horizontal displacement of each overlapping primitive, in metres."""
     shrink: float = 0.95
-    """To what share of its size a thing may shrink where pushing is not enough."""
+    """Minimum scale factor of a primitive, used where a displacement does not end the overlap."""
     drop: bool = True
-    """Take out one of two that overlap all the same."""
+    """Whether to remove one of two primitives that still overlap."""
 
     def check(self) -> None:
+        """Check the edit without a scene.
+
+        Raises:
+            ValueError: The selection is invalid, or push_m or shrink lies outside its range.
+        """
         super().check()
         if not 0 <= self.push_m < np.inf:
-            raise ValueError(f"push_m is {self.push_m}, expected metres, 0 or more")
+            raise ValueError(f"push_m is {self.push_m}, expected a finite distance of at least 0 m")
         if not 0 < self.shrink <= 1:
-            raise ValueError(f"shrink is {self.shrink}, expected a share of the size above 0, at most 1 (no shrinking)")
+            raise ValueError(f"shrink is {self.shrink}, expected a factor in (0, 1], where 1 means no shrinking")
 
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
+        """Repair selected primitives of a scene.
+
+        Args:
+            scene: Scene with n primitives.
+            chosen: (n,) bool; the selected primitives.
+
+        Returns:
+            The repaired scene, and the previous number of each remaining primitive.
+
+        Raises:
+            ValueError: A primitive of the result has an invalid position or size.
+        """
         scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)
         scene = require_valid_objects(separate_objects(scene, chosen, self.push_m, self.shrink))
-        scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)  # where a push led over a slope
+        # A displacement may have moved a primitive over a slope.
+        scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)
         gone = find_removable_objects(scene, chosen) if self.drop else np.zeros(len(scene), bool)
         return scene.select(~gone), np.flatnonzero(~gone)
 
@@ -314,13 +476,13 @@ EDITS = {kind.__name__.lower(): kind for kind in (Remove, Duplicate, Translate, 
 
 
 def _raise_objects(part: Scene, up_m: np.ndarray) -> np.ndarray:
-    """(n, 3) centres moved up by up_m (n,)."""
+    """Return the centres (n, 3) after an upward displacement of up_m (n,)."""
     return (part.center_m + up_m[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)
 
 
 def _check_way(by_m: Sequence[float]) -> None:
     if not np.isfinite(by_m).all() or not any(by_m):
-        raise ValueError(f"by_m is {list(by_m)}: expected metres along x, y and z, not all 0")
+        raise ValueError(f"by_m is {list(by_m)}, expected finite metres along x, y and z that are not all 0")
 
 
 def _parse_category(name: str) -> int:
@@ -330,17 +492,34 @@ def _parse_category(name: str) -> int:
 
 
 class ObjectChange(NamedTuple):
-    """What an edit did, a row per primitive it touched; numbers are those before it."""
+    """Changes of one edit, with one entry per changed primitive.
 
-    primitive: np.ndarray  # (k,) int, index into the scene before
-    change: np.ndarray  # (k,) str: removed, copied or changed
-    moved_m: np.ndarray  # (k,) float64, of the centre; a copy's distance from its original
-    turned_rad: np.ndarray  # (k,) float64, the most that one of its axes turned, as a line
-    resized: np.ndarray  # (k,) float64, the largest change of an extent as a share of what it was
+    Attributes:
+        primitive: Index of the primitive in the scene before the edit.
+        change: One of removed, copied and changed.
+        moved_m: Displacement of the centre (m); for a copy, the distance from its original.
+        turned_rad: Largest angle between an axis before and after the edit (rad), ignoring its sign.
+        resized: Largest relative change of length, width or height.
+    """
+
+    primitive: np.ndarray  # (k,) int
+    change: np.ndarray  # (k,) str
+    moved_m: np.ndarray  # (k,) float64
+    turned_rad: np.ndarray  # (k,) float64
+    resized: np.ndarray  # (k,) float64
 
 
 def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectChange:
-    """What became of the primitives of a scene; origin (m,): the number that each of `after` had there."""
+    """Report the changes between a scene and its edited version.
+
+    Args:
+        before: Scene before the edit.
+        after: Scene after the edit, with m primitives.
+        origin: (m,) number in `before` of each primitive of `after`.
+
+    Returns:
+        One entry per removed, copied or changed primitive.
+    """
     removed = np.setdiff1d(np.arange(len(before)), origin)
     copied = np.ones(len(origin), bool)
     copied[np.unique(origin, return_index=True)[1]] = False
@@ -362,10 +541,19 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
 
 
 def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[ObjectChange]]:
-    """Apply edits in order, and report the changes of each.
+    """Apply edits in order and report the changes of each.
 
-    The numbers of primitives are those before each edit; after a removal the numbers of later primitives decrease.
-    Raises ValueError naming an edit that fails.
+    Each edit numbers the primitives of its own input. A removal therefore decreases the numbers of later primitives.
+
+    Args:
+        scene: Scene.
+        edits: Edits.
+
+    Returns:
+        The edited scene, and the changes of each edit.
+
+    Raises:
+        ValueError: An edit fails; the message names the edit.
     """
     done = []
     for step, edit in enumerate(edits):
@@ -379,7 +567,14 @@ def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[Objec
 
 
 def serialize_edits(edits: Sequence[Edit]) -> list[dict]:
-    """Edits as JSON objects, tuples as lists; what has its default is left out."""
+    """Convert edits to JSON objects.
+
+    Args:
+        edits: Edits.
+
+    Returns:
+        One dictionary per edit. Tuples become lists, and fields with their default value are omitted.
+    """
     return json.loads(json.dumps([{"edit": edit.name, **_describe_value(edit)} for edit in edits]))
 
 
@@ -392,9 +587,19 @@ def _describe_value(value: Edit | Select) -> dict:
 
 
 def parse_edits(content: object) -> list[Edit]:
-    """The edits of a JSON list. Raises ValueError that names the edit and what is wrong with it."""
+    """Parse a JSON list of edits.
+
+    Args:
+        content: Parsed JSON.
+
+    Returns:
+        The edits.
+
+    Raises:
+        ValueError: The content is invalid; the message names the edit and the fault.
+    """
     if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
-        raise ValueError("a list of edits is a JSON list of objects, each with 'edit' and 'select'")
+        raise ValueError("the edits must be a JSON list of objects, each with the keys 'edit' and 'select'")
     edits = []
     for step, entry in enumerate(content):
         kind, rest = entry.get("edit"), {name: value for name, value in entry.items() if name != "edit"}
@@ -407,5 +612,5 @@ def parse_edits(content: object) -> list[Edit]:
             where = ".".join(map(str, first["loc"]))
             known = fields(Select if len(first["loc"]) > 1 and first["loc"][0] == "select" else EDITS[kind])
             takes = ", ".join(f.name for f in known)
-            raise ValueError(f"edit {step} ({kind}): {where}: {first['msg']}; it takes {takes}") from error
+            raise ValueError(f"edit {step} ({kind}): {where}: {first['msg']}; the valid fields are {takes}") from error
     return edits

@@ -1,7 +1,7 @@
-"""Repair a scene's faults with small changes: move objects to the ground, push them apart, remove the remaining ones.
+"""Repair faults of a scene with small changes: move objects to the ground, push them apart, and remove the rest.
 
-metrics/validity.py defines the faults. A repair never makes another fault of the same kind worse: it skips a push that
-would move a primitive into a third one.
+metrics/validity.py defines the faults. A repair never makes another fault of the same kind worse: it skips a
+displacement that would move a primitive into a third primitive.
 """
 
 from __future__ import annotations
@@ -15,21 +15,31 @@ from models.geometry.iou3d import Boxes, compute_iou3d_matrix, compute_iou3d_pai
 from models.scene import Scene
 from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, find_faults
 
-# A little less than what is a fault: rounded as tables store it, what was none would else become one.
+# Goals slightly below the limits of a fault. Rounding in the tables would otherwise turn a valid result into a fault.
 GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
 GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
 DIRECTIONS = 24
-STEPS = 20  # lengths of a push that are tried
-PAIRS_AT_ONCE = 256  # that are looked at together: some 50 MB
-CANDIDATES = 6  # directions of the shortest pushes that are tried against everything around
+STEPS = 20  # Number of displacement lengths to try
+PAIRS_AT_ONCE = 256  # Number of pairs that are processed together, which takes 50 MB.
+CANDIDATES = 6  # Number of directions, with the shortest displacements, that are tested against all other primitives
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
 
 
 def snap_to_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
-    """Chosen (n,) primitives that float or are sunken, with their lowest point on the surface."""
+    """Move floating or sunken primitives vertically so that their lowest point lies on the ground.
+
+    Args:
+        scene: Scene with n primitives.
+        chosen: (n,) bool; primitives that may move.
+        slab_offset_m: Height of the ground raster above the real surface (m).
+        which: Faults to repair.
+
+    Returns:
+        The repaired scene.
+    """
     found = find_faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
     wrong = np.zeros(len(scene), bool)
     for name in ("floating", "sunken"):
@@ -41,7 +51,15 @@ def snap_to_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which
 
 
 def find_overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
-    """(p, 2) indices i < j of solid boxes that overlap by more than validity allows, the least overlap first."""
+    """Find the pairs of solid boxes whose IoU3D exceeds the validity limit.
+
+    Args:
+        boxes: Boxes of n primitives.
+        solid: (n,) bool; boxes that must not overlap.
+
+    Returns:
+        (p, 2) indices i < j, in ascending order of IoU3D.
+    """
     index = np.flatnonzero(solid)
     part = boxes.take(index)
     iou = np.triu(compute_iou3d_matrix(part, part), 1)
@@ -51,10 +69,19 @@ def find_overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
 
 
 def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
-    """Chosen (n,) solid primitives that overlap, pushed apart sideways by at most most_m each.
+    """Displace overlapping solid primitives horizontally until they no longer overlap.
 
-    Of all ways to part two the shortest that puts neither into a third; the smaller one goes farther. Where that is not
-    enough both shrink about their centres, to no less than `shrink` of their size.
+    For each pair, the shortest displacement that moves neither primitive into a third one is used. The smaller
+    primitive moves farther. If no displacement suffices, both primitives also shrink about their centres.
+
+    Args:
+        scene: Scene with n primitives.
+        chosen: (n,) bool; primitives that may change.
+        most_m: Maximum displacement of each primitive (m).
+        shrink: Minimum scale factor, in (0, 1].
+
+    Returns:
+        The scene after the displacements; some overlaps may remain.
     """
     parting = _Separation(scene, chosen, most_m, shrink)
     for _ in range(ROUNDS):
@@ -65,7 +92,7 @@ def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: fl
 
 
 class _Separation:
-    """Boxes being pushed: where they are now, where they were given, and who may be moved."""
+    """State of the separation: given boxes, current boxes, and which boxes may move."""
 
     def __init__(self, scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> None:
         self.given, self.now = extract_boxes(scene), extract_boxes(scene)
@@ -73,7 +100,7 @@ class _Separation:
         self.most_m, self.shrink = most_m, shrink
 
     def round(self) -> bool:
-        """Part what can be parted, each box once; did anything move?"""
+        """Separate pairs, and move each box at most once; return whether any box moved."""
         pairs = find_overlapping_pairs(self.now, self.solid)
         moved = np.zeros(len(self.solid), bool)
         for scale in (1.0, self.shrink):
@@ -87,10 +114,12 @@ class _Separation:
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
-        """Find up to CANDIDATES places (k, 2) for each pair where its boxes do not overlap, the shortest push first.
+        """Find up to CANDIDATES positions (k, 2) for each pair where its boxes do not overlap, the shortest
+        displacement first.
 
-        Two boxes that overlap at both ends of a straight path overlap along all of it, because their common volume is
-        log-concave (Brunn-Minkowski). A direction is therefore skipped if its longest push does not separate them.
+        If two boxes overlap at both ends of a straight path, they overlap along the whole path, because their common
+        volume is log-concave (Brunn-Minkowski). A direction is therefore skipped if its longest displacement does not
+        separate the boxes.
         """
         start = self.now.take(pairs)  # (p, 2, ...)
         share = self.select_primitives[pairs] * start.size_m.prod(axis=2)[:, ::-1]
@@ -105,11 +134,11 @@ class _Separation:
         to_m = share[:, None, None, :, None] * [[-1.0], [1.0]] * pushes_m[:, :, None]  # (p, directions, steps, 2, 3)
         center_m = start.center_m[:, None, None] + to_m
         moved_m = np.linalg.norm((center_m - self.given.center_m[pairs][:, None, None])[..., :2], axis=-1)
-        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): so far, and no farther
+        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): limit of the displacement
         within &= share.any(axis=1)[:, None, None]
 
         def parted(where: np.ndarray) -> np.ndarray:
-            """(p, directions, steps) bool: of the pushes in the mask `where` those that part their pair."""
+            """(p, directions, steps) bool: the displacements in the mask `where` that separate their pair."""
             pair, *_ = np.nonzero(where)
             a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
             found = where.copy()
@@ -118,7 +147,7 @@ class _Separation:
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
         found = parted(within & parted(longest).any(axis=2, keepdims=True))
-        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions), STEPS: none
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]
@@ -127,7 +156,7 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: whether a box of the pair, in places (k, 2), overlaps a third box too much and more than now."""
+        """(k,) bool: whether a box of the pair at positions (k, 2) overlaps a third box too much and more than now."""
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
@@ -140,7 +169,17 @@ class _Separation:
 
 
 def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:
-    """(n,) bool: few chosen primitives whose removal ends all overlaps; of two, the less certain, then the smaller."""
+    """Select few primitives whose removal ends all overlaps.
+
+    Of two equal candidates, the one with the lower existence probability is removed, then the smaller one.
+
+    Args:
+        scene: Scene with n primitives.
+        chosen: (n,) bool; primitives that may be removed.
+
+    Returns:
+        (n,) bool; primitives to remove.
+    """
     gone = np.zeros(len(scene), bool)
     pairs = find_overlapping_pairs(extract_boxes(scene), np.isin(scene.category, SOLID))
     while len(pairs := pairs[(chosen[pairs] & ~gone[pairs]).any(axis=1) & ~gone[pairs].any(axis=1)]):

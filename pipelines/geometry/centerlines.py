@@ -275,8 +275,7 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
-    """Yield the sections of a line (k, 2) inside the scene, and whether each includes the line's first and last point.
-    """
+    """Yield the sections of a line (k, 2) inside the scene, and whether each includes the line's first and last point."""
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for start, stop in border.tolist():

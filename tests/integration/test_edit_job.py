@@ -67,7 +67,7 @@ def test_edit_job_rejects_bad_scene_and_edits_the_rest(table, town_scenes, tmp_p
     assert (made.scenes, made.rejects) == (fits, 4 - fits)
     rejects = pq.read_table(str(tmp_path / "rejects"), partitioning=None).to_pylist()
     assert {row["scene_id"] for row in rejects} == {s.scene_id for s in town_scenes if len(s) <= last}
-    assert all("primitives, from 0 on, not" in row["reason"] for row in rejects)
+    assert all("primitives, numbered from 0; got" in row["reason"] for row in rejects)
     with pytest.raises(ValueError, match="all 4 scenes were rejected; the first: edit 0"):
         edit_scenes(Remove(primitives=(9999,), input=table, output=str(tmp_path), run="none"))
     with pytest.raises(ValueError, match="no primitive in 4 scene"):

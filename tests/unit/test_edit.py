@@ -67,12 +67,12 @@ def test_selection_matches_all_its_conditions(scene):
 @pytest.mark.parametrize(
     "select, message",
     [
-        (Select(), "no primitives are chosen: give category"),
+        (Select(), "the selection has no condition; give category"),
         (Select(category=("car",)), "category 'car' is unknown"),
-        (Select(polygon_m=(0, 1, 2)), "3 numbers: expected x y"),
-        (Select(where="speed > 3"), "speed.*docs/tables.md"),
-        (Select(where="length_m >"), "where 'length_m >'"),
-        (Select(where="true; drop table x"), "where 'true; drop"),
+        (Select(polygon_m=(0, 1, 2)), "3 numbers, expected pairs x y"),
+        (Select(where="speed > 3"), "speed.*docs/reference/tables.md"),
+        (Select(where="length_m >"), "where condition 'length_m >'"),
+        (Select(where="true; drop table x"), "where condition 'true; drop"),
         (Select(where="x_m > (select count(*) from read_csv('/etc/passwd'))"), "where .*disabled"),
     ],
 )
@@ -84,7 +84,8 @@ def test_selection_rejects_wrong_values(scene, select, message):
 
 
 def test_selection_rejects_missing_primitives(scene):
-    with pytest.raises(ValueError, match=r"edit 1 \(remove\): scene test-0005 has 60 primitives, from 0 on, not 60"):
+    words = r"edit 1 \(remove\): scene test-0005 has 60 primitives, numbered from 0; got the numbers 60"
+    with pytest.raises(ValueError, match=words):
         replay_edits(scene, [edit.Snap(ALL), edit.Remove(Select(primitives=(60,)))])
 
 
