@@ -1,1 +1,1 @@
-"""Scenes composed from known and generated parts: inpainting, outpainting, extension, seams."""
+"""Combine known and generated regions of scenes: inpainting, outpainting, extension and seams."""

@@ -1,4 +1,4 @@
-"""Scenes larger than one block: extended to one side, or regenerated inside a region (paper, Sec. 3.3)."""
+"""Scenes larger than one block: extend them to one side, or regenerate a region of them (paper, Sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -23,6 +23,14 @@ Side = Literal["ahead", "behind", "left", "right"]
 def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
     """Add pixels to a grid on one side.
 
+    Args:
+        grid: Grid.
+        side: "ahead", "behind", "left" or "right".
+        pixels: Number of rows or columns to add.
+
+    Returns:
+        The larger grid.
+
     Raises:
         ValueError: The side is unknown.
     """
@@ -36,7 +44,17 @@ def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
 
 
 def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterator[Grid]:
-    """Blocks of the model's size along one side of a grid, every `step_px`; the last one ends with the grid."""
+    """Yield the windows of block size along one side of a grid.
+
+    Args:
+        grid: Grid of the scene.
+        side: "ahead", "behind", "left" or "right".
+        block: Grid of one block.
+        step_px: Distance of neighbouring windows in pixels. The last window ends at the border of the grid.
+
+    Yields:
+        Grids of block size.
+    """
     along = grid.cols if side in ("ahead", "behind") else grid.rows
     size = block.cols if side in ("ahead", "behind") else block.rows
     for start in [*range(0, along - size, step_px), along - size]:
@@ -47,9 +65,18 @@ def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterat
 
 
 def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> list[Grid]:
-    """Blocks of the model's size, on whole cells of a grid, that together hold all pixels of a region.
+    """Return windows of block size that together cover all pixels of a region.
 
-    A region that fits into one block gets one, centred; a larger one gets a block every half a block.
+    If the region fits into one block, there is one centred window. Otherwise, windows overlap by half a block.
+
+    Args:
+        grid: Grid of the scene.
+        region: (rows, cols) bool, not empty.
+        block: Grid of one block.
+        cell_px: Side of a latent cell in pixels; windows are aligned to whole cells.
+
+    Returns:
+        Grids of block size.
     """
 
     def starts(found: np.ndarray, along: int, size: int) -> list[int]:
@@ -71,10 +98,18 @@ def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> li
 def to_block_frame(
     canvas: Scene, window: Grid, block: Grid, level_m: float
 ) -> tuple[Scene, tuple[float, float, float]]:
-    """Crop a window of a scene and move it into the model's frame, with ground at height `level_m` under the origin.
+    """Crop a window of a scene and transform it into the model's frame.
+
+    The z translation moves the ground under the origin to height `level_m`.
+
+    Args:
+        canvas: Scene.
+        window: Grid of the window in the frame of `canvas`.
+        block: Grid of one block in the model's frame.
+        level_m: Ground height under the origin of the model's frame (metres).
 
     Returns:
-        The cropped scene and the translation back (x, y, z) in metres.
+        The cropped scene and the translation (x, y, z) back to the frame of `canvas`, in metres.
     """
     dx_m, dy_m = block.front_m - window.front_m, block.left_m - window.left_m
     known = canvas.crop(window).translate(dx_m, dy_m)
@@ -83,19 +118,39 @@ def to_block_frame(
 
 
 def require_blocks(model: SceneGenerator, scene: Scene) -> None:
-    """Raises ValueError if a scene is smaller than a block or has not the model's resolution and ground classes."""
+    """Raise an error if a scene does not fit the model or is smaller than one block.
+
+    Args:
+        model: Model.
+        scene: Scene.
+
+    Raises:
+        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from the model's.
+    """
     spec, block = model.spec, model.spec.grid
     if scene.grid.resolution_m != block.resolution_m or scene.ground_classes != spec.ground_classes:
-        raise ValueError(f"{scene}: the model needs {block.resolution_m} m and {', '.join(spec.ground_classes)}")
+        raise ValueError(
+            f"{scene}: the model needs {block.resolution_m} m per pixel and {', '.join(spec.ground_classes)}"
+        )
     if scene.grid.rows < block.rows or scene.grid.cols < block.cols:
         raise ValueError(f"{scene} is smaller than a block of {block.rows} x {block.cols}")
 
 
 def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> list[tuple[Grid, np.ndarray]]:
-    """Split a region into blocks, each with the part (rows, cols) that it regenerates, in disjoint whole cells.
+    """Split a region into blocks that are regenerated one after the other.
+
+    Args:
+        model: Model.
+        scene: Scene.
+        region: (rows, cols) bool, True = regenerate.
+
+    Returns:
+        Window of each block and the mask (rows, cols) of the pixels that it regenerates. The masks consist of whole
+        cells
+        and are disjoint.
 
     Raises:
-        ValueError: As `require_blocks`.
+        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from the model's.
     """
     require_blocks(model, scene)
     block, size = model.spec.grid, model.latent_shape[-1]
@@ -110,13 +165,13 @@ def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> lis
 
 @dataclass(frozen=True)
 class InpaintStep:
-    """One block regenerated in several variants of a scene.
+    """One regenerated block of a scene in several variants.
 
-    Args:
-        known: The block's input per variant.
-        generated: What was decoded for it, before compositing.
-        region: (rows, cols) bool, the block's regenerated pixels, in whole cells.
-        canvases: The whole scene per variant, with the block composited.
+    Attributes:
+        known: Input scene of the block per variant.
+        generated: Decoded scene of the block per variant, before compositing.
+        region: (rows, cols) bool, the regenerated pixels of the block, in whole cells.
+        canvases: The whole scene per variant, composited with the block.
     """
 
     known: list[Scene]
@@ -137,24 +192,34 @@ def inpaint_blocks(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Iterator[InpaintStep]:
-    """Regenerate a region of a scene of any size, block by block, once per index; the last step holds the result.
+    """Regenerate a region of a scene of any size, block by block, in one variant per index.
 
-    Equals `PrITTIPipeline.inpaint` on a scene of the model's size. Regions grow to whole cells; the rest is kept bit
-    for bit.
+    The result equals `PrITTIPipeline.inpaint` for a scene on the model's grid. The region grows to whole cells. All
+    other
+    pixels and objects are kept bit for bit.
 
     Args:
-        model, scene: The model and the scene, at least one block large.
+        model: Model.
+        scene: Scene, at least as large as one block.
         region: (rows, cols) bool, True = regenerate.
-        label: Class of the scene.
-        contents: As for `PrITTIPipeline.inpaint`.
-        seed, indices: One variant per index.
-        repaint, guidance_scale, callback_on_step_end: As for `PrITTIPipeline.inpaint`.
+        label: Label of the scene.
+        contents: What to regenerate, see `PrITTIPipeline.inpaint`.
+        seed: Seed of the noise.
+        indices: Index of each variant; it keys the noise.
+        repaint: Options of RePaint (default: the paper's).
+        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        callback_on_step_end: See `PrITTIPipeline.generate`.
+
+    Yields:
+        One step per block. The canvases of the last step are the result.
 
     Raises:
-        ValueError: The region is empty, or as `require_blocks`.
+        ValueError: The region is empty, the scene is smaller than a block, or its resolution or ground classes differ
+            from
+            the model's.
     """
     if not region.any():
-        raise ValueError(f"{scene}: the region holds no pixel of it")
+        raise ValueError(f"{scene}: the region contains no pixel of this scene")
     canvases, level_m = [scene] * len(indices), find_ground_height(scene, 0.0, 0.0)
     for number, (window, part) in enumerate(split_region(model, scene, region)):
         blocks = [to_block_frame(canvas, window, model.spec.grid, level_m) for canvas in canvases]
@@ -191,12 +256,30 @@ def extend_scene(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Scene:
-    """Extend a scene by (1 - overlap) of a block to one side; see `PrITTIPipeline.outpaint`.
+    """Extend a scene by (1 - overlap) of a block to one side (see `PrITTIPipeline.outpaint`).
 
-    Each block is conditioned on what lies in it already, encoded again in the block's frame and height.
+    Each new block is conditioned on the known content inside it. This content is encoded in the block's frame and at
+    the
+    block's ground height.
+
+    Args:
+        model: Model.
+        scene: Scene, at least as large as one block.
+        side: "ahead", "behind", "left" or "right".
+        label: Label of all blocks.
+        seed: Seed of the noise.
+        overlap: Fraction of a block that overlaps the scene, a whole number of latent cells.
+        repaint: Options of RePaint (default: the paper's).
+        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        callback_on_step_end: See `PrITTIPipeline.generate`.
+
+    Returns:
+        The extended scene.
 
     Raises:
-        ValueError: As `require_blocks`, or the overlap is not a whole number of cells, or the side is unknown.
+        ValueError: The side is unknown, the overlap is not a whole number of cells, the scene is smaller than a block,
+            or
+            its resolution or ground classes differ from the model's.
     """
     spec, block = model.spec, model.spec.grid
     require_blocks(model, scene)

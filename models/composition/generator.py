@@ -1,4 +1,4 @@
-"""What composition needs of a pipeline; `models.pipeline.PrITTIPipeline` has it."""
+"""Interface of a pipeline that composition uses; `models.pipeline.PrITTIPipeline` implements it."""
 
 from __future__ import annotations
 
@@ -14,28 +14,65 @@ from models.sampling.diffusion import InpaintCondition, SceneKey
 from models.sampling.repaint import RePaintConfig
 from models.scene import Scene
 
-StepCallback = Callable[
-    [Any, int, int, dict], dict
-]  # diffusers' callback_on_step_end: pipeline, step, timestep, tensors
+# Type of diffusers' `callback_on_step_end`: (pipeline, step, timestep, tensors) -> tensors.
+StepCallback = Callable[[Any, int, int, dict], dict]
 
 
 @runtime_checkable
 class SceneGenerator(Protocol):
-    """Encodes, decodes and inpaints scenes of one size."""
+    """Encode, decode and inpaint scenes of one size."""
 
     @property
-    def spec(self) -> LayoutSpec: ...
+    def spec(self) -> LayoutSpec:
+        """Layout of the scenes."""
 
     @property
-    def latent_shape(self) -> tuple[int, int, int]: ...
+    def latent_shape(self) -> tuple[int, int, int]:
+        """Shape (c, h, w) of a latent."""
 
-    def encode(self, scenes: Sequence[Scene]) -> Tensor: ...
+    def encode(self, scenes: Sequence[Scene]) -> Tensor:
+        """Encode scenes to latents.
 
-    def decode(self, latents: Tensor, identities: Sequence[Scene]) -> list[Scene]: ...
+        Args:
+            scenes: Scenes on the model's grid.
 
-    def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene: ...
+        Returns:
+            (b, c, h, w) latents.
+        """
 
-    def label_tensor(self, labels: Sequence[str]) -> Tensor: ...
+    def decode(self, latents: Tensor, identities: Sequence[Scene]) -> list[Scene]:
+        """Decode latents to scenes.
+
+        Args:
+            latents: (b, c, h, w) latents.
+            identities: Scenes that provide ids and labels.
+
+        Returns:
+            One scene per latent.
+        """
+
+    def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
+        """Return an empty Scene with the id of a generated scene.
+
+        Args:
+            run: Run name.
+            seed: Seed of the run.
+            index: Index of the scene within the run.
+            label: Label of the scene.
+
+        Returns:
+            The empty scene.
+        """
+
+    def label_tensor(self, labels: Sequence[str]) -> Tensor:
+        """Convert labels to class indices.
+
+        Args:
+            labels: Names of labels.
+
+        Returns:
+            (b,) class indices.
+        """
 
     def inpaint_latents(
         self,
@@ -47,7 +84,22 @@ class SceneGenerator(Protocol):
         guidance_scale: float = 1.0,
         callback_on_step_end: StepCallback | None = None,
         purpose: int = ...,
-    ) -> Tensor: ...
+    ) -> Tensor:
+        """Sample latents that equal the condition where its mask is 0.
+
+        Args:
+            condition: Known latents and masks.
+            labels: Label of each scene.
+            seed: Seed of the noise, or one seed per scene.
+            indices: Key of each scene; it keys the noise.
+            repaint: Options of RePaint.
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            callback_on_step_end: See `PrITTIPipeline.generate`.
+            purpose: Purpose of the noise (models/sampling/diffusion.py).
+
+        Returns:
+            (b, c, h, w) latents.
+        """
 
     def inpaint(
         self,
@@ -62,4 +114,21 @@ class SceneGenerator(Protocol):
         *,
         callback_on_step_end: StepCallback | None = None,
         composite: bool = True,
-    ) -> list[Scene]: ...
+    ) -> list[Scene]:
+        """Regenerate regions of scenes (see `PrITTIPipeline.inpaint`).
+
+        Args:
+            scenes: Scenes on the model's grid.
+            regions: Mask (rows, cols) per scene, True = regenerate.
+            labels: Label of each scene.
+            contents: What to regenerate: "both", "ground" or "objects".
+            seed: Seed of the noise.
+            indices: Key of each scene; it keys the noise.
+            repaint: Options of RePaint (default: the paper's).
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            callback_on_step_end: See `PrITTIPipeline.generate`.
+            composite: Take everything outside the regions from the input.
+
+        Returns:
+            The regenerated scenes.
+        """

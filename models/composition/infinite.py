@@ -1,4 +1,4 @@
-"""An unbounded scene: any block on demand, at bounded cost, independent of the blocks requested before."""
+"""An unbounded scene that generates any block on demand at bounded cost, independently of earlier requests."""
 
 from __future__ import annotations
 
@@ -21,19 +21,23 @@ from models.scene import Grid, Scene
 
 
 class InfiniteScene:
-    """Blocks of a model in four colours (outpaint.py); each depends on at most eight neighbours and on block (0, 0).
+    """An unbounded scene of blocks in four ranks (`outpaint.rank_four_colors`).
 
-    Block (0, 0) sets the level of the ground. Generated blocks are kept in memory until `drop_block`.
+    Each block depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height. Generated
+    blocks
+    are kept in memory until `drop_block` is called.
 
     Args:
         model: A PrITTIPipeline.
-        label: Class of all blocks, or a function of the block's index.
+        label: Label of all blocks, or a function that returns the label of a block from its index.
         seed: Seed of the scene.
         overlap: Fraction of a block that overlaps its neighbour, below 0.5.
-        mode, repaint, guidance_scale: As for `PrITTIPipeline.outpaint`.
+        mode: "copy" or "reencode", see `PrITTIPipeline.outpaint`.
+        repaint: Options of RePaint (default: the paper's).
+        guidance_scale: Scale of classifier-free guidance; 1 is none.
 
     Raises:
-        ValueError: The model does not know the label, or the overlap is 0.5 or more.
+        ValueError: The label is unknown to the model, or the overlap is 0.5 or more.
     """
 
     def __init__(
@@ -54,38 +58,65 @@ class InfiniteScene:
         model.label_tensor([self.label_of((0, 0))])
 
     def label_of(self, index: BlockIndex) -> str:
-        """Class of a block."""
+        """Return the label of a block.
+
+        Args:
+            index: Index of the block (steps ahead, steps left).
+
+        Returns:
+            The label.
+        """
         return self.label if isinstance(self.label, str) else self.label(index)
 
     def get_block(self, index: BlockIndex) -> SceneBlock:
-        """The block at (steps ahead, steps left); it and its predecessors are generated if they are missing."""
+        """Return a block; generate it and its predecessors if they do not exist.
+
+        Args:
+            index: Index of the block (steps ahead, steps left).
+
+        Returns:
+            The block.
+        """
         if index not in self.blocks:
             known = {other: self.get_block(other) for other, _ in self.composer.block_grid.known_cells(index)}
             if known:
                 self.composer.level_m = find_ground_height(self.get_block((0, 0)).scene, 0.0, 0.0)
             label = self.label_of(index)
             like = self.model.new_identity("city", self.seed, 0, label)
-            # One block at a time: a batch would round differently, and the scene would depend on the requests.
+            # Generate one block at a time: a batch rounds differently, so the scene would depend on the requests.
             self.blocks |= generate_blocks(
                 self.model, self.composer, [index], known, like, {index: label}, self.seed, **self.options
             )
         return self.blocks[index]
 
     def drop_block(self, index: BlockIndex) -> None:
-        """Free the memory of a block; if requested again, the same block is regenerated."""
+        """Free the memory of a block. A later request regenerates the same block.
+
+        Args:
+            index: Index of the block (steps ahead, steps left).
+        """
         self.blocks.pop(index, None)
 
     def get_scene(self, ahead_m: float, behind_m: float, left_m: float, right_m: float) -> Scene:
-        """One Scene of the rectangle from `behind_m` behind the origin to `ahead_m` ahead, `right_m` to `left_m`.
+        """Return one Scene that covers a rectangle around the origin.
 
         The rectangle grows to whole pixels.
+
+        Args:
+            ahead_m: Extent ahead of the origin (metres).
+            behind_m: Extent behind the origin (metres).
+            left_m: Extent to the left (metres).
+            right_m: Extent to the right (metres).
+
+        Returns:
+            The scene of this rectangle.
 
         Raises:
             ValueError: The rectangle is empty.
         """
         if not (ahead_m > -behind_m and left_m > -right_m):
             raise ValueError(
-                f"an empty rectangle: {ahead_m} m ahead, {behind_m} behind, {left_m} left, {right_m} right"
+                f"the rectangle is empty: {ahead_m} m ahead, {behind_m} m behind, {left_m} m left, {right_m} m right"
             )
         resolution_m = self.model.spec.grid.resolution_m
         front, back, left, right = (-(-m // resolution_m) for m in (ahead_m, behind_m, left_m, right_m))
@@ -95,9 +126,16 @@ class InfiniteScene:
         return self.composer.stitch(blocks, replace(like, scene_id=f"{like.sequence}-{self.seed}"), grid)
 
     def list_blocks(self, grid: Grid) -> list[BlockIndex]:
-        """Indices of all blocks that overlap a grid."""
+        """List the blocks that overlap a grid.
+
+        Args:
+            grid: Grid in the frame of block (0, 0).
+
+        Returns:
+            Indices of the blocks.
+        """
         block, step_m = self.model.spec.grid, self.composer.step_m
-        # Block i covers block.back_m + i step_m to block.front_m + i step_m.
+        # Block i covers x from block.back_m + i step_m to block.front_m + i step_m.
         ahead = range(int((grid.back_m - block.front_m) // step_m), int((grid.front_m - block.back_m) // step_m) + 2)
         left = range(int((grid.right_m - block.left_m) // step_m), int((grid.left_m - block.right_m) // step_m) + 2)
         return [

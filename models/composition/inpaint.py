@@ -1,6 +1,8 @@
-"""Inpainting: regions to regenerate, and the composition of known and generated parts (paper, Sec. 3.3).
+"""Inpainting: select regions, and combine known and generated parts of scenes (paper, Sec. 3.3).
 
-A region is a mask (rows, cols) over a scene's pixels, True = regenerate. Regions are sets: join them with |, & and ~.
+A region is a mask (rows, cols) over the pixels of a scene, where True means regenerate. The operators |, & and ~
+combine
+regions.
 """
 
 from __future__ import annotations
@@ -21,30 +23,61 @@ Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a r
 
 
 def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-    """Whether points (x_m, y_m, broadcast together) lie inside a polygon of corners (x, y) in metres; even-odd rule.
+    """Test whether points lie inside a polygon, by the even-odd rule.
 
-    Raises ValueError for fewer than three corners or numbers that are not finite.
+    Args:
+        corners_m: Corners (x, y) of the polygon (metres).
+        x_m: x coordinates of the points (metres).
+        y_m: y coordinates of the points (metres); they are broadcast with `x_m`.
+
+    Returns:
+        Boolean per point.
+
+    Raises:
+        ValueError: There are fewer than three corners, or a number is not finite.
     """
     corners = np.asarray(corners_m, float)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise ValueError(f"polygon {np.asarray(corners_m).tolist()}: expected three or more corners (x, y) in metres")
     inside = np.zeros(np.broadcast_shapes(np.shape(x_m), np.shape(y_m)), bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if x0 != x1:  # does the edge cross the ray from the point towards +y?
+        if x0 != x1:  # test whether the edge crosses the ray from the point towards +y
             crosses = (x0 > x_m) != (x1 > x_m)
             inside ^= crosses & (y_m < y0 + (x_m - x0) / (x1 - x0) * (y1 - y0))
     return inside
 
 
 def select_polygon(grid: Grid, corners_m: Sequence[Any] | np.ndarray) -> np.ndarray:
-    """(rows, cols) pixels whose centre lies inside a polygon of corners (x, y) in metres (`contains_points`)."""
+    """Select the pixels whose centre lies inside a polygon.
+
+    Args:
+        grid: Grid of the scene.
+        corners_m: Corners (x, y) of the polygon (metres, scene frame).
+
+    Returns:
+        (rows, cols) bool.
+
+    Raises:
+        ValueError: There are fewer than three corners, or a number is not finite.
+    """
     return contains_points(corners_m, grid.x_m()[:, None], grid.y_m()[None, :])
 
 
 def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> np.ndarray:
-    """(rows, cols) pixels at least `offset_m` along a direction (x, y), which need not have length 1.
+    """Select the pixels at a distance of at least `offset_m` from the origin along a direction.
 
-    (1, 0) and 40: everything at least 40 m ahead. Raises ValueError for a direction of length 0.
+    For example, normal (1, 0) and offset 40 select all pixels at least 40 m ahead.
+
+    Args:
+        grid: Grid of the scene.
+        normal: Direction (x, y) of any length above 0.
+        offset_m: Distance from the origin along the direction (metres).
+
+    Returns:
+        (rows, cols) bool.
+
+    Raises:
+        ValueError: The direction has length 0.
     """
     direction = np.asarray(normal, float)
     if direction.shape != (2,) or not 0 < (length := np.hypot(*direction)) < np.inf:
@@ -54,10 +87,18 @@ def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> n
 
 
 def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, margin_m: float = 1.0) -> np.ndarray:
-    """(rows, cols) pixels within the upright bounds of primitives, grown by a margin.
+    """Select the pixels inside the upright bounding boxes of primitives, enlarged by a margin.
+
+    Args:
+        scene: Scene.
+        primitives: Indices of the primitives.
+        margin_m: Margin on all sides (metres).
+
+    Returns:
+        (rows, cols) bool.
 
     Raises:
-        IndexError: The scene has no primitive of that number.
+        IndexError: The scene has no primitive with this index.
     """
     chosen = scene.select(np.asarray(primitives, int))
     region = np.zeros((scene.grid.rows, scene.grid.cols), bool)
@@ -70,7 +111,18 @@ def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, 
 
 
 def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
-    """(size, size) latent cells that hold a pixel of a region. ValueError if pixels do not divide into cells."""
+    """Find the latent cells that contain a pixel of a region.
+
+    Args:
+        region: (rows, cols) bool.
+        size: Number of cells per side of the latent grid.
+
+    Returns:
+        (size, size) bool.
+
+    Raises:
+        ValueError: The pixels do not divide into `size` cells per side.
+    """
     rows, cols = region.shape
     if rows % size or cols % size:
         raise ValueError(f"a region of {rows} x {cols} pixels does not divide into {size} x {size} cells")
@@ -78,12 +130,34 @@ def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
 
 
 def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
-    """Grow a region to whole latent cells, which are what is regenerated."""
+    """Grow a region to whole latent cells, because the model regenerates whole cells.
+
+    Args:
+        region: (rows, cols) bool.
+        grid: Grid of the region.
+        size: Number of cells per side of the latent grid.
+
+    Returns:
+        (rows, cols) bool.
+
+    Raises:
+        ValueError: The pixels do not divide into `size` cells per side.
+    """
     return grid.upsample_cells(find_region_cells(region, size))
 
 
 def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents | str) -> Tensor:
-    """(b, c, h, w) float32, 1 = regenerate. The first half of a split latent's channels is the ground's.
+    """Make the latent mask of regions.
+
+    The first half of the channels of a split latent belongs to the ground, the second half to the objects.
+
+    Args:
+        regions: (rows, cols) bool per scene.
+        shape: Shape (c, h, w) of a latent.
+        contents: "both", "ground" or "objects": the channels to regenerate.
+
+    Returns:
+        (b, c, h, w) float32, 1 = regenerate, 0 = keep.
 
     Raises:
         ValueError: `contents` is unknown.
@@ -100,18 +174,24 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
 
 
 def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
-    """Combine a scene with its regenerated part; everything outside the region is the input's, bit for bit.
+    """Combine a scene with its regenerated part; everything outside the region equals the input bit for bit.
 
-    Pixels are selected by place, primitives by the pixel under their centre. New ground is blended into the known
-    ground at the region's border (seam_blending.py). Decoders see the whole latent, so their output outside the region
-    differs slightly from the scene although the latent there does not: a known object near the border may be decoded a
-    little inside the region. Such copies are removed.
+    Pixels inside the region come from the generated scene. A primitive lies in the region if the pixel under its centre
+    does. New ground is blended into the known ground at the border (seam_blending.py).
+
+    Decoders read the whole latent. Their output outside the region therefore differs slightly from the scene, although
+    the
+    latent there is the same. A known object near the border may be decoded slightly inside the region. Such copies are
+    removed.
 
     Args:
-        scene: Input.
+        scene: Input scene.
         generated: Decoded scene on the same grid.
-        region: (rows, cols) bool, whole latent cells.
+        region: (rows, cols) bool, in whole latent cells.
         contents: What was regenerated.
+
+    Returns:
+        The combined scene.
     """
     nothing = np.zeros_like(region)
     ground, objects = (nothing if contents == other else region for other in ("objects", "ground"))

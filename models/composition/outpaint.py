@@ -1,12 +1,13 @@
 """Outpainting on a grid of overlapping blocks (paper, supplement B.3).
 
-The paper extends a scene to three by three blocks, with the given one in the middle. Any rectangle works the same way
-with more blocks, and so does an unbounded grid; only the order differs in which neighbours are generated.
+The paper extends a scene to three by three blocks around it. This module also supports any rectangle of blocks and an
+unbounded grid, which differ only in the order of the blocks.
 
-Block (i, j) lies i steps ahead and j steps left of block (0, 0); a step is (1 - overlap) of a block. The rank of a
-block follows from (i, j) alone. Where blocks overlap, the lowest rank owns the cell; blocks of equal rank never
-overlap in cells that they own. A block is conditioned on the cells that lower ranks own. The result therefore does not
-depend on when, where or in which order blocks are generated.
+Block (i, j) lies i steps ahead and j steps left of block (0, 0). A step is (1 - overlap) of a block. The rank of a
+block
+is a function of (i, j) alone. Where blocks overlap, the block of lowest rank owns the cell. Blocks of equal rank never
+overlap in cells that they own. Each block is conditioned on the cells that blocks of lower rank own. The result
+therefore does not depend on the time, the machine or the order of generation.
 """
 
 from __future__ import annotations
@@ -34,24 +35,38 @@ EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid
 
 
 def rank_outward(index: BlockIndex) -> int:
-    """Rank by distance from block (0, 0): the paper's four sides, then its four corners, and so on."""
+    """Rank a block by its distance from block (0, 0): first the paper's four sides, then its four corners.
+
+    Args:
+        index: Index of the block.
+
+    Returns:
+        Rank.
+    """
     return abs(index[0]) + abs(index[1])
 
 
 def rank_four_colors(index: BlockIndex) -> int:
-    """One of four ranks, for an unbounded grid: every second block both ways, those between two of them, the rest."""
+    """Rank the blocks of an unbounded grid by the parity of i and j, which gives four ranks.
+
+    Args:
+        index: Index of the block.
+
+    Returns:
+        Rank from 0 to 3. Blocks of equal rank are two steps apart.
+    """
     return index[0] % 2 + 2 * (index[1] % 2)
 
 
 @dataclass(frozen=True)
 class BlockGrid:
-    """Blocks of `size` cells every `step` cells.
+    """Blocks of `size` cells, placed every `step` cells.
 
-    Args:
+    Attributes:
         size: Side of a block in latent cells.
         step: Distance of neighbouring blocks in cells.
-        rank: Rank of a block; lower ranks are generated first.
-        num_blocks: Blocks ahead, behind, left and right of block (0, 0); None for an unbounded grid.
+        rank: Function that returns the rank of a block; lower ranks are generated first.
+        num_blocks: Number of blocks ahead, behind, left and right of block (0, 0); None for an unbounded grid.
     """
 
     size: int
@@ -61,7 +76,15 @@ class BlockGrid:
 
     @classmethod
     def from_overlap(cls, size: int, overlap: float, **options: Any) -> BlockGrid:
-        """A grid by the overlap of neighbouring blocks, as a fraction of a block.
+        """Make a block grid from the overlap of neighbouring blocks.
+
+        Args:
+            size: Side of a block in latent cells.
+            overlap: Overlap as a fraction of a block.
+            **options: Further fields of `BlockGrid`.
+
+        Returns:
+            The block grid.
 
         Raises:
             ValueError: The overlap is not a whole number of cells, or blocks of equal rank would overlap.
@@ -71,36 +94,72 @@ class BlockGrid:
             raise ValueError(f"overlap {overlap} is not a whole number of the {size} latent cells between 0 and 1")
         grid = cls(size, step, **options)
         if grid.rank is rank_four_colors and 2 * step <= size:
-            raise ValueError(f"overlap {overlap}: four colours need less than 0.5, or blocks of equal rank overlap")
+            raise ValueError(
+                f"overlap {overlap}: four ranks need an overlap below 0.5, otherwise blocks of equal rank overlap"
+            )
         return grid
 
     def contains(self, index: BlockIndex) -> bool:
+        """Test whether the grid contains a block.
+
+        Args:
+            index: Index of the block.
+
+        Returns:
+            True if it does; always True for an unbounded grid.
+        """
         if self.num_blocks is None:
             return True
         ahead, behind, left, right = self.num_blocks
         return -behind <= index[0] <= ahead and -right <= index[1] <= left
 
     def indices(self) -> list[BlockIndex]:
-        """All blocks of a bounded grid. Raises ValueError for an unbounded one."""
+        """List all blocks of a bounded grid.
+
+        Raises:
+            ValueError: The grid is unbounded.
+        """
         if self.num_blocks is None:
             raise ValueError("an unbounded grid has no list of blocks")
         ahead, behind, left, right = self.num_blocks
         return list(product(range(-behind, ahead + 1), range(-right, left + 1)))
 
     def group_by_rank(self, indices: Iterable[BlockIndex]) -> list[list[BlockIndex]]:
-        """Blocks by rank, lowest first; those of a group can be generated concurrently."""
+        """Group blocks by rank, lowest rank first.
+
+        Args:
+            indices: Indices of blocks.
+
+        Returns:
+            Groups of blocks; the blocks of a group can be generated concurrently.
+        """
         ordered = sorted(indices, key=lambda index: (self.rank(index), index))
         return [list(group) for _, group in groupby(ordered, key=self.rank)]
 
     def list_predecessors(self, index: BlockIndex) -> list[BlockIndex]:
-        """Overlapping blocks of lower rank, lowest first: they must be generated before this block."""
+        """List the overlapping blocks of lower rank, which must be generated before this block.
+
+        Args:
+            index: Index of the block.
+
+        Returns:
+            Indices of the predecessors, lowest rank first.
+        """
         reach = range(-((self.size - 1) // self.step), (self.size - 1) // self.step + 1)
         near = [(index[0] + i, index[1] + j) for i in reach for j in reach]
         rank = self.rank(index)
         return sorted((p for p in near if self.contains(p) and self.rank(p) < rank), key=lambda p: (self.rank(p), p))
 
     def overlap_cells(self, index: BlockIndex, of: BlockIndex) -> tuple[slice, slice]:
-        """Rows and columns of the block `index` that the block `of` covers."""
+        """Return the cells of one block that another block covers.
+
+        Args:
+            index: Index of the block.
+            of: Index of the other block.
+
+        Returns:
+            Row slice and column slice of block `index`.
+        """
         rows, cols = (
             slice(max(0, shift), max(0, min(self.size, self.size + shift)))
             for shift in ((a - b) * self.step for a, b in zip(index, of, strict=True))
@@ -108,14 +167,28 @@ class BlockGrid:
         return rows, cols
 
     def owned_cells(self, index: BlockIndex) -> np.ndarray:
-        """(size, size) bool: cells of a block that no predecessor covers."""
+        """Return the cells of a block that no predecessor covers.
+
+        Args:
+            index: Index of the block.
+
+        Returns:
+            (size, size) bool.
+        """
         owned = np.ones((self.size, self.size), bool)
         for other in self.list_predecessors(index):
             owned[self.overlap_cells(index, other)] = False
         return owned
 
     def known_cells(self, index: BlockIndex) -> list[tuple[BlockIndex, np.ndarray]]:
-        """Predecessors that own cells of this block, with those cells (size, size) bool."""
+        """Return the cells of a block that its predecessors own.
+
+        Args:
+            index: Index of the block.
+
+        Returns:
+            Index and mask (size, size) bool of each predecessor that owns cells of this block.
+        """
         parts = []
         for other in self.list_predecessors(index):
             here = np.zeros((self.size, self.size), bool)
@@ -129,12 +202,12 @@ class BlockGrid:
 class SceneBlock:
     """A generated block.
 
-    Args:
-        scene: What the block owns, in its own frame, `datum_m` above the world's heights.
-        latent: (c, h, w) of the whole block.
-        datum_m: Height of the block's frame in the world.
-        known_ground: Fraction of the pixels known beforehand that had any ground; 1 if nothing was known. The paper's
-            outpainting fails where it is near 0.
+    Attributes:
+        scene: Content of the cells that the block owns, in the block's frame.
+        latent: (c, h, w) latent of the whole block.
+        datum_m: Height of the block's frame above the frame of block (0, 0).
+        known_ground: Fraction of the known pixels that have ground, or 1 if nothing was known. The paper's outpainting
+            fails if it is near 0.
     """
 
     scene: Scene
@@ -145,7 +218,14 @@ class SceneBlock:
 
 @dataclass(frozen=True, eq=False)
 class BlockCondition:
-    """The known part of a block before it is generated: as a Scene and as a latent (c, h, w); mask 1 = generate."""
+    """The known part of a block before the block is generated.
+
+    Attributes:
+        known: Known part as a Scene.
+        latent: Latent (c, h, w) of the known part.
+        mask: (c, h, w), 1 = generate, 0 = keep.
+        datum_m: Height of the block's frame above the frame of block (0, 0).
+    """
 
     known: Scene
     latent: Tensor
@@ -154,7 +234,7 @@ class BlockCondition:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing of the block is known."""
+        """Whether the block has no known part."""
         return bool(self.mask.all())
 
     @cached_property
@@ -164,7 +244,16 @@ class BlockCondition:
 
 
 def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
-    """Height of the fused surface at the occupied pixel nearest to a point in metres; 0 if there is no ground."""
+    """Return the height of the fused surface at the occupied pixel nearest to a point.
+
+    Args:
+        scene: Scene.
+        x_m: x of the point (metres, scene frame).
+        y_m: y of the point (metres, scene frame).
+
+    Returns:
+        Height in metres; 0 if the scene has no ground.
+    """
     height, ground_class = scene.surface()
     row, col = np.nonzero(ground_class >= 0)
     if len(row) == 0:
@@ -175,13 +264,13 @@ def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
 
 
 class BlockComposer:
-    """Conditions blocks on their predecessors and stitches them together. Keeps no blocks.
+    """Condition blocks on their predecessors and stitch blocks together. It stores no blocks.
 
     Args:
-        block_grid: Which blocks there are.
+        block_grid: Block grid.
         spec: Layout of one block.
-        encode: Encodes scenes to latents.
-        level_m: Height of the ground under the origin of a block's frame, as in the model's training data.
+        encode: Function that encodes scenes to latents.
+        level_m: Ground height under the origin of a block's frame, as in the model's training data (metres).
     """
 
     def __init__(self, block_grid: BlockGrid, spec: LayoutSpec, encode: EncodeScenes, level_m: float = 0.0) -> None:
@@ -198,21 +287,34 @@ class BlockComposer:
         return self.step_px * self.spec.grid.resolution_m
 
     def to_block_frame(self, index: BlockIndex, other: BlockIndex, block: SceneBlock) -> Scene:
-        """The part of block `other` inside block `index`, in the latter's frame and the world's heights."""
+        """Return the part of one block that lies inside another block.
+
+        Args:
+            index: Index of the block that defines the result's x, y frame.
+            other: Index of the block to crop.
+            block: Content of block `other`.
+
+        Returns:
+            The cropped scene in the x, y frame of block `index`, with z in the frame of block (0, 0).
+        """
         x, y = ((a - b) * self.step_m for a, b in zip(other, index, strict=True))
         return block.scene.translate(x, y, block.datum_m).crop(self.spec.grid)
 
     def condition_block(
         self, index: BlockIndex, blocks: Mapping[BlockIndex, SceneBlock], empty: Scene, mode: str
     ) -> BlockCondition:
-        """Gather what predecessors know of a block.
+        """Collect the known part of a block from its predecessors.
 
         Args:
-            index: The block.
-            blocks: Generated blocks, with all its predecessors.
-            empty: An empty Scene with the ids of the result.
-            mode: "copy" takes the neighbours' latents (the paper); "reencode" decodes them, moves them into the block's
-                frame and datum and encodes the result, because object latents hold absolute centres.
+            index: Index of the block.
+            blocks: Generated blocks, with all predecessors of the block.
+            empty: Empty Scene that provides the ids of the result.
+            mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms their decoded
+                content into
+                the block's frame and encodes it again, because object latents contain absolute centres.
+
+        Returns:
+            The known part.
 
         Raises:
             KeyError: A predecessor is missing.
@@ -235,18 +337,30 @@ class BlockComposer:
         return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m)
 
     def finish_block(self, condition: BlockCondition, latent: Tensor, generated: Scene) -> SceneBlock:
-        """The new part of a decoded block, blended into the known part and without copies of its objects."""
+        """Blend a decoded block into its known part and remove copies of known objects.
+
+        Args:
+            condition: Known part of the block.
+            latent: (c, h, w) latent of the whole block.
+            generated: Decoded block.
+
+        Returns:
+            The block with the content of the cells that it owns.
+        """
         own = extract_new_part(generated, condition.known, condition.new_pixels)
         seen = np.any(condition.known.occupied, axis=0)[~condition.new_pixels]
         return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:
-        """Combine blocks to one Scene, each with what it owns.
+        """Combine blocks to one Scene; each block contributes the cells that it owns.
 
         Args:
             blocks: Generated blocks.
-            like: Gives ids and labels.
-            grid: Extent of the result, in whole pixels from block (0, 0) (default: all blocks).
+            like: Scene that provides ids and labels.
+            grid: Grid of the result, aligned to whole pixels with block (0, 0) (default: all blocks).
+
+        Returns:
+            The combined scene.
         """
         small = self.spec.grid
         if grid is None:
@@ -288,19 +402,24 @@ def generate_blocks(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> dict[BlockIndex, SceneBlock]:
-    """Generate blocks in one batch, conditioned on those generated before.
+    """Generate blocks in one batch, conditioned on blocks that exist.
 
     Args:
-        model: Generates one block.
-        composer: Which blocks there are and how they fit together.
+        model: Model that generates one block.
+        composer: Block grid and the functions that combine blocks.
         indices: Blocks to generate.
-        blocks: Generated blocks, with all predecessors of `indices`.
-        like: Gives the ids of the result.
-        label: Class of all blocks or of each.
-        seed, scene_index: Noise depends on them and on the block's index.
-        mode: As for `BlockComposer.condition_block`.
+        blocks: Existing blocks, with all predecessors of `indices`.
+        like: Scene that provides the ids of the result.
+        label: Label of all blocks, or label by index of the block.
+        seed: Seed of the noise.
+        scene_index: Index of the scene; together with the block's index it keys the noise.
+        mode: "copy" or "reencode", see `BlockComposer.condition_block`.
         repaint: Options of RePaint (default: the paper's).
-        guidance_scale, callback_on_step_end: As for `PrITTIPipeline.generate`.
+        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        callback_on_step_end: See `PrITTIPipeline.generate`.
+
+    Returns:
+        The new blocks by index.
 
     Raises:
         KeyError: A block has no label or a predecessor is missing.
@@ -312,7 +431,7 @@ def generate_blocks(
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
     stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
     repaint = repaint or RePaintConfig()
-    if all(condition.is_empty for condition in conditions):  # nothing to harmonise with
+    if all(condition.is_empty for condition in conditions):  # resampling has no effect without a known part
         repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
     latents = model.inpaint_latents(
         stacked,
@@ -342,7 +461,27 @@ def outpaint_scene(
     guidance_scale: float,
     callback_on_step_end: StepCallback | None,
 ) -> Scene:
-    """Extend a scene on the model's grid by blocks ahead, behind, left and right; see `PrITTIPipeline.outpaint`."""
+    """Extend a scene on the model's grid by blocks ahead, behind, left and right.
+
+    Args:
+        model: Model.
+        scene: Scene on the model's grid.
+        label: Label of all blocks, or label by index of the block.
+        seed: Seed of the noise.
+        scene_index: Index of the scene; it keys the noise.
+        overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
+        mode: "copy" or "reencode", see `BlockComposer.condition_block`.
+        num_blocks: Number of blocks ahead, behind, left and right.
+        repaint: Options of RePaint, or None for the paper's.
+        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        callback_on_step_end: See `PrITTIPipeline.generate`.
+
+    Returns:
+        One scene that covers all blocks.
+
+    Raises:
+        ValueError: The overlap is not a whole number of cells, or `mode` is unknown.
+    """
     block_grid = BlockGrid.from_overlap(model.latent_shape[-1], overlap, num_blocks=num_blocks)
     composer = BlockComposer(block_grid, model.spec, model.encode, find_ground_height(scene, 0.0, 0.0))
     blocks = {(0, 0): SceneBlock(scene, model.encode([scene])[0])}

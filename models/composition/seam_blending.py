@@ -1,10 +1,14 @@
 """Blend generated ground into known ground at seams.
 
-A new part is decoded together with the known part, so the decoder draws both sides consistently; but the known side is
-kept as given, and where the two differ by a pixel of kerb or a centimetre of height the seam is visible. The
-difference at the seam is therefore added to the new side and falls off with distance. A decoder that sees a latent
-half known and half new may also draw a step at the seam: a slope there that exceeds MAX_SLOPE and the slope of the
-known ground is removed in the same way. Differs from the paper, which pastes.
+The decoder decodes the new part together with the known part, so both parts are consistent. The result however keeps
+the original known part. Where the original and the decoded known part differ by a pixel at a kerb or by a centimetre of
+height, the seam is visible. The difference at the seam is therefore added to the new side, with a weight that falls off
+with distance.
+
+A decoder may also draw a height step at the seam between known and new latent cells. A slope at the seam that exceeds
+both MAX_SLOPE and the slope of the known ground is removed in the same way.
+
+Differs from the paper, which pastes the new part without blending.
 """
 
 from __future__ import annotations
@@ -19,22 +23,23 @@ from scipy.ndimage import distance_transform_edt
 from models.composition.deduplicate import find_regenerated_objects
 from models.scene import Scene, merge_scenes
 
-BLEND_M = 8.0  # distance from the seam within which new ground changes
+BLEND_M = 8.0  # largest distance from the seam at which new ground is changed
 MAX_EDGE_SHIFT_M = 2.0  # largest shift of a class's edge
-MAX_SLOPE = 0.08  # rise per metre across the seam where known ground is less steep; a higher one is a decoder's step
+MAX_SLOPE = 0.08  # rise per metre across the seam; a steeper rise is a decoder's step unless known ground is as steep
 
 
 def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     """Blend generated ground into the known ground at seams; objects keep their height above the ground.
 
-    Per class, its signed distance from the class's edge and its height take up the difference at the nearest known
-    pixel. Far from the class's known pixels, its height takes up the difference of the surfaces where both are of one
-    class.
+    Near a class's known pixels, two quantities are corrected by their difference at the nearest known pixel. These are
+    the
+    signed distance from the edge of the class, and the height of the class. Elsewhere, the height is corrected by the
+    difference of the two fused surfaces at the nearest known pixel where both have the same class.
 
     Args:
         generated: Scene on the grid of `known`.
-        known: Scene whose pixels outside `new` are kept.
-        new: (rows, cols) bool, pixels that were generated; the others of `generated` stay unchanged.
+        known: Scene; its pixels outside `new` are kept.
+        new: (rows, cols) bool, generated pixels. All other pixels of `generated` are unchanged.
 
     Returns:
         `generated` with blended ground in `new`.
@@ -61,8 +66,8 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
             new_mask, given, limit_px
         )
         inside = _compute_edge_distance(new_mask, np.ones_like(new), limit_px) + weight * shift_px[nearest] > 0
-        # The class's height everywhere: that of its nearest generated pixel, or of the nearest known one if there is
-        # none.
+        # Height of the class at every pixel: that of the nearest generated pixel of the class. If there is none, it is
+        # that of the nearest known pixel.
         away, place = _find_nearest(known_mask) if known_mask.any() else (np.full(new.shape, np.inf), nearest)
         level_m = new_m[_find_nearest(new_mask)[1]] if new_mask.any() else known_m[place]
         own = _compute_falloff(away * resolution_m)
@@ -79,15 +84,31 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
 
 
 def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
-    """The generated part in the pixels `new`, blended into `known` and without copies of its objects."""
+    """Return the new part of a generated scene, blended into the known ground and without copies of known objects.
+
+    Args:
+        generated: Decoded scene on the grid of `known`.
+        known: Known part.
+        new: (rows, cols) bool, generated pixels.
+
+    Returns:
+        The scene with the content of `new` only.
+    """
     fresh = generated.select(~find_regenerated_objects(generated, known))
     return merge_scenes([blend_ground(fresh, known, new)], [new], generated)
 
 
 def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
-    """Fill the pixels `unknown` (rows, cols) of a scene with the ground of the nearest known pixel, for encoding.
+    """Fill unknown pixels with the ground of the nearest known pixel before the scene is encoded.
 
-    An encoder sees a little beyond a cell; empty unknown pixels would look like an edge of the ground.
+    The receptive field of an encoder extends beyond a cell. Empty unknown pixels would look like an edge of the ground.
+
+    Args:
+        known: Known part of a scene.
+        unknown: (rows, cols) bool, pixels to fill.
+
+    Returns:
+        The scene with filled ground.
     """
     if unknown.all() or not unknown.any():
         return known
@@ -96,7 +117,7 @@ def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
 
 
 def _find_bounding_window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Bounding rectangle of a non-empty mask, with a margin in pixels."""
+    """Return the bounding rectangle of a non-empty mask, enlarged by a margin in pixels."""
     rows, cols = (
         slice(max(0, span[0] - margin), span[-1] + 1 + margin)
         for span in (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
@@ -105,7 +126,7 @@ def _find_bounding_window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
 
 
 def _find_nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Distance in pixels to the nearest pixel of a non-empty mask, and that pixel's (row, col)."""
+    """Return the distance in pixels to the nearest pixel of a non-empty mask, and the (row, col) of this pixel."""
     distance, (row, col) = cast(tuple, distance_transform_edt(~mask, return_indices=True))
     return distance, (row, col)
 
@@ -113,7 +134,10 @@ def _find_nearest(mask: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.nd
 def _compute_surface_difference(
     generated: Scene, known: Scene, window: tuple[slice, slice], given: np.ndarray
 ) -> np.ndarray:
-    """Height of the known above the generated surface in metres where their classes agree, with a falloff elsewhere."""
+    """Return the height of the known surface above the generated surface in metres.
+
+    Where the classes of the surfaces differ, the value is that of the nearest pixel with equal classes, with a falloff.
+    """
     known_m, known_class = (part[window] for part in known.surface())
     new_m, new_class = (part[window] for part in generated.surface())
     alike = given & (known_class == new_class) & (known_class >= 0)
@@ -124,7 +148,10 @@ def _compute_surface_difference(
 
 
 def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Largest height step from each pixel of a mask to those of its four neighbours that are in the mask, else 0."""
+    """Return the largest height step from each pixel of a mask to its four neighbours in the mask.
+
+    The step is 0 for pixels outside the mask and for pixels without such neighbours.
+    """
     largest = np.zeros(mask.shape, np.float32)
     for axis in (0, 1):
         height, out = height_m.swapaxes(0, axis), largest.swapaxes(0, axis)
@@ -136,7 +163,10 @@ def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_step_m: np.ndarray) -> np.ndarray:
-    """A class's level at known pixels as seen from its nearest new pixel, rising by at most `max_step_m` per pixel."""
+    """Return the expected height of a class at known pixels, extrapolated from the nearest new pixel.
+
+    The height changes by at most `max_step_m` per pixel.
+    """
     if not new.any():
         return level_m
     distance, nearest = _find_nearest(new)
@@ -145,13 +175,13 @@ def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_
 
 
 def _compute_falloff(distance_m: np.ndarray) -> np.ndarray:
-    """Smooth weight: 1 at the seam, 0 from BLEND_M on."""
+    """Return a smooth weight: 1 at the seam, 0 at distances of BLEND_M and more."""
     left = np.clip(1 - distance_m / BLEND_M, 0, 1)
     return left * left * (3 - 2 * left)
 
 
 def _compute_edge_distance(mask: np.ndarray, domain: np.ndarray, limit: float) -> np.ndarray:
-    """Signed distance in pixels from the edge of a mask inside a domain, positive in the mask, within +-limit."""
+    """Return the signed distance in pixels from the edge of a mask, positive inside, clipped to +-limit."""
     inside, outside = (
         np.minimum(_find_nearest(side)[0] - 0.5, limit) if side.any() else np.full(mask.shape, limit)
         for side in (mask & domain, ~mask & domain)

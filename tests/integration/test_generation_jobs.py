@@ -289,7 +289,7 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
     assert inpaint(config) == drift and times == {path: path.stat().st_mtime_ns for path in times}
     with pytest.raises(ValueError, match="holds a run 'inpainted' with seed=0, asked for 1"):
         inpaint(replace(config, seed=1))
-    with pytest.raises(ValueError, match="the region holds no pixel"):
+    with pytest.raises(ValueError, match="the region contains no pixel"):
         inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
     Path(find_shards(str(samples))[0].path("scenes")).touch()  # it may hold other scenes now
     with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):

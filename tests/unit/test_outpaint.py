@@ -106,7 +106,7 @@ def test_block_grid_fronts_are_independent():
 def test_block_grid_rejects_wrong_overlaps():
     with pytest.raises(ValueError, match=r"overlap 0.51 is not a whole number of the 8 latent cells"):
         BlockGrid.from_overlap(8, 0.51)
-    with pytest.raises(ValueError, match=r"overlap 0.5: four colours need less than 0.5"):
+    with pytest.raises(ValueError, match=r"overlap 0.5: four ranks need an overlap below 0.5"):
         BlockGrid.from_overlap(8, 0.5, rank=rank_four_colors, num_blocks=None)
 
 
@@ -232,7 +232,7 @@ def test_infinite_scene_is_independent_of_request_order(pipeline):
     assert whole.grid == Grid(70.0, 20.0, 2.0, 40, 25)
     part = one.get_scene(40.0, -10.0, 20.0, 0.0)
     assert scenes_equal(whole.crop(part.grid), part)
-    with pytest.raises(ValueError, match="an empty rectangle"):
+    with pytest.raises(ValueError, match="the rectangle is empty"):
         one.get_scene(10.0, -10.0, 5.0, 5.0)
     with pytest.raises(ValueError, match="label 'dense' is unknown"):
         InfiniteScene(pipeline, "dense")
