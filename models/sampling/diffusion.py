@@ -1,7 +1,7 @@
 """Denoising diffusion on layout latents (paper, supplement B.3): noise schedule and samplers.
 
-States are counted on the visited timesteps: state i has the noise of timestep `timesteps[i]`, state -1 is clean.
-Sampling passes the states n-1, n-2, ..., 0, -1; RePaint adds jumps back to noisier states (repaint.py).
+States number the visited timesteps: state i has the noise of timestep `timesteps[i]`, and state -1 is clean. Sampling
+visits the states n-1, n-2, ..., 0, -1. RePaint adds jumps back to noisier states (repaint.py).
 """
 
 from __future__ import annotations
@@ -18,12 +18,18 @@ from torch import Tensor
 
 Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
 SceneKey = int | tuple[int, ...]  # a scene's index, or several numbers that identify it
-OnStep = Callable[[int, int, Tensor], Tensor]  # index of the step, its timestep, latent -> latent of the next step
+OnStep = Callable[[int, int, Tensor], Tensor]  # step, timestep, latent -> latent for the next step
 
 
 @dataclass(frozen=True)
 class Diffusion:
-    """DDPM with a linear variance schedule; the paper's numbers (supplement B.3, Implementation Details)."""
+    """DDPM with a linear variance schedule; the defaults are the paper's (supplement B.3, Implementation Details).
+
+    Attributes:
+        num_timesteps: Number T of training timesteps.
+        beta_start: Variance of the first timestep.
+        beta_end: Variance of the last timestep.
+    """
 
     num_timesteps: int = 1000
     beta_start: float = 0.0015
@@ -31,16 +37,24 @@ class Diffusion:
 
     @cached_property
     def alpha_bar(self) -> np.ndarray:
-        """(T,) float64 cumulative product of 1 - beta_t."""
+        """(T,) float64: cumulative product of 1 - beta_t."""
         return np.cumprod(1 - np.linspace(self.beta_start, self.beta_end, self.num_timesteps, dtype=np.float64))
 
     def select_timesteps(self, num_inference_steps: int) -> np.ndarray:
-        """Select ascending timesteps (n,) with "leading" spacing: 0, 4, ..., 996 for 250 of 1000.
+        """Select ascending timesteps with "leading" spacing, for example 0, 4, ..., 996 for 250 of 1000.
+
+        Some numbers are rejected. For example, 600 timesteps have a spacing of 1, so sampling starts at timestep 599.
+        There the
+        network expects a signal share of 20 % but the input is pure noise.
+
+        Args:
+            num_inference_steps: Number n of timesteps.
+
+        Returns:
+            (n,) timesteps in ascending order.
 
         Raises:
-            ValueError: The number is out of range, or the timesteps would cover less than nine tenths of the schedule.
-                600 timesteps with a spacing of 1 begin at 599, where the network expects two tenths of the signal and
-                would receive pure noise.
+            ValueError: The number is out of range, or the timesteps cover less than 90 % of the schedule.
         """
         if not 1 <= num_inference_steps <= self.num_timesteps:
             raise ValueError(f"num_inference_steps is {num_inference_steps}, expected 1 to {self.num_timesteps}")
@@ -48,26 +62,36 @@ class Diffusion:
         if num_inference_steps * spacing < 0.9 * self.num_timesteps:
             near = self.num_timesteps // (spacing + 1), self.num_timesteps // spacing
             raise ValueError(
-                f"num_inference_steps is {num_inference_steps}: with a spacing of {spacing} they would begin at "
-                f"{(num_inference_steps - 1) * spacing} of {self.num_timesteps}; expected {near[0]} or {near[1]}"
+                f"num_inference_steps is {num_inference_steps}: with a spacing of {spacing}, sampling would begin "
+                f"at timestep {(num_inference_steps - 1) * spacing} of {self.num_timesteps}; "
+                f"expected {near[0]} or {near[1]}"
             )
         return np.arange(num_inference_steps) * spacing
 
     def add_noise(
         self, clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], timestep: Int[Tensor, " b"]
     ) -> Float[Tensor, "b c h w"]:
-        """z_t = sqrt(alpha_bar_t) z_0 + sqrt(1 - alpha_bar_t) eps."""
+        """Add noise: z_t = sqrt(alpha_bar_t) z_0 + sqrt(1 - alpha_bar_t) eps.
+
+        Args:
+            clean: Clean latents z_0.
+            noise: Standard normal noise eps.
+            timestep: Timestep of each sample.
+
+        Returns:
+            Noisy latents z_t.
+        """
         alpha_bar = torch.from_numpy(self.alpha_bar).to(clean.device)[timestep][:, None, None, None]
         return alpha_bar.sqrt().to(clean.dtype) * clean + (1 - alpha_bar).sqrt().to(clean.dtype) * noise
 
 
 class SamplingSchedule:
-    """The visited timesteps of one sampling run and the transitions between their states.
+    """Visited timesteps of a sampling run and the transitions between their states.
 
     Args:
-        diffusion: The noise schedule.
+        diffusion: Noise schedule.
         num_inference_steps: Number of visited timesteps.
-        eta: Share of the noise of DDPM's steps (DDIM; Song et al., 2021): 1 in the paper, 0 for none.
+        eta: Share of DDPM's noise that each step adds (DDIM; Song et al., 2021): 1 in the paper, 0 for none.
     """
 
     def __init__(self, diffusion: Diffusion, num_inference_steps: int, eta: float = 1.0) -> None:
@@ -78,25 +102,54 @@ class SamplingSchedule:
         return len(self.timesteps)
 
     def descending_transitions(self) -> list[tuple[int, int]]:
-        """Transitions (from, to) without jumps."""
+        """Return the transitions (from, to) of a sampling run without jumps."""
         return [(i, i - 1) for i in reversed(range(len(self)))]
 
     def noise_to_state(self, clean: Tensor, noise: Tensor, state: int) -> Tensor:
-        """Add noise to a clean latent up to a state; state -1 returns it bit for bit."""
+        """Add noise to a clean latent up to a state.
+
+        Args:
+            clean: Clean latent z_0.
+            noise: Standard normal noise.
+            state: Target state; state -1 returns `clean` bit for bit.
+
+        Returns:
+            Latent at this state.
+        """
         if state == -1:
             return clean
         a = self.alpha_bar[state]
         return a**0.5 * clean + (1 - a) ** 0.5 * noise
 
     def step_up(self, latent: Tensor, noise: Tensor, state: int, to: int) -> Tensor:
-        """Sample q(z_to | z_state) for to > state: add the noise between two states."""
+        """Sample q(z_to | z_state): add the noise between two states.
+
+        Args:
+            latent: Latent at `state`.
+            noise: Standard normal noise.
+            state: Current state.
+            to: Target state, above `state`.
+
+        Returns:
+            Latent at state `to`.
+        """
         ratio = self.alpha_bar[to] / self.alpha_bar[state]
         return ratio**0.5 * latent + (1 - ratio) ** 0.5 * noise
 
     def step_down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
-        """Sample p(z_{state-1} | z_state). With eta 1 it has the mean and the variance of DDPM's posterior.
+        """Sample p(z_{state-1} | z_state). With eta 1, mean and variance are those of DDPM's posterior.
 
-        Written through z_0, so that it holds for spaced timesteps (beta = 1 - alpha_bar_i / alpha_bar_{i-1}).
+        The formula is expressed by z_0, so it also holds for spaced timesteps (beta = 1 - alpha_bar_i /
+        alpha_bar_{i-1}).
+
+        Args:
+            latent: Latent at `state`.
+            predicted_noise: Noise that the model predicts in `latent`.
+            noise: Standard normal noise.
+            state: Current state.
+
+        Returns:
+            Latent at the state below.
         """
         a, a_prev = self.alpha_bar[state], self.alpha_bar[state - 1]
         variance = self.eta**2 * (1 - a_prev) / (1 - a) * (1 - a / a_prev)
@@ -105,15 +158,21 @@ class SamplingSchedule:
         return mean if state == 0 else mean + variance**0.5 * noise
 
 
-# Purposes of noise: generation and outpainting of the same scene index must start from different noise.
+# Purposes of noise. Generation and outpainting of the same scene index must start from different noise.
 GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 
 
 class SceneNoise:
-    """Standard normal noise keyed by (seed, scene index, purpose): each scene draws its own sequence.
+    """Standard normal noise keyed by (seed, scene index, purpose); each scene has its own sequence.
 
     A scene therefore does not depend on the batch size, the number of workers or the other scenes of its batch.
-    `seed` is one number for all scenes, or one per scene.
+
+    Args:
+        seed: One seed for all scenes, or one per scene.
+        indices: Key of each scene.
+        shape: Shape of the noise of one scene.
+        device: Device of the noise.
+        purpose: GENERATE, OUTPAINT or INPAINT.
     """
 
     def __init__(
@@ -130,19 +189,36 @@ class SceneNoise:
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:
+        """Return the next noise (b, *shape) of the scenes."""
         noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
         return noise.to(self.device)
 
 
 def make_keyed_generator(*key: int) -> torch.Generator:
-    """A CPU generator that depends on every number of the key, and on nothing else."""
-    # SeedSequence takes [a] and [a, 0] for the same: the length goes in too.
+    """Make a CPU generator that depends on the numbers of a key only.
+
+    Args:
+        *key: Integers.
+
+    Returns:
+        A new generator.
+    """
+    # SeedSequence treats [a] and [a, 0] as equal, so the key starts with its length.
     state = np.random.SeedSequence([len(key), *(k & 0xFFFFFFFF for k in key)]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
 
 def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
-    """Add classifier-free guidance to a model; at scale 1 it is returned unchanged and evaluated once per step."""
+    """Add classifier-free guidance to a model.
+
+    Args:
+        model: Model that predicts the noise.
+        null_label: Index of the null label.
+        scale: Guidance scale. With 1, the model is returned unchanged and evaluated once per step.
+
+    Returns:
+        A model that predicts the guided noise.
+    """
     if scale == 1.0:
         return model
 
@@ -155,10 +231,18 @@ def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
 
 
 def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
-    """Divide the noise that a model predicts by a number near 1; at 1 the model is returned unchanged.
+    """Divide the predicted noise of a model by a number near 1.
 
-    Epsilon scaling (Ning et al., ICLR 2024): during sampling a network takes its own errors for noise. Dividing its
-    prediction compensates for that, so that samples keep the standard deviation of the data.
+    This is epsilon scaling (Ning et al., ICLR 2024). During sampling, a network interprets its own earlier errors as
+    noise.
+    The division compensates for that, so samples keep the standard deviation of the data.
+
+    Args:
+        model: Model that predicts the noise.
+        noise_scaling: Divisor. With 1, the model is returned unchanged.
+
+    Returns:
+        A model that predicts the scaled noise.
     """
     if noise_scaling == 1.0:
         return model
@@ -167,7 +251,12 @@ def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
 
 @dataclass(frozen=True, eq=False)
 class InpaintCondition:
-    """Clean known latents and a mask, 1 = generate, 0 = keep (paper, Eqs. "z_known" ff.)."""
+    """Known part of latents (paper, Eqs. "z_known" ff.).
+
+    Attributes:
+        latent: Clean latents of the known part.
+        mask: 1 = generate, 0 = keep.
+    """
 
     latent: Float[Tensor, "b c h w"]
     mask: Float[Tensor, "b c h w"]
@@ -186,19 +275,25 @@ def sample(
 ) -> Float[Tensor, "b c h w"]:
     """Sample clean latents by ancestral sampling along `transitions`.
 
-    Downward transitions denoise; upward ones add noise back (RePaint). With a condition, the known part is noised to
-    the state just reached and pasted in after each downward step. Differs from the paper, which prints the level just
-    left (Eq. "z_known"): the two parts would have different noise levels. In the end the known part is z_0 bit for bit.
+    Downward transitions denoise; upward transitions add noise back (RePaint). With a condition, each downward step
+    replaces
+    the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0 bit for bit.
+
+    Differs from the paper, which uses the noise level of the state just left (Eq. "z_known"). The known part and the
+    generated part would then have different noise levels.
 
     Args:
-        model: Predicts the noise in a latent.
+        model: Model that predicts the noise in a latent.
         schedule: Visited timesteps and the noise of each step.
-        noise: The scenes' random numbers.
+        noise: Random numbers of the scenes.
         label: Class index of each scene.
         transitions: Pairs (from, to) of states (default: descending, without jumps).
-        condition: Known part of the latents.
-        on_step: Called after every evaluation of the model; returns the latent to continue with.
-        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part; not in the paper.
+        condition: Known part of the latents (default: none).
+        on_step: Function that is called after every evaluation of the model and returns the latent for the next step.
+        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part. The paper has no such guidance.
+
+    Returns:
+        Clean latents.
     """
     latent, evaluations = noise.draw(), 0
     for state, to in transitions or schedule.descending_transitions():
@@ -232,11 +327,25 @@ def pseudoinverse_guidance(
     alpha_bar: float,
     condition: InpaintCondition,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
-    """Predict the noise, and the direction that moves the estimate of the clean latent towards the known part.
+    """Predict the noise, and the direction that moves the clean estimate towards the known part.
 
-    Pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement: the transposed Jacobian of the
-    clean estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting alone does not inform the
-    generated part where a network has not learnt to. One call costs about as much as two evaluations.
+    This is pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement. The direction is the
+    transposed
+    Jacobian of the clean estimate, times its difference from the known part, times sqrt(alpha_bar). If the known part
+    is
+    only pasted, an untrained network ignores it in the generated part. One call costs about two evaluations of the
+    model.
+
+    Args:
+        model: Model that predicts the noise.
+        latent: Noisy latents.
+        timestep: Timestep of all latents.
+        label: Class index of each scene.
+        alpha_bar: Squared signal share at this timestep.
+        condition: Known part of the latents.
+
+    Returns:
+        Predicted noise and direction.
     """
     with torch.enable_grad():
         latent = latent.detach().requires_grad_()
@@ -255,10 +364,18 @@ def sample_with_scheduler(
     label: Int[Tensor, " b"],
     on_step: OnStep | None = None,
 ) -> Float[Tensor, "b c h w"]:
-    """Sample clean latents with a scheduler of diffusers, such as DPM-Solver++ or DDIM, after its `set_timesteps`.
+    """Sample clean latents with a scheduler of diffusers, such as DPM-Solver++ or DDIM.
 
-    `scheduler` is a SchedulerMixin (diffusers is not imported here). Schedulers that add noise must accept it as an
-    argument, so that each scene keeps its own random numbers.
+    Args:
+        model: Model that predicts the noise.
+        scheduler: A SchedulerMixin after its `set_timesteps`. A scheduler that adds noise must accept the noise as an
+            argument, so that the noise stays keyed per scene.
+        noise: Random numbers of the scenes.
+        label: Class index of each scene.
+        on_step: Function that is called after every evaluation of the model and returns the latent for the next step.
+
+    Returns:
+        Clean latents.
     """
     latent = noise.draw() * scheduler.init_noise_sigma
     stochastic = str(scheduler.config.get("algorithm_type")).startswith("sde-")

@@ -1,4 +1,4 @@
-"""RePaint (Lugmayr et al., 2022): options and order of its sampling steps (paper, supplement B.3, Applications)."""
+"""RePaint (Lugmayr et al., 2022): options and order of the sampling steps (paper, supplement B.3, Applications)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ import math
 from dataclasses import dataclass
 
 NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
-JUMP_LENGTH, RESAMPLINGS = 10, 10  # paper, supplement B.3: roll-back J and resamplings R
+JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper, supplement B.3
 
 
 def repaint_transitions(
     num_inference_steps: int, jump_length: int = JUMP_LENGTH, resamplings: int = RESAMPLINGS
 ) -> list[tuple[int, int]]:
-    """List the transitions (from, to) between states: after each jump_length-th state, RePaint adds noise back.
+    """List the transitions (from, to) between states for RePaint.
 
-    250 steps with J = R = 10 jump back at states 0, 10, ..., 230, nine times each, which makes 2,410 denoising steps.
+    After every `jump_length` states, RePaint adds noise back and denoises again. With 250 steps and J = R = 10, it
+    jumps
+    back at states 0, 10, ..., 230, nine times each. The result has 2,410 denoising steps.
 
     Args:
         num_inference_steps: Number of visited timesteps.
-        jump_length: Number of steps that a jump goes back (J of the paper).
-        resamplings: Number of passes over the same steps (R of the paper).
+        jump_length: Number of states that a jump goes back (J of the paper).
+        resamplings: Number of passes over the same states (R of the paper).
+
+    Returns:
+        Transitions in order.
 
     Raises:
         ValueError: `jump_length` or `resamplings` is below 1.
@@ -42,13 +47,12 @@ def repaint_transitions(
 class RePaintConfig:
     """Options of inpainting and outpainting; the defaults are the paper's.
 
-    Args:
+    Attributes:
         num_inference_steps: Number of visited timesteps.
-        jump_length, resamplings: See `repaint_transitions`.
-        pseudoinverse_guidance: Guidance weight towards the known region (`diffusion.pseudoinverse_guidance`); 0 is
-            none.
-        eta: Share of DDPM's noise that each step adds (`diffusion.SamplingSchedule`). With few steps, noise removes
-            small objects.
+        jump_length: Number of states that a jump goes back (J of the paper).
+        resamplings: Number of passes over the same states (R of the paper).
+        pseudoinverse_guidance: Weight of pseudo-inverse guidance towards the known region; 0 is none.
+        eta: Share of DDPM's noise that each step adds, from 0 (none) to 1. With few steps, noise removes small objects.
 
     Raises:
         ValueError: A value is out of range.
@@ -62,22 +66,31 @@ class RePaintConfig:
 
     @classmethod
     def guided(cls, num_inference_steps: int = 50) -> RePaintConfig:
-        """Guidance instead of resampling: fewer visible seams, more objects and 24 times the paper's speed."""
+        """Return options with pseudo-inverse guidance instead of resampling.
+
+        They give fewer visible seams and more objects, and they are 24 times as fast as the paper's.
+
+        Args:
+            num_inference_steps: Number of visited timesteps.
+
+        Returns:
+            The options.
+        """
         return cls(num_inference_steps, resamplings=1, pseudoinverse_guidance=1.0, eta=0.3)
 
     def __post_init__(self) -> None:
         if not 0 <= self.eta <= 1:
-            raise ValueError(f"eta is {self.eta}, expected 0 (steps add no noise) to 1 (the paper)")
+            raise ValueError(f"eta is {self.eta}, expected 0 (steps add no noise) to 1 (as in the paper)")
         if not 0 <= self.pseudoinverse_guidance < math.inf:
             raise ValueError(
-                f"pseudoinverse_guidance is {self.pseudoinverse_guidance}, expected 0 (none) or more, 1 is usual"
+                f"pseudoinverse_guidance is {self.pseudoinverse_guidance}, expected 0 (none) or more; 1 is usual"
             )
 
     def transitions(self) -> list[tuple[int, int]]:
-        """Transitions between states, see `repaint_transitions`."""
+        """Return the transitions between states (see `repaint_transitions`)."""
         return repaint_transitions(self.num_inference_steps, self.jump_length, self.resamplings)
 
     @property
     def num_evaluations(self) -> int:
-        """Number of evaluations of the network."""
+        """Number of denoising steps; each one evaluates the network once."""
         return sum(to < state for state, to in self.transitions())

@@ -181,11 +181,11 @@ def test_sampler_rejects_invalid_step_counts():
     with pytest.raises(ValueError, match="num_inference_steps is 0, expected 1 to 1000"):
         SamplingSchedule(Diffusion(), 0)
     with pytest.raises(
-        ValueError, match="600: with a spacing of 1 they would begin at 599 of 1000; expected 500 or 1000"
+        ValueError, match="600: with a spacing of 1, sampling would begin at timestep 599 of 1000; expected 500 or 1000"
     ):
         SamplingSchedule(Diffusion(), 600)
     with pytest.raises(
-        ValueError, match="334: with a spacing of 2 they would begin at 666 of 1000; expected 333 or 500"
+        ValueError, match="334: with a spacing of 2, sampling would begin at timestep 666 of 1000; expected 333 or 500"
     ):
         SamplingSchedule(Diffusion(), 334)
     assert all(
@@ -280,7 +280,7 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
         caught.value.positions == [11] and len(asked) == 1
     )  # the search for the sample is no step: other workers take none
     batch["mean"][:] = float("nan")
-    with pytest.raises(NonFiniteLossError, match="of every sample: the weights are broken"):
+    with pytest.raises(NonFiniteLossError, match="of every sample, so the weights are invalid"):
         trainer.step(batch, range(8))
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 
