@@ -1,9 +1,9 @@
-"""The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids: adaLN-Zero blocks, one timestep and one
-label embedding shared by all of them (paper, supplement B.3).
+"""The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
-diffusers' own `DiTTransformer2DModel` embeds timestep and label again in every block, which is 8 % larger and drops
-labels for guidance independently per block, so that its unconditional branch is never trained. Here one embedding
-and one mask per sample serve the whole network.
+It consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. diffusers'
+`DiTTransformer2DModel` embeds timestep and label again in every block, which makes it 8 % larger. It also drops labels
+for guidance independently per block, so its unconditional branch is never trained. Here, each sample has one embedding
+and one dropout mask for the whole network.
 """
 
 from __future__ import annotations
@@ -25,7 +25,14 @@ Prediction = Literal["epsilon", "v_prediction"]
 
 
 def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
-    """Sinusoidal embedding of a timestep, cosines first."""
+    """Compute the sinusoidal embedding of timesteps, cosines first.
+
+    Args:
+        timestep: Timesteps.
+
+    Returns:
+        Embeddings.
+    """
     half = FREQUENCIES // 2
     frequency = torch.exp(-math.log(10_000) * torch.arange(half, device=timestep.device, dtype=torch.float32) / half)
     angle = timestep.float()[:, None] * frequency
@@ -33,7 +40,15 @@ def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 25
 
 
 def make_sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
-    """Fixed 2D sine-cosine positions of a square token grid, row-major: first half columns, second half rows."""
+    """Make fixed 2D sine-cosine positions of a square token grid.
+
+    Args:
+        rows: Number of rows and of columns.
+        width: Number of channels; the first half encodes the column, the second half the row.
+
+    Returns:
+        Positions of the tokens in row-major order.
+    """
 
     def axis(position: Tensor) -> Tensor:
         frequency = 10_000 ** (-torch.arange(width // 4, dtype=torch.float64) / (width // 4))
@@ -45,11 +60,21 @@ def make_sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
 
 
 def modulate(x: Float[Tensor, "batch n d"], shift: Tensor, scale: Tensor) -> Float[Tensor, "batch n d"]:
+    """Compute (1 + scale) x + shift.
+
+    Args:
+        x: Tokens.
+        shift: (batch, d) shift per channel.
+        scale: (batch, d) scale per channel.
+
+    Returns:
+        Modulated tokens.
+    """
     return torch.addcmul(shift[:, None], x, (1 + scale)[:, None])
 
 
 class DiTBlock(nn.Module):
-    """Self-attention and MLP, both modulated and gated by the condition (adaLN-Zero)."""
+    """Self-attention and MLP, each modulated and gated by the condition (adaLN-Zero)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -61,7 +86,15 @@ class DiTBlock(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch n d"], modulation: Float[Tensor, "batch 6*d"]
     ) -> Float[Tensor, "batch n d"]:
-        """`modulation` is the output of the layer of that name for the condition."""
+        """Apply the block.
+
+        Args:
+            x: Tokens.
+            modulation: Shifts, scales and gates; output of `self.modulation` for the condition.
+
+        Returns:
+            Tokens of the same shape.
+        """
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
         width = x.shape[-1:]
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
@@ -73,14 +106,27 @@ class DiTBlock(nn.Module):
 
 
 class DiT(ConfiguredModel):
-    """Predicts the noise in a latent (b, channels, size, size) at timestep t under label y.
+    """Predict the noise in a latent (b, channels, size, size) at timestep t under label y.
 
-    Label `num_labels` is the null label of classifier-free guidance. `labels` names what a label means, `scale`
-    divides and `shift` is subtracted from VAE latents before diffusion (per channel; the paper uses none).
+    Args:
+        channels: Number of latent channels.
+        size: Number of latent cells per side.
+        patch: Side of a patch in latent cells.
+        width: Width of the tokens.
+        depth: Number of blocks.
+        heads: Number of attention heads.
+        label: Kind of label, a key of `models.labels.LABELS`.
+        num_labels: Number of labels; this index is the null label of classifier-free guidance.
+        layout: LayoutSpec of the training scenes as a dict, or None.
+        shift: Value per channel that is subtracted from VAE latents before diffusion. The paper uses none.
+        scale: Value per channel that divides VAE latents after the shift. The paper uses none.
+        prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is
+            sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the
+                noise.
+            With it, a small network need not transport the noise of its input through all layers.
 
-    `prediction` is the output of the network: "epsilon" (the noise) as in the paper, or "v_prediction",
-    sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which is converted to the noise here. A
-    small network then need not carry its input's noise through all its layers.
+    Raises:
+        ValueError: `prediction` is unknown, or `patch` or `heads` does not divide the size or the width.
     """
 
     positions: Tensor
@@ -106,7 +152,9 @@ class DiT(ConfiguredModel):
         if prediction not in get_args(Prediction):
             raise ValueError(f"DiT: prediction {prediction!r}, expected one of: {', '.join(get_args(Prediction))}")
         if size % patch or width % heads or width % 4:
-            raise ValueError(f"DiT: size {size} / patch {patch} and width {width} / heads {heads} must be whole")
+            raise ValueError(
+                f"DiT: size {size} / patch {patch} and width {width} / heads {heads} must be whole numbers"
+            )
         self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
         self.timestep_mlp = nn.Sequential(nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
         self.label_embedding = nn.Embedding(num_labels + 1, width)
@@ -116,18 +164,25 @@ class DiT(ConfiguredModel):
         self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
         alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
-        self.register_buffer("noise_shares", shares, persistent=False)  # of the latent and of the velocity
+        self.register_buffer("noise_shares", shares, persistent=False)  # factors of latent and velocity
         self.init_weights()
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Names of predictions as versions before 0.2 wrote them."""
+        """Rename predictions in a config that a version before 0.2 wrote.
+
+        Args:
+            config: Entries of a stored config.
+
+        Returns:
+            Keyword arguments of the constructor.
+        """
         renamed = {"noise": "epsilon", "velocity": "v_prediction"}
         prediction = config.get("prediction", "epsilon")
         return config | {"prediction": renamed.get(prediction, prediction)}
 
     def init_weights(self) -> None:
-        """The original initialisation: xavier everywhere, every residual branch and the output start at zero."""
+        """Initialise the weights as DiT does: Xavier, with zeros for every residual branch and the output."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -142,25 +197,53 @@ class DiT(ConfiguredModel):
             nn.init.zeros_(layer.bias)
 
     def list_modulations(self) -> list[nn.Linear]:
-        """The layers that the condition goes through: one per block, and the output's."""
+        """Return the layers that map the condition to modulations: one per block, then that of the output."""
         return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
 
     @property
     def null_label(self) -> int:
+        """Index of the null label."""
         return self.config.num_labels
 
     def condition(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> Float[Tensor, "batch d"]:
-        """One vector per sample that modulates every block: SiLU of timestep plus label embedding."""
+        """Compute the condition that modulates every block: SiLU of timestep embedding plus label embedding.
+
+        Args:
+            timestep: Timesteps.
+            label: Class indices.
+
+        Returns:
+            One vector per sample.
+        """
         frequencies = embed_timesteps(timestep).to(self.patch_out.weight.dtype)
         return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
 
     def modulations(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> list[Tensor]:
-        """Shifts, scales and gates of every block (b, 6 d), of the output (b, 2 d), and the noise's shares (b, 2)."""
+        """Compute the modulations of all layers.
+
+        Args:
+            timestep: Timesteps.
+            label: Class indices.
+
+        Returns:
+            Shifts, scales and gates (b, 6 d) of every block, shift and scale (b, 2 d) of the output, and the factors
+            (b, 2) that
+            convert latent and network output to the noise.
+        """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
 
     def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
-        """What the squared error of the noise counts in training: that of what the network puts out counts 1."""
+        """Return the weight of the squared noise error in training.
+
+        The weight makes the squared error of the network's own output (noise or velocity) count 1.
+
+        Args:
+            timestep: Timesteps.
+
+        Returns:
+            Weight per sample.
+        """
         if self.config.prediction == "epsilon":
             return torch.ones(len(timestep), device=timestep.device)
         return self.noise_shares[timestep, 1] ** -2
@@ -168,25 +251,36 @@ class DiT(ConfiguredModel):
     def forward(
         self, latent: Float[Tensor, "batch c h w"], timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]
     ) -> Float[Tensor, "batch c h w"]:
-        """The noise in `latent`."""
+        """Predict the noise in latents.
+
+        Args:
+            latent: Noisy latents.
+            timestep: Timesteps.
+            label: Class indices.
+
+        Returns:
+            Predicted noise.
+        """
         return self.apply_modulations(latent, self.modulations(timestep, label))
 
     @torch.no_grad()
     def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
-        """Compute the conditioning of these timesteps and labels once and return `forward` for them.
+        """Compute the modulations of the given timesteps and labels once and return `forward` for them.
 
-        The modulation layers hold a third of the weights; each step would read them for a row or two.
+        The modulation layers hold a third of the weights. Without this method, each step would read these weights for
+        only one
+        or two rows.
 
         Args:
             timesteps: Timesteps that will be used.
-            labels: Class indices that will be used, the null label included.
+            labels: Class indices that will be used, including the null label if guidance needs it.
 
         Returns:
-            A denoiser. It raises IndexError for another timestep or label.
+            A denoiser. It raises IndexError for other timesteps or labels.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
         labels = sorted(set(labels))
-        # Label by label: what one's rows round to must not depend on which others there are.
+        # Compute each label separately, because the rounding of its rows must not depend on the other labels.
         rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
         table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.list_modulations()), 2]
         row_of = torch.full((int(timestep[-1]) + 1, labels[-1] + 1), len(table), device=timestep.device)
@@ -201,7 +295,15 @@ class DiT(ConfiguredModel):
     def apply_modulations(
         self, latent: Float[Tensor, "batch c h w"], modulations: Sequence[Tensor]
     ) -> Float[Tensor, "batch c h w"]:
-        """`forward` from modulations that are computed already."""
+        """Predict the noise in latents with precomputed modulations.
+
+        Args:
+            latent: Noisy latents.
+            modulations: Output of `modulations`.
+
+        Returns:
+            Predicted noise.
+        """
         patch, tokens = self.config.patch, self.config.size // self.config.patch
         x = self.patch_in(latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
         *of_blocks, of_output, shares = modulations

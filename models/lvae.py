@@ -1,4 +1,7 @@
-"""The layout VAE (paper, Sec. 3.2 and supplement B.2): two branches, one joint latent that stays split by channel."""
+"""The layout VAE (paper, Sec. 3.2 and supplement B.2).
+
+It has a ground branch and an object branch. Their latents are stacked along the channels of one joint latent.
+"""
 
 from __future__ import annotations
 
@@ -18,28 +21,42 @@ from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectDecoder, ObjectEncoder
 from models.vae.outputs import LayoutOutput, Posterior
 
-# Posteriors start narrow (sigma 0.14): decoders see the latent, not noise, from the first step on. With sigma 1,
-# the default, the same number of steps ends at 1.5 times the loss (tests/unit/test_models.py, one batch, 300 steps).
+# Posteriors start narrow (sigma 0.14), so the latent dominates the noise from the first step. With the default
+# sigma 1, the loss after the same number of steps is 1.5 times as high (tests/unit/test_models.py: one batch, 300
+# steps).
 INITIAL_LOGVAR = -4.0
-SOLVED_LOGVAR = -8.0  # of a ground branch with a solved shortcut (models/vae/ground.py): sigma 0.018
+SOLVED_LOGVAR = -8.0  # sigma 0.018, for a ground branch with a closed-form shortcut (models/vae/ground.py)
 
 BRANCHES = ("both", "ground", "objects")
-OBJECT_DECODER = "object_decoder."  # prefix of its parameters' names
-EMPTY_LOGIT = -6.0  # occupancy where there is no ground branch
+OBJECT_DECODER = "object_decoder."  # prefix of parameter names
+EMPTY_LOGIT = -6.0  # occupancy logit of a model without a ground branch
 
 
 def compute_clamped_logit(probability: Tensor) -> Tensor:
-    """Logit of a probability, which is first clamped to [0.01, 0.99]."""
+    """Compute the logit of a probability that is first clamped to [0.01, 0.99].
+
+    Args:
+        probability: Probabilities, any shape.
+
+    Returns:
+        Logits of the same shape.
+    """
     return probability.clamp(0.01, 0.99).logit()
 
 
 class LayoutVAE(ConfiguredModel):
-    """Encodes layouts into a latent (2 c, h, w) and decodes them back; h = w = raster pixels / `ground.cell_px`.
+    """Encode layouts to latents (2 c, h, w) and decode latents to layouts; h = w = pixels / `ground.cell_px`.
 
     Args:
-        layout: A LayoutSpec as a dict, so that a saved model inverts its own outputs.
-        latent_channels, ground, objects, shortcut, split_latent, branches: See `LayoutVAEConfig`. With one branch the
-            latent has c channels, and the other side of a decoded layout is empty.
+        layout: LayoutSpec as a dict, with which a saved model decodes its outputs.
+        latent_channels: Number c of latent channels per branch.
+        ground: Options of the ground branch.
+        objects: Options of the object branch.
+        shortcut: See `LayoutVAEConfig`.
+        split_latent: See `LayoutVAEConfig`.
+        branches: "both", "ground" or "objects". With one branch, the latent has c channels and the other part of a
+            decoded
+            layout is empty.
 
     Raises:
         ValueError: An option is unknown, or the grid does not divide into latent cells.
@@ -65,15 +82,19 @@ class LayoutVAE(ConfiguredModel):
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground.cell_px:
             raise ValueError(f"LayoutVAE needs a square grid divisible by {ground.cell_px}, got {spec.grid}")
         size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
-        # A cell's proposals give positions as fractions of the cell; losses therefore measure metres in cells. The
-        # queries of the paper's DETR search the whole crop and are trained on normalised numbers.
+        # Proposals of a cell decoder are relative to their cell, so losses measure distances in cells. DETR queries
+        # search the whole scene, so losses measure distances in normalised units.
         self.feature_unit = (
             spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
             if objects.decoder == "cells"
             else (1.0,) * FEATURES
         )
-        self.latent_shape = (latent_channels * (2 if branches == "both" else 1), size, size)  # of the joint latent
-        seen = latent_channels if split_latent else self.latent_shape[0]  # channels that a decoder reads
+        self.latent_shape = (
+            latent_channels * (2 if branches == "both" else 1),
+            size,
+            size,
+        )  # shape of the joint latent
+        seen = latent_channels if split_latent else self.latent_shape[0]  # number of channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
@@ -92,17 +113,26 @@ class LayoutVAE(ConfiguredModel):
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Options of the branches as dataclasses, from a config of this version or an earlier, flat one."""
+        """Convert the options of the branches to dataclasses.
+
+        Args:
+            config: Config of this version, or a flat one of a version before 0.2.
+
+        Returns:
+            Keyword arguments of the constructor.
+        """
         return parse_options(config)
 
     @torch.no_grad()
     def init_from_data(self, batch: LayoutBatch) -> None:
-        """Initialise every output to its mean over `batch`, a sample of training layouts.
+        """Initialise every output to its mean over a sample of training layouts.
 
-        For shortcuts see models/vae/ground.py.
+        Adam moves a bias by about the learning rate per step. From zero, it would need thousands of steps to learn that
+        poles
+        are thin and that most pixels are not road. models/vae/ground.py describes the initialisation of shortcuts.
 
-        Adam moves a bias by about the learning rate per step. From zero, it would spend thousands of steps on learning
-        that a pole is thin and that most pixels are not road.
+        Args:
+            batch: Training layouts.
         """
         if self.ground_encoder and self.ground_decoder:
             init_from_data(self.ground_encoder, self.ground_decoder, batch.height, batch.occupied)
@@ -114,9 +144,12 @@ class LayoutVAE(ConfiguredModel):
         self.object_decoder.init_from_data(compute_clamped_logit(features), count)
 
     def freeze_all_but_object_decoder(self, state: dict[str, Tensor]) -> None:
-        """Load all weights but the object decoder's from a model of the same encoders, and train that decoder only.
+        """Load the weights of another model with the same encoders, and train only the object decoder.
 
-        The latents are then those of the other model, which a diffusion transformer may have been trained on.
+        The latents then equal those of the other model. A diffusion transformer that was trained on them remains valid.
+
+        Args:
+            state: State dict of the other model; its object decoder is ignored.
         """
         mine = {name: value for name, value in self.state_dict().items() if name.startswith(OBJECT_DECODER)}
         theirs = {name: value for name, value in state.items() if not name.startswith(OBJECT_DECODER)}
@@ -125,17 +158,28 @@ class LayoutVAE(ConfiguredModel):
             parameter.requires_grad_(name.startswith(OBJECT_DECODER))
 
     def learning_rate_factors(self) -> dict[str, float]:
-        """Factors of the learning rate by prefix of a parameter's name: solved parts change slowly."""
+        """Return factors of the learning rate by prefix of the parameter name.
+
+        Parameters that are initialised in closed form have factors below 1.
+        """
         if not self.config.shortcut:
             return {}
         return {"ground_encoder.shortcut": 0.05, "ground_decoder.shortcut": 0.05, "ground_": 0.25}
 
     @property
     def spec(self) -> LayoutSpec:
+        """Layout of the scenes."""
         return LayoutSpec.from_dict(self.config.layout)
 
     def encode(self, batch: LayoutBatch) -> Posterior:
-        """Joint posterior: channel groups [ground; objects] of mean and of log-variance."""
+        """Encode layouts to the joint posterior.
+
+        Args:
+            batch: Layouts.
+
+        Returns:
+            Posterior with the channels [ground; objects].
+        """
         moments = []
         if self.ground_encoder:
             moments.append(self.ground_encoder(torch.cat([batch.height, batch.occupied], dim=1)).chunk(2, 1))
@@ -145,7 +189,16 @@ class LayoutVAE(ConfiguredModel):
         return Posterior(mean, logvar.clamp(-30, 20))
 
     def decode(self, latent: Float[Tensor, "batch c2 h w"]) -> LayoutOutput:
-        """Each decoder reads its own half of the channels, without `split_latent` all of them."""
+        """Decode latents to layouts.
+
+        With `split_latent`, each decoder reads its own half of the channels; otherwise both read all channels.
+
+        Args:
+            latent: Joint latents.
+
+        Returns:
+            Output of both decoders.
+        """
         split = self.config.split_latent and self.config.branches == "both"
         ground, objects = latent.chunk(2, dim=1) if split else (latent, latent)
         height, occupancy_logit = self.decode_ground(ground)
@@ -153,7 +206,14 @@ class LayoutVAE(ConfiguredModel):
         return LayoutOutput(height, occupancy_logit, *self.decode_objects(objects), unit, branches)
 
     def decode_ground(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor]:
-        """Heights and occupancy logits; nothing occupied where there is no ground branch."""
+        """Decode the ground.
+
+        Args:
+            latent: Channels that the ground decoder reads.
+
+        Returns:
+            Normalised heights and occupancy logits. Without a ground branch, all pixels are unoccupied.
+        """
         if self.ground_decoder:
             return self.ground_decoder(latent).chunk(2, dim=1)
         grid = self.spec.grid
@@ -161,7 +221,16 @@ class LayoutVAE(ConfiguredModel):
         return height, torch.full_like(height, EMPTY_LOGIT)
 
     def decode_objects(self, latent: Float[Tensor, "batch c h w"]) -> tuple[Tensor, Tensor, tuple, MatchWeights]:
-        """Features, existence logits, proposals and how to match them; no proposal where there is no object branch."""
+        """Decode the objects.
+
+        Args:
+            latent: Channels that the object decoder reads.
+
+        Returns:
+            Features, existence logits, proposals per category and weights of the matching cost. Without an object
+            branch, there
+            are no proposals.
+        """
         if self.object_decoder:
             return *self.object_decoder(latent), self.object_decoder.proposals, self.object_decoder.match_weights
         features = latent.new_zeros(len(latent), 0, FEATURES)
@@ -173,15 +242,22 @@ class LayoutVAE(ConfiguredModel):
         noise: Float[Tensor, "batch c2 h w"],
         corruption: Float[Tensor, "batch c2 h w"] | None = None,
     ) -> tuple[LayoutOutput, Posterior]:
-        """Reconstruction from a sampled latent, and the posterior it was sampled from.
+        """Sample latents from the posterior and decode them.
+
+        Differs from the paper, which has no corruption. Zheng et al. (RAE, 2025) train decoders with such noise. Here,
+        encoders
+        are trained together with the decoders, and each scene has its own noise level
+        (`models.training.sample_corruption`).
 
         Args:
+            batch: Layouts.
             noise: Standard normal noise of the reparameterisation.
             corruption: Additional noise on the latent, in units of each channel's standard deviation over the cells of
-                a scene. Decoders learn to tolerate errors in sampled latents.
+                a scene
+                (default: none). It makes decoders tolerate errors in sampled latents.
 
-        Differs from the paper, which has no such noise. Zheng et al. (RAE, 2025) train decoders with it; here encoders
-        are trained with them, and each scene draws its own strength (models.training.sample_corruption).
+        Returns:
+            Output of the decoders, and the posterior.
         """
         posterior = self.encode(batch)
         latent = posterior.sample(noise)

@@ -1,4 +1,4 @@
-"""PrITTIPipeline: layout VAE and DiT as one object in diffusers' conventions. It turns labels and seeds into Scenes."""
+"""PrITTIPipeline: layout VAE and DiT as one object that follows diffusers' conventions and generates Scenes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,16 @@ SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
 def draw_seeds(
     generator: torch.Generator | Sequence[torch.Generator] | None, seed: int | Sequence[int], count: int
 ) -> list[int]:
-    """One seed per scene: `seed` without a generator, else what one generator draws for all or each for its scene.
+    """Return one seed per scene.
+
+    Args:
+        generator: One generator that draws a seed for all scenes, or one generator per scene. With None, `seed` is
+            used.
+        seed: One seed for all scenes, or one per scene.
+        count: Number of scenes.
+
+    Returns:
+        `count` seeds.
 
     Raises:
         ValueError: The number of generators is neither 1 nor `count`.
@@ -70,23 +79,34 @@ def draw_seeds(
 
 
 def check_noise_scaling(noise_scaling: float) -> float:
-    """Return the number. Raises ValueError if it is not between 0.9 and 1.1."""
+    """Return a noise scaling after a range check.
+
+    Args:
+        noise_scaling: Divisor of the predicted noise.
+
+    Returns:
+        The same number.
+
+    Raises:
+        ValueError: The number is not between 0.9 and 1.1.
+    """
     if not 0.9 <= noise_scaling <= 1.1:
-        raise ValueError(f"noise_scaling is {noise_scaling}, expected 1 (none) or slightly more, up to 1.1")
+        raise ValueError(f"noise_scaling is {noise_scaling}, expected 0.9 to 1.1; 1 means no scaling")
     return noise_scaling
 
 
 class PrITTIPipeline:
-    """Generates Scenes. Methods and files are those of diffusers' pipelines.
+    """Generate, inpaint and outpaint Scenes. Methods and files follow diffusers' pipelines.
 
     Args:
         lvae: Layout VAE.
-        dit: Diffusion transformer on its latents.
-        scheduler: A SchedulerConfig or a scheduler of diffusers: noise schedule and sampler (default: the paper's
+        dit: Diffusion transformer that was trained on the latents of `lvae`.
+        scheduler: Noise schedule and sampler, as a SchedulerConfig or a scheduler of diffusers (default: the paper's
             DDPM).
-        noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`); not in
-            the paper.
-        existence_threshold: A scene keeps the primitives whose existence probability is higher; 0.3 in the paper.
+        noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`). The
+            paper
+            has no such scaling.
+        existence_threshold: Primitives with a higher existence probability are kept; 0.3 in the paper.
 
     Raises:
         ValueError: The DiT was trained on layouts of another LayoutSpec.
@@ -111,15 +131,18 @@ class PrITTIPipeline:
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
-        """Load a pipeline from a local directory or by the name of released weights; nothing is downloaded.
+        """Load a pipeline from a local directory or by the name of included weights; nothing is downloaded.
 
         Args:
-            directory: What `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town"
+            directory: Directory that `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town"
                 (models/pretrained.py).
             torch_dtype: Data type of the parameters (default: as stored).
 
+        Returns:
+            The pipeline in evaluation mode on the CPU.
+
         Raises:
-            ValueError: There is no complete pipeline, or a file of it is damaged.
+            ValueError: There is no complete pipeline, or a file is damaged.
         """
         path = Path(find_pipeline_path(directory))
         index = read_config(path / INDEX_NAME)
@@ -140,7 +163,11 @@ class PrITTIPipeline:
         )
 
     def save_pretrained(self, directory: str | os.PathLike) -> None:
-        """Write model_index.json and a directory per component."""
+        """Write model_index.json and one directory per component.
+
+        Args:
+            directory: Output directory. It is created if it does not exist.
+        """
         path = Path(directory)
         self.lvae.save_pretrained(path / "lvae")
         self.dit.save_pretrained(path / "dit")
@@ -153,13 +180,18 @@ class PrITTIPipeline:
 
     @property
     def scheduler(self) -> Any:
-        """The sampler as an object of diffusers, which is imported on first use."""
+        """Scheduler of diffusers, which is imported on first use."""
         if self._scheduler is None:
             self._scheduler = self.scheduler_config.build()
         return self._scheduler
 
     @scheduler.setter
     def scheduler(self, scheduler: Any) -> None:
+        """Set the scheduler.
+
+        Args:
+            scheduler: A SchedulerConfig or a scheduler of diffusers.
+        """
         if isinstance(scheduler, SchedulerConfig):
             self.scheduler_config, self._scheduler = scheduler, None
             return
@@ -168,9 +200,12 @@ class PrITTIPipeline:
         self.scheduler_config, self._scheduler = SchedulerConfig(type(scheduler).__name__, config), scheduler
 
     def use_sampler(self, name: str) -> None:
-        """Sample with one of `SAMPLERS`; "ddpm" is the paper's.
+        """Select a sampler by name.
 
-        Any other scheduler of diffusers may be set as `scheduler`.
+        Any other scheduler of diffusers may be assigned to `scheduler`.
+
+        Args:
+            name: Key of `models.sampling.schedulers.SAMPLERS`; "ddpm" is the paper's sampler.
 
         Raises:
             ValueError: The name is unknown.
@@ -183,12 +218,20 @@ class PrITTIPipeline:
         return self.scheduler_config.class_name == "DDPMScheduler"
 
     def register_modules(self, **components: Any) -> None:
-        """Replace `lvae`, `dit` or `scheduler`."""
+        """Replace `lvae`, `dit` or `scheduler`.
+
+        Args:
+            **components: New components by name.
+        """
         for name, component in components.items():
             setattr(self, name, component)
 
     def register_to_config(self, **changes: Any) -> None:
-        """Replace `noise_scaling` or `existence_threshold`."""
+        """Replace `noise_scaling` or `existence_threshold`.
+
+        Args:
+            **changes: New values by name.
+        """
         self.config = Config(self.config | changes)
 
     @property
@@ -197,38 +240,55 @@ class PrITTIPipeline:
         return {"lvae": self.lvae, "dit": self.dit, "scheduler": self.scheduler}
 
     def to(self, *args: Any, **kwargs: Any) -> PrITTIPipeline:
-        """Move the networks to a device or data type, as `torch.nn.Module.to`."""
+        """Move the networks to a device or data type.
+
+        Args:
+            *args: Arguments of `torch.nn.Module.to`.
+            **kwargs: Keyword arguments of `torch.nn.Module.to`.
+
+        Returns:
+            This pipeline.
+        """
         self.lvae.to(*args, **kwargs)
         self.dit.to(*args, **kwargs)
         return self
 
     @property
     def device(self) -> torch.device:
+        """Device of the networks."""
         return self.dit.device
 
     @property
     def dtype(self) -> torch.dtype:
+        """Data type of the networks."""
         return self.dit.dtype
 
     def set_progress_bar_config(self, **options: Any) -> None:
-        """Options of the progress bar, as tqdm takes them: `disable=True` hides it."""
+        """Set options of the progress bar.
+
+        Args:
+            **options: Options of tqdm; `disable=True` hides the progress bar.
+        """
         self._progress_bar = options
 
     @property
     def spec(self) -> LayoutSpec:
+        """Layout of the scenes."""
         return self.lvae.spec
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
+        """Shape (c, h, w) of a latent."""
         return self.lvae.latent_shape
 
     @property
     def diffusion(self) -> Diffusion:
+        """Noise schedule of the scheduler."""
         config = self.scheduler_config.config
         return Diffusion(config["num_train_timesteps"], config["beta_start"], config["beta_end"])
 
     def _moments(self) -> tuple[Tensor, Tensor]:
-        """Shift and scale of the latents, (c, 1, 1) each."""
+        """Return shift and scale (c, 1, 1) of the latents."""
         channels = self.dit.config.channels
         shift, scale = self.dit.config.shift or [0.0] * channels, self.dit.config.scale or [1.0] * channels
         shift, scale = (torch.tensor(values, device=self.device)[:, None, None] for values in (shift, scale))
@@ -236,7 +296,14 @@ class PrITTIPipeline:
 
     @torch.no_grad()
     def encode(self, scenes: Sequence[Scene]) -> Float[Tensor, "b c h w"]:
-        """Posterior means of scenes in the space of the diffusion model."""
+        """Encode scenes to the posterior means, normalised as the diffusion model expects.
+
+        Args:
+            scenes: Scenes over the area of the model's grid.
+
+        Returns:
+            Latents.
+        """
         shift, scale = self._moments()
         return (self.lvae.encode(make_layout_batch(list(scenes), self.spec).to(self.device)).mean - shift) / scale
 
@@ -244,10 +311,22 @@ class PrITTIPipeline:
     def decode(
         self, latents: Float[Tensor, "b c h w"], identities: Sequence[Scene], existence_threshold: float | None = None
     ) -> list[Scene]:
-        """Decode latents to scenes that take their ids and labels from `identities`.
+        """Decode latents to scenes.
 
-        Latents are decoded one at a time, so that a scene is the same to the last bit in any batch. Where cells are
-        decoded separately, two of them may propose the same object: the higher-confidence one is kept.
+        Latents are decoded one at a time, so that each scene is bit-identical in any batch. A cell decoder may propose
+        the same
+        object in two cells; the proposal with the higher existence probability is kept.
+
+        Args:
+            latents: Latents.
+            identities: Scenes that provide ids and labels.
+            existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
+
+        Returns:
+            One scene per latent.
+
+        Raises:
+            ValueError: The threshold is not between 0 and 1.
         """
         threshold = self.resolve_existence_threshold(existence_threshold)
         shift, scale = self._moments()
@@ -261,7 +340,17 @@ class PrITTIPipeline:
         return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
-        """An empty Scene with the id of scene `index` of a run and the requested labels."""
+        """Return an empty Scene with the id of a generated scene and the requested labels.
+
+        Args:
+            run: Run name.
+            seed: Seed of the run.
+            index: Index of the scene within the run.
+            label: Label of the scene.
+
+        Returns:
+            The empty scene.
+        """
         vegetation, vehicle = split_label(self.dit.config.label, label)
         return make_empty_scene(
             f"generated-{run}-{seed}-{index:07d}",
@@ -274,23 +363,53 @@ class PrITTIPipeline:
         )
 
     def label_tensor(self, labels: Sequence[str]) -> Tensor:
-        """(b,) indices of labels. Raises ValueError for a label that the model does not know."""
+        """Convert labels to class indices.
+
+        Args:
+            labels: Names of labels.
+
+        Returns:
+            (b,) class indices.
+
+        Raises:
+            ValueError: A label is unknown to the model.
+        """
         return torch.tensor([find_label_index(self.dit.config.label, name) for name in labels], device=self.device)
 
     def _denoiser(self, timesteps: np.ndarray | Tensor, label: Tensor, guidance_scale: float) -> Denoiser:
-        """The DiT with classifier-free guidance and precomputed conditioning."""
+        """Return the DiT with classifier-free guidance and precomputed modulations."""
         null = self.dit.null_label
         labels = label.tolist() if guidance_scale == 1.0 else [*label.tolist(), null]
         return with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
-        """The number given, or the default of the pipeline with its sampler. Raises ValueError if it is not near 1."""
+        """Return the given noise scaling, or the default for the current sampler.
+
+        Args:
+            noise_scaling: Divisor of the predicted noise, or None for the default.
+
+        Returns:
+            The divisor; its default is 1 for DDPM.
+
+        Raises:
+            ValueError: The number is not between 0.9 and 1.1.
+        """
         if noise_scaling is None:
             return 1.0 if self.uses_ddpm else self.config.noise_scaling
         return check_noise_scaling(noise_scaling)
 
     def resolve_existence_threshold(self, existence_threshold: float | None) -> float:
-        """The number given, or the pipeline's default. Raises ValueError if it is not a probability."""
+        """Return the given existence threshold, or the pipeline's default.
+
+        Args:
+            existence_threshold: Threshold, or None for the default.
+
+        Returns:
+            The threshold.
+
+        Raises:
+            ValueError: The number is not between 0 and 1.
+        """
         if existence_threshold is None:
             return self.config.existence_threshold
         if not 0 < existence_threshold < 1:
@@ -299,7 +418,10 @@ class PrITTIPipeline:
 
     @contextmanager
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
-        """What a sampler calls after each evaluation: it moves a progress bar and calls the user's callback."""
+        """Yield the function that a sampler calls after each step.
+
+        It advances the progress bar and calls the user's callback.
+        """
         with tqdm(total=num_evaluations, **self._progress_bar) as bar:
 
             def on_step(number: int, timestep: int, latents: Tensor) -> Tensor:
@@ -318,7 +440,23 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """Sample latents of scenes `indices`; each depends on (seed, its index, its label) only."""
+        """Sample latents; each one depends only on (seed, its index, its label).
+
+        Args:
+            labels: Label of each scene.
+            seed: One seed for all scenes, or one per scene.
+            indices: Index of each scene within the run.
+            num_inference_steps: Number of denoising steps; 250 in the paper.
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            callback_on_step_end: See `generate`.
+            noise_scaling: Divisor of the predicted noise (default: the pipeline's).
+
+        Returns:
+            Latents.
+
+        Raises:
+            ValueError: A label is unknown, a number is out of range, or the scheduler uses fractional timesteps.
+        """
         noise = SceneNoise(seed, indices, self.latent_shape, self.device)
         label, noise_scaling = self.label_tensor(labels), self.resolve_noise_scaling(noise_scaling)
         with self._step_callback(num_inference_steps, callback_on_step_end) as on_step:
@@ -326,12 +464,13 @@ class PrITTIPipeline:
                 schedule = SamplingSchedule(self.diffusion, num_inference_steps)
                 model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
                 return sample(model, schedule, noise, label, on_step=on_step)
-            self.diffusion.select_timesteps(num_inference_steps)  # diffusers accepts any number
+            self.diffusion.select_timesteps(num_inference_steps)  # check the number, because diffusers accepts any
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
             timesteps = self.scheduler.timesteps
             if timesteps.is_floating_point():
                 raise ValueError(
-                    f"{self.scheduler_config.class_name} uses fractional timesteps; DPM-Solver++ and DDIM do not"
+                    f"{self.scheduler_config.class_name} uses fractional timesteps, which the DiT does not support; "
+                    "use DPM-Solver++ or DDIM"
                 )
             model = scale_noise(self._denoiser(timesteps, label, guidance_scale), noise_scaling)
             return sample_with_scheduler(model, self.scheduler, noise, label, on_step)
@@ -349,18 +488,26 @@ class PrITTIPipeline:
         noise_scaling: float | None = None,
         existence_threshold: float | None = None,
     ) -> list[Scene]:
-        """Generate one Scene per label. Scene i depends on (seed, indices[i], its label) only, whatever the batch.
+        """Generate one Scene per label.
+
+        Scene i depends only on (seed, indices[i], its label), not on its batch.
 
         Args:
-            labels: Class of each scene, such as "low".
+            labels: Label of each scene, such as "low".
             seed: Seed of the run.
             indices: Index of each scene within the run (default: 0, 1, ...).
             num_inference_steps: Number of denoising steps; 250 in the paper.
             guidance_scale: Scale of classifier-free guidance; 1 is none.
-            run: Name of the run, part of the scenes' ids.
-            generator: Draws the seed; several draw the seed of their scene.
-            callback_on_step_end: Called as (pipeline, step, timestep, {"latents": ...}), returns such a dict.
-            noise_scaling, existence_threshold: Replace the pipeline's own.
+            run: Run name, which is part of the scene ids.
+            generator: Generator that draws the seed, or one generator per scene. It replaces `seed`.
+            callback_on_step_end: Called as (pipeline, step, timestep, {"latents": ...}) after each step; returns such a
+                dict
+                with the latents for the next step.
+            noise_scaling: Divisor of the predicted noise (default: the pipeline's).
+            existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
+
+        Returns:
+            The scenes in the order of the labels.
 
         Raises:
             ValueError: A label is unknown or a number is out of range.
@@ -386,7 +533,26 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         purpose: int = GENERATE,
     ) -> Float[Tensor, "b c h w"]:
-        """Sample latents with RePaint; they keep the condition bit for bit where its mask is 0 (paper, Sec. 3.3)."""
+        """Sample latents with RePaint (paper, Sec. 3.3).
+
+        The latents equal the condition bit for bit where its mask is 0.
+
+        Args:
+            condition: Known latents and masks.
+            labels: Label of each scene.
+            seed: One seed for all scenes, or one per scene.
+            indices: Key of each scene; it keys the noise.
+            repaint: Options of RePaint.
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            callback_on_step_end: See `generate`.
+            purpose: Purpose of the noise (models/sampling/diffusion.py).
+
+        Returns:
+            Latents.
+
+        Raises:
+            ValueError: A label is unknown or a number is out of range.
+        """
         schedule = SamplingSchedule(self.diffusion, repaint.num_inference_steps, repaint.eta)
         noise = SceneNoise(seed, indices, self.latent_shape, self.device, purpose)
         label = self.label_tensor(labels)
@@ -422,13 +588,20 @@ class PrITTIPipeline:
 
         Args:
             scenes: Scenes on the model's grid.
-            regions: Masks (rows, cols) per scene, True = regenerate (models/composition/inpaint.py).
-            labels: Class of each scene.
-            contents: "objects" puts objects on the given ground, "ground" ground under the given objects.
-            seed, indices, generator: As for `generate`.
+            regions: Mask (rows, cols) per scene, True = regenerate (models/composition/inpaint.py).
+            labels: Label of each scene.
+            contents: "objects" regenerates objects on the known ground, "ground" regenerates the ground under the known
+                objects, and "both" regenerates both.
+            seed: Seed of the run.
+            indices: Key of each scene within the run (default: 0, 1, ...).
             repaint: Options of RePaint (default: the paper's).
-            guidance_scale, callback_on_step_end: As for `generate`.
-            composite: Take everything outside the regions from the input. Otherwise it is the decoders' reconstruction.
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            generator: As for `generate`.
+            callback_on_step_end: As for `generate`.
+            composite: Take everything outside the regions from the input. If False, it is the decoders' reconstruction.
+
+        Returns:
+            The regenerated scenes.
 
         Raises:
             ValueError: A scene is not on the model's grid, or the model's latent is not split and `contents` is not
@@ -475,20 +648,26 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         side: Side | None = None,
     ) -> Scene:
-        """Extend a scene by generated blocks; what it held is kept (paper, supplement B.3).
+        """Extend a scene by generated blocks; the content of the input is kept (paper, supplement B.3).
 
         Args:
-            scene: On the model's grid; with `side`, of any size from one block on.
-            label: Class of all blocks, or of each block (steps ahead, steps left).
-            seed, index: Seed of the run and index of the scene within it.
+            scene: Scene on the model's grid. With `side`, the scene may have any size of at least one block.
+            label: Label of all blocks, or label by block index (steps ahead, steps left).
+            seed: Seed of the run.
+            index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
-            mode: "copy" gives each block the shifted latent, as the paper does; "reencode" decodes the known part,
-                moves it into the block's frame and height datum and encodes it again. Object latents hold absolute
-                centres, which a copy does not change.
-            num_blocks: Blocks ahead, behind, left and right. One to every side is the paper's outpainting.
-            repaint, guidance_scale, callback_on_step_end: As for `inpaint`.
-            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"), instead of
-                `num_blocks`.
+            mode: "copy" copies the shifted latent of the neighbours, as in the paper. "reencode" decodes the known
+                part,
+                transforms it into the block's frame and height, and encodes it again. Object latents contain absolute
+                    centres,
+                which a copy does not change.
+            num_blocks: Number of blocks ahead, behind, left and right. One on every side is the paper's outpainting.
+            repaint: Options of RePaint (default: the paper's).
+            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            callback_on_step_end: As for `generate`.
+            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right").
+                `num_blocks` is
+                then ignored.
 
         Returns:
             One scene that covers all blocks.
@@ -516,7 +695,14 @@ class PrITTIPipeline:
         )
 
     def require_grid(self, scene: Scene) -> None:
-        """Raises ValueError if a scene is not on the model's grid with the model's ground classes."""
+        """Raise an error if a scene does not have the model's grid and ground classes.
+
+        Args:
+            scene: Scene.
+
+        Raises:
+            ValueError: The grid or the ground classes differ.
+        """
         if scene.grid != self.spec.grid or scene.ground_classes != self.spec.ground_classes:
             raise ValueError(
                 f"scene {scene.scene_id} has {scene.grid} and ground classes {scene.ground_classes}; "

@@ -1,7 +1,8 @@
-"""One optimisation step, EMA, schedule and checkpoint of both stages, in plain torch.
+"""Training of both stages in plain torch: optimisation step, EMA, learning-rate schedule and checkpoint.
 
-No Ray here: the same code trains alone on a GPU box. Randomness is keyed by (seed, step, position of the sample in
-the global batch), so that a resumed run and a run on more workers draw the same numbers.
+This module does not use Ray, so it also trains in a single process. Random numbers are keyed by (seed, step, position
+of
+the sample in the global batch). A resumed run and a run on more workers therefore draw the same numbers.
 """
 
 from __future__ import annotations
@@ -33,21 +34,41 @@ from models.vae.matching import NonFiniteCostError
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with a cosine (OneCycle without warm-up) or constant learning rate."""
+    """Options of AdamW with a constant or a cosine learning rate (OneCycle without its warm-up).
+
+    Attributes:
+        steps: Number of training steps.
+        learning_rate: Initial learning rate.
+        weight_decay: Weight decay.
+        final_learning_rate: Learning rate of the last step (None: constant learning rate).
+        warmup_steps: Number of steps in which the learning rate rises linearly.
+        betas: beta1 and beta2 of AdamW.
+        cycle_momentum: beta1 of the first and of the last step; it follows the cosine (None: constant beta1).
+        grad_clip: Largest gradient norm (None: no clipping).
+        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        seed: Seed of all random numbers.
+    """
 
     steps: int
     learning_rate: float
     weight_decay: float
-    final_learning_rate: float | None = None  # None: constant
+    final_learning_rate: float | None = None
     warmup_steps: int = 0
     betas: tuple[float, float] = (0.9, 0.999)
-    cycle_momentum: tuple[float, float] | None = None  # beta1 from the first to the second as the rate falls
+    cycle_momentum: tuple[float, float] | None = None
     grad_clip: float | None = None
     ema_decay: float | None = None
     seed: int = 0
 
     def at(self, step: int) -> tuple[float, float]:
-        """Learning rate and beta1 of a step, counted from 0."""
+        """Return learning rate and beta1 of a step.
+
+        Args:
+            step: Index of the step, from 0.
+
+        Returns:
+            Learning rate and beta1.
+        """
         rate, beta1 = self.learning_rate, self.betas[0]
         if self.final_learning_rate is not None:
             fall = (1 - math.cos(math.pi * min(step / max(self.steps - 1, 1), 1))) / 2
@@ -61,11 +82,21 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """How steps are computed, not what: the same weights come out, up to rounding."""
+    """Options of the execution of a training step. They change the result only by rounding.
 
-    accumulate: int = 1  # parts into which a batch is cut, one after another, where it does not fit memory
-    precision: str = "auto"  # fp32, bf16, or auto: bf16 where the device has it in hardware
-    compile: bool = False  # torch.compile
+    Attributes:
+        accumulate: Number of parts into which a batch is split to save memory; the parts are computed one after
+            another.
+        precision: "fp32", "bf16" or "auto". "auto" is bf16 if the device supports it in hardware.
+        compile: Use torch.compile.
+
+    Raises:
+        ValueError: A value is out of range or unknown.
+    """
+
+    accumulate: int = 1
+    precision: str = "auto"
+    compile: bool = False
 
     def __post_init__(self) -> None:
         if self.accumulate < 1 or self.precision not in ("auto", "fp32", "bf16"):
@@ -75,16 +106,29 @@ class ExecutionConfig:
             )
 
     def autocast(self, device: torch.device) -> torch.autocast:
+        """Return the autocast context for a device.
+
+        Args:
+            device: Device of the training.
+
+        Returns:
+            Context manager; it is disabled for fp32.
+        """
         fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
         wanted = self.precision == "bf16" or (self.precision == "auto" and fast)
         return torch.autocast(device.type, torch.bfloat16, enabled=wanted)
 
 
 class NonFiniteLossError(ValueError):
-    """A loss is not finite. `positions` are the samples of the global batch that are to blame, empty if all are."""
+    """Raised when a loss is not finite.
+
+    Attributes:
+        step: Index of the step.
+        positions: Positions in the global batch of the samples with a non-finite loss; empty if all samples have one.
+    """
 
     def __init__(self, step: int, positions: list[int]) -> None:
-        which = f"of samples {positions} of its batch" if positions else "of every sample: the weights are broken"
+        which = f"of samples {positions} of its batch" if positions else "of every sample, so the weights are invalid"
         super().__init__(f"step {step}: the loss is not finite because {which}; lower the learning rate")
         self.step, self.positions = step, positions
 
@@ -93,14 +137,33 @@ LossFunction = Callable[[Callable[..., Any], dict[str, Tensor], list[torch.Gener
 
 
 def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """(len(generators), *shape) standard normal numbers, one generator per sample."""
+    """Draw standard normal noise with one generator per sample.
+
+    Args:
+        generators: One generator per sample.
+        shape: Shape of the noise of one sample.
+        device: Device of the result.
+
+    Returns:
+        (b, *shape) noise.
+    """
     return torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
 
 
 def sample_corruption(
     generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
 ) -> Tensor:
-    """(len(generators), *shape) normal numbers, each sample's as large as |N(0, spread^2)| says."""
+    """Draw normal noise whose standard deviation is |N(0, spread^2)|, drawn once per sample.
+
+    Args:
+        generators: One generator per sample.
+        shape: Shape of the noise of one sample.
+        spread: Scale of the standard deviations.
+        device: Device of the result.
+
+    Returns:
+        (b, *shape) noise.
+    """
     drawn = [torch.randn(shape, generator=g) * torch.randn((), generator=g).abs() * spread for g in generators]
     return torch.stack(drawn).to(device)
 
@@ -108,7 +171,17 @@ def sample_corruption(
 def make_layout_loss(
     spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
 ) -> LossFunction:
-    """Stage 1: compact layouts (tensors.encode_layout) -> the parts of the LVAE objective."""
+    """Make the loss function of stage 1, which trains the layout VAE.
+
+    Args:
+        spec: Layout of the scenes.
+        latent_shape: Shape (c, h, w) of a latent.
+        kl_weight: Weight of the KL loss.
+        latent_noise: Scale of the noise on the training latents (`sample_corruption`); 0 is none.
+
+    Returns:
+        A function that maps compact layouts (`tensors.encode_layout`) to the parts of the objective.
+    """
 
     def loss(
         model: Callable[..., Any], arrays: dict[str, Tensor], generators: list[torch.Generator]
@@ -126,14 +199,26 @@ def make_layout_loss(
 
 
 TimestepSampling = Literal["uniform", "logit_normal"]
-LOGIT_NORMAL = (-0.6, 1.2)  # mean and deviation of the logit of t / 1000: half of the timesteps lie between 196 and 552
+# Mean and standard deviation of the logit of t / 1000. Half of the timesteps lie between 196 and 552.
+LOGIT_NORMAL = (-0.6, 1.2)
 
 
 def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
-    """Timesteps of training from numbers between 0 and 1: all alike (the paper), or the middle ones more often.
+    """Convert uniform random numbers to training timesteps.
 
-    Whether an object is there is decided between timesteps 126 and 467, a third of all and half of these.
-    Logit-normal, as in SD3 (Esser et al., 2024).
+    "uniform" is the paper's density. "logit_normal" prefers middle timesteps, as in SD3 (Esser et al., 2024). The
+    existence
+    of objects is decided between timesteps 126 and 467. This interval contains a third of the uniform timesteps and
+    half of
+    the logit-normal ones.
+
+    Args:
+        uniform: Random numbers between 0 and 1.
+        density: Density of the timesteps.
+        num_timesteps: Number of timesteps of the noise schedule.
+
+    Returns:
+        Timesteps.
     """
     if density == "logit_normal":
         uniform = torch.sigmoid(LOGIT_NORMAL[0] + LOGIT_NORMAL[1] * torch.special.ndtri(uniform))
@@ -143,9 +228,20 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
 def make_diffusion_loss(
     dit: DiT, diffusion: Diffusion, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
 ) -> LossFunction:
-    """Stage 2: latents {mean, logvar, label} -> mean squared error of the predicted noise (Eq. "LDM"), or velocity.
+    """Make the loss function of stage 2, which trains the DiT: mean squared error of the noise (Eq. "LDM").
 
-    Latents are sampled from the cached posterior at every step; one label-dropout mask per sample.
+    With v-prediction, the error is weighted by `DiT.loss_weight`. Each step samples the latents from the cached
+    posterior.
+    Each sample has one label-dropout mask.
+
+    Args:
+        dit: Model.
+        diffusion: Noise schedule.
+        label_dropout: Probability of training a sample with the null label.
+        timestep_sampling: Density of the timesteps (`sample_timesteps`).
+
+    Returns:
+        A function that maps posteriors and labels {mean, logvar, label} to the losses.
     """
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
@@ -170,9 +266,18 @@ def make_diffusion_loss(
 
 
 class Trainer:
-    """A model in training: `step` advances it; a run that resumes with `save` and `load` equals an uninterrupted one.
+    """Train a model step by step and save checkpoints.
 
-    `wrapped` is what is called (for instance the model under DistributedDataParallel); `model` is what is saved.
+    A run that is saved, loaded and resumed equals an uninterrupted one.
+
+    Args:
+        model: Model whose weights are saved.
+        loss: Loss function.
+        settings: Options of the optimizer.
+        device: Device of the training.
+        wrapped: Module that is called instead of `model`, such as `model` under DistributedDataParallel (default:
+            `model`).
+        execution: Options of the execution (default: those of `ExecutionConfig`).
     """
 
     def __init__(
@@ -187,9 +292,7 @@ class Trainer:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
         self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
-        rates = getattr(
-            model, "learning_rate_factors", dict
-        )()  # of parts whose rate is not everybody's, by name's beginning
+        rates = getattr(model, "learning_rate_factors", dict)()  # factors by prefix of the parameter name
         share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
         groups = [
             {"params": [p for n, p in self.parameters.items() if share[n] == value], "share": value}
@@ -202,10 +305,17 @@ class Trainer:
         self.steps_done = 0
 
     def step(self, arrays: dict[str, Tensor], positions: Iterable[int]) -> dict[str, Tensor]:
-        """One optimisation step on a (local) batch; `positions` are its samples' places in the global batch.
+        """Perform one optimisation step on a local batch.
 
-        Returns detached losses and the gradient norm. Raises NotFinite, a ValueError, if the loss is not finite,
-        before weights change.
+        Args:
+            arrays: Batch of this worker.
+            positions: Positions of its samples in the global batch.
+
+        Returns:
+            Detached losses, and the gradient norm as `grad_norm`.
+
+        Raises:
+            NonFiniteLossError: The loss is not finite; the weights are unchanged.
         """
         rate, beta1 = self.settings.at(self.steps_done)
         for group in self.optimiser.param_groups:
@@ -219,7 +329,7 @@ class Trainer:
             part = slice(first, first + size)
             share = len(positions[part]) / len(positions)
             more = first + size < len(positions)
-            no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # of DistributedDataParallel
+            no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # a method of DistributedDataParallel
             with no_sync() if more else nullcontext():
                 losses = self._compute_losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
@@ -236,7 +346,10 @@ class Trainer:
     def _compute_losses(
         self, network: Callable[..., Any], arrays: dict[str, Tensor], positions: list[int]
     ) -> dict[str, Tensor] | None:
-        """The parts of the loss of `network`, or None if it is not finite. Each sample has its own noise."""
+        """Return the losses of `network`, or None if the loss is not finite.
+
+        Each sample has its own random generator.
+        """
         generators = [make_keyed_generator(self.settings.seed, self.steps_done, position) for position in positions]
         try:
             with self.execution.autocast(self.device):
@@ -247,9 +360,10 @@ class Trainer:
 
     @torch.no_grad()
     def _find_nonfinite_samples(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
-        """The positions whose own loss is not finite; empty if that is all of them.
+        """Return the positions of the samples whose loss is not finite, or an empty list if all losses are not finite.
 
-        By the model itself: a wrapped one would wait here for the other workers, who are elsewhere.
+        The model is called without its wrapper. A wrapper such as DistributedDataParallel would wait for the other
+        workers.
         """
         bad = [
             position
@@ -261,7 +375,10 @@ class Trainer:
 
     @torch.no_grad()
     def update_ema(self) -> None:
-        """Exponential moving average with warm-up: decay = min(ema_decay, 1 - (1 + step)^-3/4), as diffusers does."""
+        """Update the exponential moving average of the weights.
+
+        Its decay is min(ema_decay, 1 - (1 + step)^-3/4), as in diffusers.
+        """
         if self.ema is None or self.settings.ema_decay is None:
             return
         decay = min(self.settings.ema_decay, 1 - (1 + self.steps_done) ** -0.75)
@@ -271,7 +388,7 @@ class Trainer:
 
     @torch.no_grad()
     def ema_model(self) -> ConfiguredModel:
-        """The model to use: a copy with EMA weights, or the model itself where there is no EMA."""
+        """Return a copy of the model with EMA weights, or the model itself if there is no EMA."""
         if not self.ema:
             return self.model
         copy = type(self.model).from_config(self.model.config)
@@ -279,7 +396,13 @@ class Trainer:
         return copy.to(self.device).eval()
 
     def save(self, directory: str | Path) -> None:
-        """Everything needed to resume exactly: safetensors and JSON, no pickles. `state.json` is written last."""
+        """Save everything that an exact resumption needs, as safetensors and JSON without pickles.
+
+        `state.json` is written last.
+
+        Args:
+            directory: Output directory. It is created if it does not exist.
+        """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
@@ -296,14 +419,22 @@ class Trainer:
         os.replace(temporary, directory / "state.json")
 
     def load(self, directory: str | Path) -> None:
-        """Resume from `save`. Raises ValueError if the checkpoint was made with other settings."""
+        """Load a checkpoint that `save` wrote.
+
+        Args:
+            directory: Directory of the checkpoint.
+
+        Raises:
+            ValueError: The checkpoint was trained with other settings.
+        """
         directory = Path(directory)
         state = json.loads((directory / "state.json").read_text())
         mine = json.loads(json.dumps(asdict(self.settings)))
         for name, value in mine.items():
             if state["settings"].get(name) != value:
                 raise ValueError(
-                    f"{directory}: was trained with {name}={state['settings'].get(name)}, asked for {value}; "
+                    f"{directory}: the checkpoint was trained with {name}={state['settings'].get(name)}, "
+                    f"asked for {value}; "
                     "use the same options to resume, or another --name for a new run"
                 )
         optimiser: dict[str, dict[str, Tensor]] = {name: {} for name in self.parameters}
@@ -335,6 +466,20 @@ def make_lvae_trainer(
     execution: ExecutionConfig | None = None,
     latent_noise: float = 0.0,
 ) -> Trainer:
+    """Make a trainer of a layout VAE.
+
+    Args:
+        model: Model; it is moved to `device`.
+        settings: Options of the optimizer.
+        kl_weight: Weight of the KL loss.
+        device: Device of the training.
+        wrap: Function that wraps the model, for instance with DistributedDataParallel (default: none).
+        execution: Options of the execution (default: those of `ExecutionConfig`).
+        latent_noise: Scale of the noise on the training latents (`sample_corruption`); 0 is none.
+
+    Returns:
+        The trainer.
+    """
     execution = execution or ExecutionConfig()
     model = model.to(device)
     loss = make_layout_loss(model.spec, model.latent_shape, kl_weight, latent_noise)
@@ -350,6 +495,20 @@ def make_dit_trainer(
     execution: ExecutionConfig | None = None,
     timestep_sampling: TimestepSampling = "uniform",
 ) -> Trainer:
+    """Make a trainer of a diffusion transformer.
+
+    Args:
+        model: Model; it is moved to `device`.
+        settings: Options of the optimizer.
+        label_dropout: Probability of training a sample with the null label.
+        device: Device of the training.
+        wrap: Function that wraps the model, for instance with DistributedDataParallel (default: none).
+        execution: Options of the execution (default: those of `ExecutionConfig`).
+        timestep_sampling: Density of the timesteps (`sample_timesteps`).
+
+    Returns:
+        The trainer.
+    """
     execution = execution or ExecutionConfig()
     model = model.to(device)
     loss = make_diffusion_loss(model, Diffusion(), label_dropout, timestep_sampling)

@@ -1,1 +1,1 @@
-"""Experiments on parts of the model that are not part of the pipeline."""
+"""Experiments on single components of the models."""

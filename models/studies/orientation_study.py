@@ -1,15 +1,15 @@
-"""The paper's Cholesky-versus-quaternion study (supplement, "Cholesky vs. quaternion"): how well a small object
-autoencoder rebuilds one box, by the numbers in which the box is written (encodings.py).
+"""The paper's study "Cholesky vs. quaternion" (supplement): how well a small autoencoder reconstructs one box.
 
-The autoencoder is the object branch of the layout VAE made small, with one slot and one query: a box's numbers in, the
-same numbers out, L1. Whatever the encoding, only the first and the last linear layer differ. The box is centred at
-zero and its centre is not predicted.
+The study compares encodings of the box (models/geometry/encodings.py). The autoencoder is a small object branch of the
+layout VAE with one slot and one query. It reconstructs the code of a box with an L1 loss. The encodings differ only in
+the first and the last linear layer. Boxes are centred at zero, and the centre is not predicted.
 
-Boxes that only yaw leave some numbers of every encoding still (2 of 6, 2 of 7, 9 of 15), and L1 pulls as hard at a
-number that is right but for rounding as at one that is wrong: they disturb what is to be learned. Either all are
-regressed, as in the paper, or only the moving ones.
+For boxes that differ only by yaw, some entries of each code are constant: 2 of 6, 2 of 7 and 9 of 15. The L1 gradient
+of
+an entry does not shrink with its error, so constant entries disturb the training. The study therefore regresses either
+all entries, as the paper does, or only the varying ones.
 
-The paper leaves open: the ranges of the sizes, the network, batch size and learning rate.
+The paper does not specify the ranges of the sizes, the network, the batch size and the learning rate.
 """
 
 from __future__ import annotations
@@ -35,15 +35,20 @@ from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
 NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
-MARGIN = 0.05  # of an entry's training range, on both sides: a sigmoid does not reach 0 and 1
-STILL, LEAST_RANGE = 1e-6, 1.0  # an entry that changes by less stands still, and is given this range
+MARGIN = 0.05  # share of an entry's range added on both sides, because a sigmoid does not reach 0 and 1
+STILL, LEAST_RANGE = 1e-6, 1.0  # an entry with a smaller range than STILL is constant and gets LEAST_RANGE
 
 
 # ------------------------------------------------------------------------------------------------------- boxes
 
 
 class CenteredBoxes(NamedTuple):
-    """n boxes centred at zero: axes as columns of `rotation` (n, 3, 3), full extents `size_m` (n, 3)."""
+    """n boxes centred at zero.
+
+    Attributes:
+        rotation: (n, 3, 3) axes as columns.
+        size_m: (n, 3) full extents along the axes (metres).
+    """
 
     rotation: np.ndarray
     size_m: np.ndarray
@@ -51,7 +56,13 @@ class CenteredBoxes(NamedTuple):
 
 @dataclass(frozen=True)
 class BoxDistribution:
-    """Ranges of uniform draws: length and height in metres, width as a share of the length."""
+    """Ranges of uniform distributions of box sizes.
+
+    Attributes:
+        length_m: Range of the length (metres).
+        width_share: Range of the width as a share of the length.
+        height_m: Range of the height (metres).
+    """
 
     length_m: tuple[float, float]
     width_share: tuple[float, float]
@@ -60,14 +71,24 @@ class BoxDistribution:
 
 THINGS = {
     "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # the paper's study
-    "any": BoxDistribution(
-        (1.0, 6.0), (0.4, 1.0), (0.5, 4.0)
-    ),  # up to square footprints, where the scatter matrix has no yaw
+    # For square footprints, the scatter matrix does not determine the yaw.
+    "any": BoxDistribution((1.0, 6.0), (0.4, 1.0), (0.5, 4.0)),
 }
 
 
 def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
-    """Upright boxes with yaw anywhere in [-pi, pi). The first n of a larger draw of the same key are the draw of n."""
+    """Draw upright boxes with yaw in [-pi, pi).
+
+    With the same key, the first n boxes of a larger draw equal the draw of n boxes.
+
+    Args:
+        things: Distribution of the sizes.
+        count: Number of boxes.
+        *key: Integers that key the random numbers.
+
+    Returns:
+        The boxes.
+    """
     unit = torch.rand(count, 4, generator=make_keyed_generator(*key), dtype=torch.float64).numpy()
     low, high = np.array([things.length_m, things.width_share, things.height_m, (-np.pi, np.pi)]).T
     length, share, height, yaw = (low + unit * (high - low)).T
@@ -75,7 +96,14 @@ def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
 
 
 def compute_code_bounds(code: np.ndarray) -> Bounds:
-    """Bounds of each entry of (n, entries) training codes, with a margin."""
+    """Compute the bounds of each entry of training codes, with a margin.
+
+    Args:
+        code: (n, entries) codes.
+
+    Returns:
+        Bounds.
+    """
     low, high = code.min(axis=0), code.max(axis=0)
     middle, reach = (low + high) / 2, (0.5 + MARGIN) * (high - low)
     reach = np.where(high - low < STILL, LEAST_RANGE / 2, reach)
@@ -86,7 +114,11 @@ def compute_code_bounds(code: np.ndarray) -> Bounds:
 
 
 class OneObjectAutoencoder(nn.Module):
-    """Normalised numbers of one box (batch, entries) -> the same, through a latent as the layout VAE has it."""
+    """Autoencode the normalised code of one box through a latent like that of the layout VAE.
+
+    Args:
+        entries: Number of entries of the code.
+    """
 
     def __init__(self, entries: int) -> None:
         super().__init__()
@@ -99,21 +131,45 @@ class OneObjectAutoencoder(nn.Module):
             self.encoder.grid[LATENT_CHANNELS:] = INITIAL_LOGVAR
 
     def encode(self, code: Float[Tensor, "batch entries"]) -> Posterior:
-        features = torch.cat([code.new_full((len(code), 3), 0.5), code], dim=1)  # the centre, normalised
+        """Encode normalised codes.
+
+        Args:
+            code: Codes, normalised to [0, 1].
+
+        Returns:
+            Posterior.
+        """
+        features = torch.cat([code.new_full((len(code), 3), 0.5), code], dim=1)  # normalised centre first
         real = torch.ones(len(code), 1, dtype=torch.bool)
         mean, logvar = self.encoder(features[:, None], real).chunk(2, dim=1)
         return Posterior(mean, logvar)
 
     def decode(self, latent: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch entries"]:
+        """Decode latents.
+
+        Args:
+            latent: Latents.
+
+        Returns:
+            Codes, normalised to [0, 1].
+        """
         return self.decoder(latent)[0][:, 0]
 
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """How an autoencoder is trained, the same for every encoding.
+    """Training options of the autoencoders, equal for all encodings.
 
-    The batch is the paper's for the layout VAE. On 1,200 vehicles of a seed that the study does not use, mean IoU3D at
-    learning rates 5e-4 / 1e-3: Cholesky 0.968 / 0.964, quaternion 0.871 / 0.876, octahedral 0.938 / 0.849.
+    The batch size is that of the paper's layout VAE. The learning rate was selected on 1,200 vehicles of a seed that
+    the
+    study does not use. Mean IoU3D at learning rates 5e-4 / 1e-3: Cholesky 0.968 / 0.964, quaternion 0.871 / 0.876,
+    octahedral 0.938 / 0.849.
+
+    Attributes:
+        epochs: Passes over the training boxes.
+        batch_size: Boxes per step.
+        learning_rate: Initial learning rate.
+        weight_decay: Weight decay of AdamW.
     """
 
     epochs: int = 20
@@ -122,7 +178,14 @@ class StudyConfig:
     weight_decay: float = 5e-4
 
     def make_optimizer_config(self, count: int) -> OptimizerConfig:
-        """The layout VAE's schedule for `count` samples: the rate falls to a tenth along a cosine."""
+        """Return the learning-rate schedule of the layout VAE, a cosine that ends at a tenth of the initial rate.
+
+        Args:
+            count: Number of training boxes.
+
+        Returns:
+            Options of the optimizer.
+        """
         return OptimizerConfig(
             steps=self.epochs * -(-count // self.batch_size),
             learning_rate=self.learning_rate,
@@ -133,16 +196,30 @@ class StudyConfig:
 
 
 class TrainedStudy(NamedTuple):
-    """A trained autoencoder, with what its numbers mean."""
+    """A trained autoencoder and the encoding of its boxes.
+
+    Attributes:
+        model: Autoencoder.
+        bounds: Bounds of all entries of the code.
+        encoding: Encoding of the boxes.
+        kept: (entries,) bool: entries that the autoencoder processes. All others keep their constant training value.
+    """
 
     model: OneObjectAutoencoder
     bounds: Bounds
     encoding: Encoding
-    kept: np.ndarray  # (entries,) bool: what the autoencoder sees; the rest stays where it was in training
+    kept: np.ndarray
 
     @torch.no_grad()
     def rebuild(self, boxes: CenteredBoxes) -> tuple[CenteredBoxes, float]:
-        """The boxes that come out (from the latent mean), and the mean error of a normalised number."""
+        """Reconstruct boxes from the latent mean.
+
+        Args:
+            boxes: Boxes.
+
+        Returns:
+            Reconstructed boxes, and the mean absolute error of a normalised entry.
+        """
         code = self.bounds.normalise(self.encoding.encode(*boxes))
         given = torch.from_numpy(code[:, self.kept]).float()
         out = self.model.decode(self.model.encode(given).mean)
@@ -153,7 +230,20 @@ class TrainedStudy(NamedTuple):
 def train_autoencoder(
     encoding: Encoding, boxes: CenteredBoxes, settings: StudyConfig, seed: int, moving_only: bool = False
 ) -> TrainedStudy:
-    """An autoencoder trained on the boxes. Same seed, same initial body, order of samples and noise."""
+    """Train an autoencoder on boxes.
+
+    The same seed gives the same initial weights of the shared layers, the same order of samples and the same noise.
+
+    Args:
+        encoding: Encoding of the boxes.
+        boxes: Training boxes.
+        settings: Training options.
+        seed: Seed of weights, order and noise.
+        moving_only: Process only the entries that vary over the training boxes.
+
+    Returns:
+        The trained autoencoder.
+    """
     numbers = encoding.encode(*boxes)
     bounds = compute_code_bounds(numbers)
     kept = (np.ptp(numbers, axis=0) >= STILL) | (not moving_only)
