@@ -1,1 +1,1 @@
-"""Pictures of scenes from above and from the street."""
+"""Render images of scenes from above and from street level."""

@@ -1,4 +1,4 @@
-"""Paint street views as photographs with a ControlNet on semantic images, from local weights (diffusers)."""
+"""Turn street views into photographs with Stable Diffusion and a ControlNet on semantic images, from local weights."""
 
 from __future__ import annotations
 
@@ -18,13 +18,24 @@ from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 from pipelines.schema.run_guard import find_changed_option
 
-SKY = (70, 130, 180)  # of the KITTI-360 and Cityscapes palette, where a street view is empty
-MULTIPLE_PX = 8  # the sides of the network's pictures are multiples of this
+SKY = (70, 130, 180)  # Sky colour of the KITTI-360 and Cityscapes palette, used where a street view is empty
+MULTIPLE_PX = 8  # Width and height of the network's images are multiples of this value.
 
 
 @dataclass(frozen=True)
 class PhotoRequest:
-    """Options of painting. `diffusion` and `controlnet` are local directories of diffusers models, as safetensors."""
+    """Options for photographs from street views.
+
+    Attributes:
+        diffusion: Local directory of a Stable Diffusion model in diffusers format (safetensors).
+        controlnet: Local directory of a ControlNet in diffusers format (safetensors).
+        prompt: Text prompt.
+        negative_prompt: Text prompt of unwanted content; empty for none.
+        steps: Number of denoising steps.
+        guidance_scale: Weight of classifier-free guidance.
+        control_scale: Weight of the ControlNet.
+        seed: Random seed of the noise, the same for all frames.
+    """
 
     diffusion: str
     controlnet: str
@@ -33,19 +44,30 @@ class PhotoRequest:
     steps: int
     guidance_scale: float
     control_scale: float
-    seed: int  # the same noise for every frame
+    seed: int
 
 
 def make_control_image(class_id: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 in the KITTI-360 palette, SKY where class_id (H, W) is EMPTY."""
+    """Draw class ids in the KITTI-360 palette.
+
+    Args:
+        class_id: (H, W) class ids.
+
+    Returns:
+        (H, W, 3) uint8 sRGB, SKY where class_id is EMPTY.
+    """
     return np.where((class_id == EMPTY)[..., None], np.array(SKY, np.uint8), CLASS_COLORS[class_id])
 
 
 class Painter:
-    """Stable Diffusion under a ControlNet."""
+    """Stable Diffusion with a ControlNet."""
 
     def __init__(self, request: PhotoRequest) -> None:
-        """Load the models. Raises ValueError if a directory does not hold one."""
+        """Load the models.
+
+        Raises:
+            ValueError: A directory does not hold the expected model.
+        """
         from diffusers import (
             ControlNetModel,  # pyright: ignore[reportPrivateImportUsage]
             StableDiffusionControlNetPipeline,  # pyright: ignore[reportPrivateImportUsage]
@@ -61,15 +83,24 @@ class Painter:
             )
         except (OSError, ValueError, ImportError) as error:
             raise ValueError(
-                f"{request.diffusion} and {request.controlnet}: no Stable Diffusion and ControlNet weights in"
-                f" diffusers' layout, as safetensors ({error})"
+                f"{request.diffusion} and {request.controlnet} hold no Stable Diffusion and ControlNet weights in"
+                f" diffusers format with safetensors ({error})"
             ) from error
         self.pipeline.set_progress_bar_config(disable=True)
         self.pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
         self.request = request
 
     def paint(self, class_id: np.ndarray) -> np.ndarray:
-        """Paint class ids (H, W): (H, W, 3) uint8, the same for the same request and image."""
+        """Generate a photograph for an image of class ids.
+
+        The same request and image give the same photograph.
+
+        Args:
+            class_id: (H, W) class ids.
+
+        Returns:
+            (H, W, 3) uint8 sRGB.
+        """
         rows, cols = class_id.shape
         size = [-(-n // MULTIPLE_PX) * MULTIPLE_PX for n in (rows, cols)]
         control = Image.fromarray(make_control_image(class_id)).resize(size[::-1], Image.Resampling.NEAREST)
@@ -90,7 +121,10 @@ class Painter:
 
 
 class StreetPainter:
-    """Actor. Row in: number of a drive. Row out: its number of frames. Paints the frames that are not painted yet."""
+    """Ray actor that generates the missing photographs of a drive.
+
+    The input row holds the number of the drive. The output row holds its number of frames.
+    """
 
     def __init__(self, request: PhotoRequest, directories: Sequence[str]) -> None:
         self.painter, self.directories = Painter(request), directories
@@ -118,36 +152,59 @@ class StreetPainter:
 
 
 def list_frame_names(directory: str) -> list[str]:
+    """Return the file names of the frames of a drive.
+
+    Args:
+        directory: Directory of the drive.
+
+    Returns:
+        Names such as 000000.png, in order.
+    """
     return [path.rsplit("/", 1)[1] for path in storage.list_files(storage.join_uri(directory, "class_id"), ".png")]
 
 
 def list_drives(streets: str) -> list[str]:
-    """Return the directories of all drives with frames under streets/<run>. Raises ValueError if there is none."""
+    """Return the directories of all drives that have frames.
+
+    Args:
+        streets: Directory streets/<run>.
+
+    Returns:
+        Directories in alphabetical order.
+
+    Raises:
+        ValueError: The directory holds no frame.
+    """
     found = sorted({path.rsplit("/", 2)[0] for path in storage.list_files(streets, ".png") if "/class_id/" in path})
     if not found:
-        raise ValueError(f"{streets}: no street views here; run jobs/render_streets.py first")
+        raise ValueError(f"{streets} holds no street views; run jobs/render_streets.py first")
     return found
 
 
 def paint_streets(
     request: PhotoRequest, directories: Sequence[str], actors: int = 1, on_drive: Callable[[], None] | None = None
 ) -> int:
-    """Paint every frame of some drives, and return the number of frames. Another call resumes an interrupted one.
+    """Generate a photograph for every frame of several drives.
+
+    A second call resumes an interrupted one.
 
     Args:
-        request: Options of painting.
+        request: Options of the photographs.
         directories: Directories of the drives.
         actors: Maximum number of actors.
         on_drive: Called after each drive.
 
+    Returns:
+        Number of frames.
+
     Raises:
-        ValueError: A drive was painted with other options.
+        ValueError: A drive has photographs with other options.
     """
     for directory in directories:
         record = storage.join_uri(directory, "photos.json")
         if said := find_changed_option(record, asdict(request)):
             raise ValueError(
-                f"{directory} was painted with {said}; delete its photo/ and photos.json to paint it again"
+                f"{directory} holds photographs with {said}; delete its photo/ and photos.json to generate them again"
             )
         storage.write_json(asdict(request), record)
     total = 0

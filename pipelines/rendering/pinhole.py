@@ -1,9 +1,9 @@
-"""Render a Scene for a pinhole camera: classes, instances and depth, exact and deterministic, on the CPU.
+"""Render a Scene for a pinhole camera on the CPU: classes, instances and depth, exact and deterministic.
 
-In the image plane 1 / depth is linear over a flat triangle. The kernel that casts vertical rays (rasterize.py) can
-therefore cast camera rays, on 1 / depth instead of height. The intersection of each ray with an ellipsoid is exact, by
-a quadratic equation. The camera frame is KITTI-360's: x right, y down, z ahead; metres. Pixel centres lie at whole
-numbers (u to the right, v down).
+In the image plane, 1 / depth is linear over a flat triangle. The code that casts vertical rays (rasterize.py) can
+therefore cast camera rays, with 1 / depth instead of height. The intersection of a ray with an ellipsoid is the exact
+solution of a quadratic equation. The camera frame is that of KITTI-360: x right, y down, z forward, in metres. Pixel
+centres have integer coordinates (u to the right, v down).
 """
 
 from __future__ import annotations
@@ -20,13 +20,17 @@ from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, fin
 from pipelines.io.mesh_export import GROUND, Triangles, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY
 
-NEAR_M = 0.1  # nearer surfaces are invisible
-CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # of a camera looking along x
+NEAR_M = 0.1  # Surfaces closer to the camera are invisible.
+# Rotation for a camera that looks along x
+CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels. Default: KITTI-360's rectified left camera, image_00 (calibration/perspective.txt)."""
+    """Camera intrinsics in pixels.
+
+    The default is KITTI-360's rectified left camera, image_00 (calibration/perspective.txt).
+    """
 
     width: int = 1408
     height: int = 376
@@ -36,7 +40,15 @@ class Lens:
     cy: float = 238.769549
 
     def resize(self, width: int, height: int) -> Lens:
-        """Return the lens of the same view with another number of pixels."""
+        """Return the intrinsics of the same view at another image size.
+
+        Args:
+            width: New image width in pixels.
+            height: New image height in pixels.
+
+        Returns:
+            The intrinsics.
+        """
         x, y = width / self.width, height / self.height
         centre = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
         return Lens(width, height, self.fx * x, self.fy * y, *centre)
@@ -44,17 +56,33 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class StreetCamera:
-    """A lens somewhere in a scene."""
+    """A pinhole camera with its pose in a scene.
+
+    Attributes:
+        lens: Intrinsics.
+        position_m: Position in the scene frame (m).
+        camera_from_scene: Rotation from the scene frame to the camera frame.
+    """
 
     lens: Lens
-    position_m: np.ndarray  # (3,) scene frame
-    camera_from_scene: np.ndarray  # (3, 3) rotation
+    position_m: np.ndarray  # (3,)
+    camera_from_scene: np.ndarray  # (3, 3)
 
     @staticmethod
     def at(
         position_m: np.ndarray | Sequence[float], yaw_rad: float, pitch_rad: float = 0.0, lens: Lens | None = None
     ) -> StreetCamera:
-        """Make a level camera, turned left by yaw from the scene's x axis, then up by pitch."""
+        """Make a camera without roll.
+
+        Args:
+            position_m: (3,) position in the scene frame (m).
+            yaw_rad: Angle of the view direction to the left of the scene's x axis (rad).
+            pitch_rad: Upward angle of the view direction (rad).
+            lens: Intrinsics (default: those of KITTI-360 at 704 x 188 pixels).
+
+        Returns:
+            The camera.
+        """
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         level_from_scene = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
         cos, sin = np.cos(pitch_rad), np.sin(pitch_rad)
@@ -63,30 +91,44 @@ class StreetCamera:
         return StreetCamera(lens or Lens().resize(704, 188), np.asarray(position_m, float), rotation)
 
     def local(self, points_m: np.ndarray) -> np.ndarray:
-        """Transform scene points (..., 3) to the camera frame."""
+        """Transform points from the scene frame to the camera frame.
+
+        Args:
+            points_m: (..., 3) points in the scene frame (m).
+
+        Returns:
+            (..., 3) points in the camera frame (m).
+        """
         return (points_m - self.position_m) @ self.camera_from_scene.T
 
 
 class StreetView(NamedTuple):
-    """(H, W) each."""
+    """Rendered images of one camera, (H, W) each.
 
-    class_id: np.ndarray  # uint8, see palette; EMPTY for sky
-    primitive: np.ndarray  # int32, index into the scene; GROUND for ground and sky
-    depth_m: np.ndarray  # float32, z in the camera frame; inf for sky
-    normal: np.ndarray  # (H, W, 3) float32, outward, scene frame; 0 for sky
+    Attributes:
+        class_id: Class id of the palette; EMPTY for sky.
+        primitive: Index of the primitive in the scene; GROUND for ground and sky.
+        depth_m: z in the camera frame (m); inf for sky.
+        normal: Outward unit normal in the scene frame; 0 for sky.
+    """
+
+    class_id: np.ndarray  # uint8
+    primitive: np.ndarray  # int32
+    depth_m: np.ndarray  # float32
+    normal: np.ndarray  # (H, W, 3) float32
 
     @property
     def semantic(self) -> np.ndarray:
-        """(H, W, 3) uint8: palette colours, white for sky."""
+        """(H, W, 3) uint8 sRGB: the palette colour of each pixel, white for sky."""
         return CLASS_COLORS[self.class_id]
 
     def instance(self) -> np.ndarray:
-        """(H, W) uint16: 0 for ground and sky, else the primitive's number + 1."""
+        """Return the instance image (H, W) uint16: 0 for ground and sky, otherwise the index of the primitive + 1."""
         return (self.primitive + 1).astype(np.uint16)
 
 
 class StreetRenderer:
-    """Renders one scene for many cameras; arrays that do not depend on the camera are computed once."""
+    """Render one scene for many cameras; data that do not depend on the camera are computed once."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -95,13 +137,20 @@ class StreetRenderer:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """(t, 3) float32 unit normals."""
+        """(t, 3) float32 unit normals of the triangles."""
         a, b, c = np.moveaxis(self.soup.corners_m, 1, 0)
         normal = np.cross(b - a, c - a)
         return (normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)).astype(np.float32)
 
     def view(self, camera: StreetCamera) -> StreetView:
-        """Render the scene for a camera."""
+        """Render the scene for a camera.
+
+        Args:
+            camera: Camera in the scene.
+
+        Returns:
+            Class, primitive, depth and normal of each pixel.
+        """
         shape = camera.lens.height, camera.lens.width
         nearness, triangle = np.zeros(shape), np.full(shape, -1, np.int64)
         index, corners = _clip_in_front(camera.local(self.soup.corners_m), camera.lens)
@@ -139,19 +188,19 @@ def _list_pixels(lens: Lens) -> Grid:
 
 
 def _make_rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """(k, 3) directions in the camera frame of the rays through pixels, with z = 1."""
+    """Return the directions (k, 3) of the rays through pixels in the camera frame, with z = 1."""
     return np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(len(u))], axis=1)
 
 
 def _project_to_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
-    """Triangles (t, 3, 3) in the camera frame, z > 0, on the grid of `_list_pixels`; their height is 1 / z."""
+    """Project triangles (t, 3, 3) in the camera frame, z > 0, to the grid of `_list_pixels`; their height is 1 / z."""
     x, y, z = np.moveaxis(corners, -1, 0)
     u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
     return np.stack([-v - 0.5, -u - 0.5, 1 / z], axis=-1)
 
 
 def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the visible triangles (t, 3, 3) in the camera frame at NEAR_M: their index (k,) and corners (k, 3, 3)."""
+    """Clip the visible triangles (t, 3, 3) in the camera frame at NEAR_M; return indices (k,) and corners (k, 3, 3)."""
     x, y, z = np.moveaxis(corners, -1, 0)
     left, right = (0 - 0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx
     top, bottom = (0 - 0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy
@@ -159,7 +208,7 @@ def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndar
     index = np.flatnonzero(~np.any([side.all(axis=1) for side in beyond], axis=0))
     corners = corners[index]
     a, b, c = np.moveaxis(corners, 1, 0)
-    faces_us = np.einsum("ki,ki->k", a, np.cross(b, c)) < 0  # counter-clockwise from outside
+    faces_us = np.einsum("ki,ki->k", a, np.cross(b, c)) < 0  # Corners are counter-clockwise seen from outside.
     index, corners = index[faces_us], corners[faces_us]
     behind = (corners[..., 2] < NEAR_M).sum(axis=1)
     whole = np.flatnonzero(behind == 0)
@@ -168,12 +217,13 @@ def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndar
 
 
 def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles with 1 or 2 corners nearer than NEAR_M: one or two triangles at z >= NEAR_M each."""
+    """Clip triangles that have one or two corners closer than NEAR_M, each to one or two triangles at z >= NEAR_M."""
     found_index, found = [], []
     for count in (1, 2):
         some = np.flatnonzero(behind == count)
         near = corners[some, :, 2] < NEAR_M
-        odd = np.argmax(near if count == 1 else ~near, axis=1)  # the corner alone on its side goes first
+        # The corner that is alone on its side of the plane comes first.
+        odd = np.argmax(near if count == 1 else ~near, axis=1)
         turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
         first, second, third = np.moveaxis(turned, 1, 0)
         on_second, on_third = (_find_crossing(first, other) for other in (second, third))
@@ -187,17 +237,17 @@ def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np
 
 
 def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(k, 3) where the lines from a to b (k, 3) pass z = NEAR_M."""
+    """Return the points (k, 3) where the lines from a to b (k, 3) cross z = NEAR_M."""
     share = (NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2])
     return a + share[:, None] * (b - a)
 
 
 def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every pixel centre over every ellipsoid ahead: flat pixel index, primitive and 1 / depth (m,).
+    """Return the flat pixel index, primitive and 1 / depth (m,) of each pixel centre on each ellipsoid in front.
 
-    A ray t d (d with z = 1) meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0, A = |M d|^2, B = d.M^T M p,
-    C = |M p|^2 - 1. It does where B^2 - A C = d^T K d >= 0: along a row of pixels between the roots of a quadratic.
-    Ellipsoids that are not entirely ahead of the camera are left out.
+    A ray t d, with z = 1 in d, meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d.M^T M p
+    and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. Along a row of pixels, this is the interval
+    between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are skipped.
     """
     lens = camera.lens
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
@@ -211,10 +261,10 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     b = np.einsum("kij,kj->ki", square, p)
     c = np.einsum("ki,ki->k", b, p) - 1
     cone = b[:, :, None] * b[:, None, :] - c[:, None, None] * square  # K
-    # In pixels: d = J (u, v, 1).
+    # In pixel coordinates, the direction is d = J (u, v, 1).
     pixels = np.array([[1 / lens.fx, 0, -lens.cx / lens.fx], [0, 1 / lens.fy, -lens.cy / lens.fy], [0, 0, 1]])
     k = pixels.T @ cone @ pixels
-    # Rows: where the discriminant in u is positive, a quadratic in v that opens downward.
+    # Rows are valid where the discriminant in u is positive: a quadratic in v that opens downwards.
     qa = k[:, 0, 1] ** 2 - k[:, 0, 0] * k[:, 1, 1]
     qb = k[:, 0, 1] * k[:, 0, 2] - k[:, 0, 0] * k[:, 1, 2]
     qc = k[:, 0, 2] ** 2 - k[:, 0, 0] * k[:, 2, 2]
@@ -230,13 +280,20 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     d = _make_rays(lens, row, col)
     of_d = np.einsum("ki,ki->k", b[ball], d)
     square_d = np.einsum("ki,kij,kj->k", d, square[ball], d)
-    # The nearer root, as C / (B + sqrt): without a difference of large numbers.
+    # Compute the nearer root as C / (B + sqrt), which avoids a difference of large numbers.
     inverse = (of_d + np.sqrt(np.maximum(of_d**2 - square_d * c[ball], 0))) / c[ball]
     return row * lens.width + col, primitive[ball], inverse
 
 
 def shade_view(view: StreetView) -> np.ndarray:
-    """(H, W, 3) uint8: class colours in soft light, paler with distance, under a pale sky."""
+    """Shade a street view in class colours with soft light and haze under a pale sky.
+
+    Args:
+        view: Rendered images of one camera.
+
+    Returns:
+        (H, W, 3) uint8 sRGB.
+    """
     sun = np.array([0.35, -0.45, 0.82], np.float32)
     light = 0.62 + 0.38 * (view.normal @ sun).clip(0)
     haze = np.exp(-view.depth_m / 120.0)[..., None]

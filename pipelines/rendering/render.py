@@ -1,4 +1,4 @@
-"""Render pictures of a Scene, from above in flat class colours or oblique in soft light, and sheets of pictures."""
+"""Render a Scene from above in flat class colours or obliquely in soft light, and arrange images on a sheet."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from pipelines.io.mesh_export import triangulate_cuboids
 from pipelines.rendering.shading import render_lit
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
-MARK_COLOR = (230, 0, 0)  # sRGB, of lines drawn over a picture
+MARK_COLOR = (230, 0, 0)  # sRGB colour of lines over an image
 
 
 def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
-    """Render the scene from above in class colours, white where it is empty.
+    """Render a scene from above in class colours, white where it is empty.
 
-    Orthographic, up = +x (forward), left = +y; the grid fills the picture. Metrics use this picture; it is
-    bit-identical on every call.
+    The projection is orthographic with +x (forward) up and +y left. The grid fills the image. Metrics use this image;
+    it is bit-identical on every call.
 
     Args:
         scene: Scene.
-        size_px: Pixels of the longer side.
+        size_px: Number of pixels along the longer side.
         supersample: Each pixel is the mean of supersample^2 points.
 
     Returns:
@@ -57,7 +57,16 @@ def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nda
 
 
 def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """Render the scene from above with the border of a region (rows, cols), True inside: (H, W, 3) uint8."""
+    """Render a scene from above with the border of a region as a line.
+
+    Args:
+        scene: Scene.
+        region: (rows, cols) bool in the raster grid of the scene; True inside the region.
+        size_px: Number of pixels along the longer side.
+
+    Returns:
+        (H, W, 3) uint8 sRGB.
+    """
     picture = render_bev(scene, size_px, supersample=2).copy()
     view = _make_oblique_view(scene.grid, size_px)
     origin = np.zeros(1)
@@ -71,14 +80,20 @@ def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) ->
 
 @cache
 def _list_color_pairs() -> np.ndarray:
-    """(18 x 256, 6) colours of two neighbouring pixels, by the first's class id plus 256 times the second's."""
+    """Return the colours (18 x 256, 6) of two neighbouring pixels.
+
+    The row index is the class id of the first pixel plus 256 times that of the second.
+    """
     first, second = np.zeros((2, len(CLASS_COLORS), 256, 3), np.uint8)
     first[:, : len(CLASS_COLORS)], second[:] = CLASS_COLORS, CLASS_COLORS[:, None]
     return np.concatenate([first, second], axis=2).reshape(-1, 6)
 
 
 def _paint_pixels(class_id: np.ndarray) -> np.ndarray:
-    """(H, W, 3) CLASS_COLORS[class_id (H, W) uint8], two pixels at a time: copying six bytes is as fast as three."""
+    """Return CLASS_COLORS[class_id] (H, W, 3) for class_id (H, W) uint8.
+
+    The function processes two pixels at a time, because a copy of six bytes takes the same time as a copy of three.
+    """
     pair = np.resize(class_id, class_id.size + class_id.size % 2).view("<u2")
     return _list_color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
 
@@ -98,11 +113,21 @@ def render_3d(
     elevation_deg: float = 38.0,
     supersample: int = 2,
 ) -> np.ndarray:
-    """Render the scene as a model on a table, in soft light, orthographic: (height, width, 3) uint8 sRGB.
+    """Render a scene obliquely in soft light, as a model on a table, with an orthographic camera.
 
-    The camera looks along +x (forward) turned left by azimuth_deg, and down by elevation_deg. It depends on the
-    scene's grid only, so pictures of scenes of one size are comparable. The light plate under the scene is visible
-    where the ground is unknown.
+    The camera depends only on the scene's grid. Images of scenes of equal size are therefore comparable. The light
+    plate under the scene is visible where the scene has no ground.
+
+    Args:
+        scene: Scene.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        azimuth_deg: Angle of the view direction to the left of +x (forward), in degrees.
+        elevation_deg: Downward angle of the view direction, in degrees, in (0, 90].
+        supersample: Each pixel is the mean of supersample^2 points.
+
+    Returns:
+        (height, width, 3) uint8 sRGB.
     """
     camera = make_oblique_camera(scene.grid, width * supersample, height * supersample, azimuth_deg, elevation_deg)
     linear = average_blocks(render_lit(scene, camera), supersample)
@@ -110,14 +135,30 @@ def render_3d(
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8, as a PNG file."""
+    """Encode an image as a PNG file.
+
+    Args:
+        image: (H, W) uint8 or uint16, or (H, W, 3) uint8.
+
+    Returns:
+        Content of the file.
+    """
     file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG")  # `optimize` makes it a tenth smaller in five times the time
+    # The option `optimize` reduces the size by 10 % but takes five times as long.
+    Image.fromarray(image).save(file, "PNG")
     return file.getvalue()
 
 
 def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
-    """Replace each factor x factor block of (H, W, C) by its mean, float32."""
+    """Reduce an image by the mean of each block of factor x factor pixels.
+
+    Args:
+        picture: (H, W, C) image.
+        factor: Block size in pixels.
+
+    Returns:
+        (H // factor, W // factor, C) float32.
+    """
     rows, cols = picture.shape[0] // factor, picture.shape[1] // factor
     total = np.zeros((rows, cols, picture.shape[2]), np.float32)
     for i in range(factor):
@@ -129,13 +170,28 @@ def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
 def arrange_contact_sheet(
     pictures: Sequence[np.ndarray], columns: int, captions: Sequence[str] | None = None, gap_px: int = 12
 ) -> np.ndarray:
-    """Arrange pictures (h, w, 3) uint8 in rows of `columns` on white, each over its caption: (H, W, 3) uint8.
+    """Arrange images on a white sheet, each with its caption below.
 
-    Cells have the size of the largest picture. Raises ValueError if there is no picture or a caption is missing.
+    All cells have the size of the largest image.
+
+    Args:
+        pictures: Images (h, w, 3) uint8.
+        columns: Number of images per row.
+        captions: One caption per image (default: none).
+        gap_px: Distance between images in pixels.
+
+    Returns:
+        (H, W, 3) uint8 sheet.
+
+    Raises:
+        ValueError: There is no image, or the number of captions differs from the number of images.
     """
     captions = [""] * len(pictures) if captions is None else captions
     if len(pictures) == 0 or len(captions) != len(pictures):
-        raise ValueError(f"{len(pictures)} pictures and {len(captions)} captions: need one or more, one each")
+        raise ValueError(
+            f"got {len(pictures)} pictures and {len(captions)} captions; expected at least one picture and one caption"
+            " per picture"
+        )
     cell_h, cell_w = max(p.shape[0] for p in pictures), max(p.shape[1] for p in pictures)
     text_size = max(11, cell_w // 26)
     font = ImageFont.load_default(size=text_size)

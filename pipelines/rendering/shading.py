@@ -1,7 +1,8 @@
-"""Light for the 3D pictures: what each pixel shows, and how bright it is.
+"""Compute surface and light of each pixel in 3D images.
 
-One sun with soft shadows, a sky that is brighter above and darker where things meet, and a thin line around
-each primitive. Class colours stay readable: a level surface in the sun has exactly its palette colour.
+The light consists of a sun with soft shadows, a sky and thin outlines around primitives. The sky light is stronger on
+surfaces that face up and weaker close to other surfaces. Class colours are kept: a horizontal surface in the sun has
+exactly its palette colour.
 """
 
 from __future__ import annotations
@@ -24,22 +25,30 @@ from pipelines.geometry.rasterize import cast_rays_down
 from pipelines.io.mesh_export import make_unit_cuboid, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
 
-PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # color ids after the classes
+PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids after those of the classes
 _SRGB = np.vstack([CLASS_COLORS, [[226, 228, 232], [243, 245, 248]]]) / 255
 LINEAR_COLORS = (_SRGB**2.2).astype(np.float32)
 
-SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0  # of the sun's rays, as of a camera
-SUN = np.array([0.68, 0.65, 0.60], np.float32)  # linear RGB on a level surface
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0  # Direction of the sun's rays, defined like a camera direction
+SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface
 SKY = 1 - SUN
 SHADOW_PX, SHADOW_BIAS_PX = 900, 1.2
-SKY_PX, NEARBY_M, MARGIN_M = 640, 1.6, 12.0  # height map: longer side, blur, rim around the grid
-OUTLINE, CREASE = 0.5, 0.25  # share of light lost on a line between two primitives, two faces of one
+# Height map: pixels along the longer side, standard deviation of the blur, margin around the grid
+SKY_PX, NEARBY_M, MARGIN_M = 640, 1.6, 12.0
+# Share of light removed on a line between two primitives, and between two faces of one primitive
+OUTLINE, CREASE = 0.5, 0.25
 
-SCENERY = 0  # part number of ground, plate and table: no lines among them
+SCENERY = 0  # Part number of ground, plate and table, which have no lines between them
 
 
 class Faces(NamedTuple):
-    """Triangles to cast: corners_m (t, 3, 3) in the scene frame, color_id (t,) and part (t,)."""
+    """Triangles to render.
+
+    Attributes:
+        corners_m: Corners (t, 3, 3) in the scene frame (m).
+        color_id: Row of LINEAR_COLORS (t,).
+        part: Part number (t,): SCENERY or 4 (primitive + 1) + face.
+    """
 
     corners_m: np.ndarray
     color_id: np.ndarray
@@ -47,16 +56,31 @@ class Faces(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """What each pixel of a camera shows, (H, W) each."""
+    """Visible surface of each pixel, (H, W) each.
 
-    depth_m: np.ndarray  # float32, z in the camera frame
-    color_id: np.ndarray  # uint8, row of LINEAR_COLORS
-    part: np.ndarray  # int32, SCENERY or 4 (primitive + 1) + face
-    normal: np.ndarray  # (H, W, 3) float32, outward, scene frame
+    Attributes:
+        depth_m: z in the camera frame (m).
+        color_id: Row of LINEAR_COLORS.
+        part: Part number: SCENERY or 4 (primitive + 1) + face.
+        normal: Outward unit normal in the scene frame.
+    """
+
+    depth_m: np.ndarray  # float32
+    color_id: np.ndarray  # uint8
+    part: np.ndarray  # int32
+    normal: np.ndarray  # (H, W, 3) float32
 
 
 def render_lit(scene: Scene, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB: the scene on its plate on a table, in sun and sky."""
+    """Render a scene on its plate on a table, lit by sun and sky.
+
+    Args:
+        scene: Scene.
+        camera: Orthographic camera.
+
+    Returns:
+        (H, W, 3) float32 linear RGB.
+    """
     sheet_m = _make_sheet(scene)
     table_z_m = float(sheet_m.min()) - 1.0
     solid = _join_faces(_make_plate(scene.grid, sheet_m, table_z_m), _make_cuboid_faces(scene))
@@ -78,12 +102,12 @@ def _join_faces(*parts: Faces) -> Faces:
 
 
 def _cast_surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float) -> Surfaces:
-    """The nearest surface at each pixel: a face, an ellipsoid, or the table beneath everything."""
+    """Return the nearest surface at each pixel: a face, an ellipsoid, or the table below the scene."""
     turned = camera.turn(faces.corners_m)
     seen = find_facing_sides(turned)
     (depth,), (hit,) = cast_rays_down(turned[seen], camera.view)
     depth = np.where(hit < 0, _compute_table_depth(camera, table_z_m), depth)
-    # -1 is the table: the last entry of each list.
+    # Index -1 (no hit) selects the last entry, which is the table.
     color_id = np.append(faces.color_id[seen], np.uint8(TABLE)).take(hit, mode="wrap")
     part = np.append(faces.part[seen], SCENERY).astype(np.int32).take(hit, mode="wrap")
     normal = np.vstack([_compute_normals(faces.corners_m[seen]), [[0, 0, 1]]]).astype(np.float32)
@@ -112,7 +136,10 @@ def _make_cuboid_faces(scene: Scene) -> Faces:
 
 
 def _make_sheet(scene: Scene) -> np.ndarray:
-    """(rows, cols) heights of the plate, a node about every metre: just below the ground, and beyond it level."""
+    """Return the heights (rows, cols) of the plate, about one node per metre, just below the ground.
+
+    Outside the ground, the plate continues at the height of the nearest ground.
+    """
     height, winner = scene.surface()
     if (winner < 0).all():
         return np.zeros((2, 2))
@@ -124,30 +151,33 @@ def _make_sheet(scene: Scene) -> np.ndarray:
 
 
 def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
-    """The sheet over the whole grid, with walls down to the table."""
+    """Return the plate over the whole grid, with walls down to the table."""
     rows, cols = sheet_m.shape
     x, y = np.linspace(grid.front_m, grid.back_m, rows), np.linspace(grid.left_m, grid.right_m, cols)
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), sheet_m], axis=-1)
-    rim = np.concatenate([top[0], top[1:, -1], top[-1, -2::-1], top[-2::-1, 0]])  # clockwise from above
+    rim = np.concatenate([top[0], top[1:, -1], top[-1, -2::-1], top[-2::-1, 0]])  # clockwise seen from above
     foot = rim * [1, 1, 0] + [0, 0, table_z_m]
     corners = np.concatenate([_make_quads(top), _make_quads(np.stack([foot, rim]))])
     return Faces(corners, np.full(len(corners), PLATE, np.uint8), np.full(len(corners), SCENERY))
 
 
 def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
-    """(H, 1) depth of the table at each row of the picture: its scene z is up x + near depth."""
+    """(H, 1) depth of the table at each row of the image: its scene z equals up x + near depth."""
     up, _, near = camera.camera_from_scene[:, 2]
     return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 
 
 def _make_quads(points: np.ndarray) -> np.ndarray:
-    """(2 (r - 1) (c - 1), 3, 3) triangles of a net of points (r, c, 3); facing up where x and y fall."""
+    """Return the triangles (2 (r - 1) (c - 1), 3, 3) of a net of points (r, c, 3).
+
+    They face up if x and y decrease along the rows and columns.
+    """
     here, right, below, across = points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]
     return np.stack([here, below, right, right, below, across], axis=2).reshape(-1, 3, 3)
 
 
 def _compute_normals(corners_m: np.ndarray) -> np.ndarray:
-    """(t, 3) unit outward normals of triangles (t, 3, 3)."""
+    """Return the unit outward normals (t, 3) of triangles (t, 3, 3)."""
     normal = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
 
@@ -155,7 +185,7 @@ def _compute_normals(corners_m: np.ndarray) -> np.ndarray:
 def _compute_ellipsoid_normals(
     scene: Scene, camera: Camera, depth_m: np.ndarray, row: np.ndarray, col: np.ndarray, primitive: np.ndarray
 ) -> np.ndarray:
-    """(k, 3) unit normals, scene frame, at the pixels (row, col) that show these primitives."""
+    """Return the unit normals (k, 3) of ellipsoids in the scene frame at the pixels (row, col)."""
     view = camera.view
     point = np.stack([view.x_m()[row], view.y_m()[col], depth_m[row, col]], axis=1) @ camera.camera_from_scene
     axes = scene.rotation / scene.size_m[:, None, :] ** 2
@@ -165,17 +195,17 @@ def _compute_ellipsoid_normals(
 
 
 def _find_top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
-    """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf where there is none."""
+    """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf without one."""
     turned = camera.turn(solid.corners_m)
     (flat,), _ = cast_rays_down(turned[find_facing_sides(turned)], camera.view)
     return np.maximum(flat, cast_ellipsoids(scene, camera)[0]).astype(np.float32)
 
 
 def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray) -> np.ndarray:
-    """(H, W) share of the sun, 0..1, that reaches each point: a shadow map, softened over its neighbours."""
+    """(H, W) share of the sun in [0, 1] at each point, from a shadow map averaged over neighbouring pixels."""
     blocker = _add_rim(_find_top(scene, solid, sun), -np.inf)
     x, y, z = (a * point[0] + b * point[1] + c * point[2] for a, b, c in sun.camera_from_scene.tolist())
-    z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # more where the sun grazes
+    z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # larger at grazing incidence
     pixel = _project_flat(sun.view, x, y)
     free = np.zeros(z.shape, np.float32)
     neighbours = (0, 1, -1, SHADOW_PX, -SHADOW_PX)
@@ -185,7 +215,7 @@ def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray
 
 
 def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
-    """(H, W) 1 in the open, less the deeper a point lies below the mean top of its neighbourhood."""
+    """(H, W) share of the sky light, which decreases with the depth of a point below the mean height around it."""
     grid = scene.grid
     length_m, width_m = (n * grid.resolution_m + 2 * MARGIN_M for n in (grid.rows, grid.cols))
     resolution_m = max(length_m, width_m) / SKY_PX
@@ -198,21 +228,24 @@ def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[
 
 
 def _add_rim(picture: np.ndarray, value: float) -> np.ndarray:
-    """(H W,) the picture flattened, with `value` in its two outermost pixels: what lies outside."""
+    """Return the flattened image (H W,), with `value` in its two outermost rows and columns.
+
+    These pixels represent the area outside the image.
+    """
     framed = np.full_like(picture, value)
     framed[2:-2, 2:-2] = picture[2:-2, 2:-2]
     return framed.reshape(-1)
 
 
 def _project_flat(view: Grid, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Index into the flattened picture of the pixel under each point, the nearest for points outside."""
+    """Return the index into the flattened image for each point; points outside get the nearest pixel."""
     row = ((view.front_m - x) * (1 / view.resolution_m)).clip(0, view.rows - 1).astype(np.int32)
     col = ((view.left_m - y) * (1 / view.resolution_m)).clip(0, view.cols - 1).astype(np.int32)
     return row * view.cols + col
 
 
 def _draw_lines(seen: Surfaces) -> np.ndarray:
-    """(H, W) share of light lost to a line: on the nearer side of each border between parts."""
+    """(H, W) share of light removed by lines, which lie on the nearer side of each border between parts."""
     lost = np.zeros(seen.part.shape, np.float32)
     for axis in (0, 1):
         one, two = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])

@@ -1,4 +1,7 @@
-"""Render street views along the roads of scenes, one Ray task per scene: images, cameras, contact sheet, animation."""
+"""Render street views along the roads of scenes, one Ray task per scene.
+
+The output of a scene consists of images, cameras, a contact sheet and an animation.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,25 @@ from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.run_guard import find_changed_option
 from pipelines.schema.scene_subset import SceneSubset
 
-DEPTH_PER_M = 256  # of the 16 bits of a depth image, as in KITTI; 0 where nothing is or beyond 255 m
+DEPTH_PER_M = 256  # Units per metre in a 16-bit depth image, as in KITTI; 0 marks sky and depths above 255 m.
 FRAMES_PER_SECOND = 10
 ON_SHEET = 24
 
 
 @dataclass(frozen=True)
 class StreetRequest:
-    """Where the cameras stand, and where the images go: streets/<run>/<scene_id>/."""
+    """Options of street views, which are written to streets/<run>/<scene_id>/.
+
+    Attributes:
+        output: Output directory.
+        run: Run name.
+        spacing_m: Distance between cameras along the road (m).
+        height_m: Height of a camera above the ground (m).
+        pitch_deg: Upward angle of the view direction, in degrees.
+        lens: Camera intrinsics.
+        right: Offset to the right of the centreline, as a share of the road width.
+        most: Maximum number of frames per scene; None means no limit.
+    """
 
     output: str
     run: str
@@ -34,15 +48,31 @@ class StreetRequest:
     height_m: float
     pitch_deg: float
     lens: Lens
-    right: float  # of the centreline, as a share of the road's width
-    most: int | None  # frames of a scene
+    right: float
+    most: int | None
 
     def directory(self, scene: Scene) -> str:
+        """Return the output directory of a scene.
+
+        Args:
+            scene: Scene.
+
+        Returns:
+            Path or URI.
+        """
         return storage.join_uri(self.output, "streets", self.run, scene.scene_id)
 
 
 def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
-    """Cameras on a way (k, 3) over the ground, each looking along it; the last metres only show the way."""
+    """Place cameras along a path on the ground, each looking along the path.
+
+    Args:
+        way_m: (k, 3) points of the path in the scene frame (m), k >= 2.
+        request: Spacing, height, pitch and intrinsics of the cameras.
+
+    Returns:
+        Cameras at multiples of request.spacing_m along the path.
+    """
     along_m = np.append(0, np.cumsum(np.linalg.norm(np.diff(way_m[:, :2], axis=0), axis=1)))
     count = int((along_m[-1] - 1e-6) // request.spacing_m) + 1
     at_m = np.arange(min(count, request.most or count)) * request.spacing_m
@@ -58,20 +88,41 @@ def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamer
 
 
 def serialize_camera(camera: StreetCamera) -> dict:
-    """Pose of a camera in the scene, and its intrinsics."""
+    """Return the pose and the intrinsics of a camera as JSON data.
+
+    Args:
+        camera: Camera in the scene.
+
+    Returns:
+        Dictionary with scene_from_camera, a 4 x 4 matrix (m), and the intrinsics (pixels).
+    """
     scene_from_camera = np.eye(4)
     scene_from_camera[:3, :3], scene_from_camera[:3, 3] = camera.camera_from_scene.T, camera.position_m
     return {"scene_from_camera": scene_from_camera.tolist(), **asdict(camera.lens)}
 
 
 def encode_depth(view: StreetView) -> np.ndarray:
-    """(H, W) uint16 of DEPTH_PER_M a metre."""
+    """Return the depth image of a street view.
+
+    Args:
+        view: Rendered images of one camera.
+
+    Returns:
+        (H, W) uint16 with DEPTH_PER_M units per metre; 0 for sky and depths above 255 m.
+    """
     depth = np.round(view.depth_m * DEPTH_PER_M)
     return np.where(depth < 2**16, depth, 0).astype(np.uint16)
 
 
 def encode_animation(frames: list[np.ndarray]) -> bytes:
-    """Frames (H, W, 3) uint8 as an animated WebP, which every browser plays."""
+    """Encode frames as an animated WebP file, which web browsers display.
+
+    Args:
+        frames: Images (H, W, 3) uint8 of equal size.
+
+    Returns:
+        Content of the file.
+    """
     content, (first, *rest) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
     pause_ms = 1000 // FRAMES_PER_SECOND
     first.save(content, "WEBP", save_all=True, append_images=rest, duration=pause_ms, loop=0, quality=80)
@@ -79,7 +130,17 @@ def encode_animation(frames: list[np.ndarray]) -> bytes:
 
 
 def write_street(scene: Scene, request: StreetRequest) -> int:
-    """Render the drive through a scene; how many frames. cameras.json is written last."""
+    """Render the street views of one scene.
+
+    The function writes cameras.json last. A directory with this file is therefore complete.
+
+    Args:
+        scene: Scene.
+        request: Cameras and output.
+
+    Returns:
+        Number of frames; 0 if the scene has no road.
+    """
     directory, renderer = request.directory(scene), StreetRenderer(scene)
     way_m = plan_drive(extract_road_network(scene), right=request.right)
     cameras = place_cameras(way_m, request) if len(way_m) > 1 else []
@@ -111,7 +172,9 @@ def write_street(scene: Scene, request: StreetRequest) -> int:
 def render_streets(
     request: StreetRequest, selection: SceneSubset, on_scene: Callable[[], None] | None = None
 ) -> dict[str, int]:
-    """Render street views of the selected scenes. Another call resumes an interrupted one.
+    """Render street views of the selected scenes.
+
+    A second call resumes an interrupted one.
 
     Args:
         request: Cameras and output.
@@ -122,7 +185,7 @@ def render_streets(
         Number of frames by scene id; 0 for a scene without a road.
 
     Raises:
-        ValueError: The output holds a run with other cameras, or no scene has a road.
+        ValueError: The output holds a run of the same name with other cameras, or no scene has a road.
     """
     record = storage.join_uri(request.output, "streets", f"{request.run}.json")
     if said := find_changed_option(record, asdict(request)):
@@ -143,5 +206,5 @@ def render_streets(
         if on_scene:
             on_scene()
     if not any(frames.values()):
-        raise ValueError(f"none of the {len(frames)} scenes has a road: street views need the ground class road")
+        raise ValueError(f"none of the {len(frames)} scenes has a road; street views need the ground class road")
     return frames

@@ -27,6 +27,6 @@ def test_paint_job_paints_drive_and_resumes(controlnet_weights, tmp_path, cluste
     again = {path.name: path.stat().st_mtime_ns for path in (drive / "photo").iterdir()}
     assert again["000000.png"] == files["000000.png"] and again["000001.png"] != files["000001.png"]
     with pytest.raises(
-        ValueError, match=r'was painted with prompt="a photograph.*asked for "night"; delete its photo/'
+        ValueError, match=r'holds photographs with prompt="a photograph.*asked for "night"; delete its photo/'
     ):
         paint(Config(**options, prompt="night"))

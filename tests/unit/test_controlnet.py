@@ -55,5 +55,5 @@ def test_painter_names_missing_weights(controlnet_weights, tmp_path):
         (tmp_path / path.name).write_text(path.read_text())
     with pytest.raises(ValueError, match="no Stable Diffusion and ControlNet weights"):
         Painter(request((controlnet_weights[0], str(tmp_path))))
-    with pytest.raises(ValueError, match="no street views here; run jobs/render_streets"):
+    with pytest.raises(ValueError, match="holds no street views; run jobs/render_streets"):
         paint(Config(streets=str(tmp_path), diffusion=controlnet_weights[0], controlnet=controlnet_weights[1]))
