@@ -1,7 +1,8 @@
 """Augment training scenes: mirror a scene, or view it from a slightly moved vehicle.
 
-The paper does not augment scenes. SLEDGE, on which the paper builds, moves the vehicle by up to 1 m and 2.5 degrees.
-A moved crop includes an area outside the stored crop. This area stays empty, so moves should be small.
+The paper does not augment scenes. SLEDGE, on which the paper builds, moves the vehicle by up to 1 m and rotates it by
+up to 2.5 degrees. A moved crop includes an area outside the stored crop. The area outside the stored crop is empty, so
+moves should be small.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ class Augmentation:
     seed: int = 0
 
     def __call__(self, scene: Scene, place: int) -> Scene:
-        """Return a mirrored and moved copy of a scene, as the draw at this position requires.
+        """Return a randomly mirrored and moved copy of a scene.
 
         Args:
             scene: Stored scene.
             place: Position in the sample stream; it keys the random draw.
 
         Returns:
-            The changed scene, or `scene` itself if the draw changes nothing.
+            The changed scene, or `scene` itself if the random draw changes nothing.
         """
         rng = np.random.default_rng([7303, self.seed, place])
         flip, dx, dy, turn = rng.random(), *rng.uniform(-1, 1, 3)

@@ -1,9 +1,9 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
-It consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. diffusers'
-`DiTTransformer2DModel` embeds timestep and label again in every block, which makes it 8 % larger. It also drops labels
-for guidance independently per block, so its unconditional branch is never trained. Here, each sample has one embedding
-and one dropout mask for the whole network.
+The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
+`DiTTransformer2DModel` of diffusers embeds timestep and label again in every block, which makes it 8 % larger. That
+class also drops labels for guidance independently per block, so its unconditional branch is never trained. Here, each
+sample has one embedding and one dropout mask for the whole network.
 """
 
 from __future__ import annotations
@@ -118,12 +118,11 @@ class DiT(ConfiguredModel):
         label: Kind of label, a key of `models.labels.LABELS`.
         num_labels: Number of labels; this index is the null label of classifier-free guidance.
         layout: LayoutSpec of the training scenes as a dict, or None.
-        shift: Value per channel that is subtracted from VAE latents before diffusion. The paper uses none.
-        scale: Value per channel that divides VAE latents after the shift. The paper uses none.
-        prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is
-            sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the
-                noise.
-            With it, a small network need not transport the noise of its input through all layers.
+        shift: Value per channel that is subtracted from VAE latents before diffusion. The paper uses no shift.
+        scale: Value per channel that divides VAE latents after the shift. The paper uses no scale.
+        prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is sqrt(alpha_bar)
+            noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the noise. With
+            "v_prediction", a small network need not transport the noise of its input through all layers.
 
     Raises:
         ValueError: `prediction` is unknown, or `patch` or `heads` does not divide the size or the width.
@@ -164,7 +163,7 @@ class DiT(ConfiguredModel):
         self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
         alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
-        self.register_buffer("noise_shares", shares, persistent=False)  # factors of latent and velocity
+        self.register_buffer("noise_shares", shares, persistent=False)  # factors of latent and v
         self.init_weights()
 
     @classmethod
@@ -226,9 +225,8 @@ class DiT(ConfiguredModel):
             label: Class indices.
 
         Returns:
-            Shifts, scales and gates (b, 6 d) of every block, shift and scale (b, 2 d) of the output, and the factors
-            (b, 2) that
-            convert latent and network output to the noise.
+            A list: shifts, scales and gates (b, 6 d) of every block; shift and scale (b, 2 d) of the output; factors
+            (b, 2) of latent and network output in the predicted noise.
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
@@ -236,7 +234,7 @@ class DiT(ConfiguredModel):
     def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
         """Return the weight of the squared noise error in training.
 
-        The weight makes the squared error of the network's own output (noise or velocity) count 1.
+        With this weight, the squared error of the network's own output (noise or v) counts once at every timestep.
 
         Args:
             timestep: Timesteps.
@@ -268,8 +266,7 @@ class DiT(ConfiguredModel):
         """Compute the modulations of the given timesteps and labels once and return `forward` for them.
 
         The modulation layers hold a third of the weights. Without this method, each step would read these weights for
-        only one
-        or two rows.
+        only one or two rows.
 
         Args:
             timesteps: Timesteps that will be used.

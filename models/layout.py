@@ -1,7 +1,7 @@
 """LayoutSpec defines the meaning of the values of a LayoutBatch (batch.py).
 
 pipelines/preprocess/ingest.py computes one LayoutSpec per dataset and writes it to dataset.json. Each checkpoint stores
-a copy of it. A model therefore decodes its outputs to scenes without the dataset.
+a copy of the LayoutSpec. A model therefore decodes its outputs to scenes without the dataset.
 """
 
 from __future__ import annotations
@@ -77,8 +77,7 @@ class LayoutSpec:
         cholesky_bounds: Bounds of the six Cholesky parameters (sqrt(metres)).
         height_bounds_m: Bounds of the ground height (metres, scene frame).
         surface: Reference surface of the ground heights. "top" is the top of the slabs, 0.3 m above the true surface,
-            as in
-            the authors' data. Any other value is the true surface.
+            as in the authors' data. Any other value means that heights are those of the true surface.
     """
 
     categories: tuple[str, ...] = CATEGORIES

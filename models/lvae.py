@@ -1,6 +1,7 @@
 """The layout VAE (paper, Sec. 3.2 and supplement B.2).
 
-It has a ground branch and an object branch. Their latents are stacked along the channels of one joint latent.
+The layout VAE has a ground branch and an object branch. The latents of both branches are stacked along the channels of
+one joint latent.
 """
 
 from __future__ import annotations
@@ -55,8 +56,7 @@ class LayoutVAE(ConfiguredModel):
         shortcut: See `LayoutVAEConfig`.
         split_latent: See `LayoutVAEConfig`.
         branches: "both", "ground" or "objects". With one branch, the latent has c channels and the other part of a
-            decoded
-            layout is empty.
+            decoded layout is empty.
 
     Raises:
         ValueError: An option is unknown, or the grid does not divide into latent cells.
@@ -127,9 +127,9 @@ class LayoutVAE(ConfiguredModel):
     def init_from_data(self, batch: LayoutBatch) -> None:
         """Initialise every output to its mean over a sample of training layouts.
 
-        Adam moves a bias by about the learning rate per step. From zero, it would need thousands of steps to learn that
-        poles
-        are thin and that most pixels are not road. models/vae/ground.py describes the initialisation of shortcuts.
+        Adam moves a bias by about the learning rate per step. From zero, Adam would need thousands of steps to learn
+        that poles are thin and that most pixels are not road. The initialisation of shortcuts is described in
+        models/vae/ground.py.
 
         Args:
             batch: Training layouts.
@@ -146,7 +146,8 @@ class LayoutVAE(ConfiguredModel):
     def freeze_all_but_object_decoder(self, state: dict[str, Tensor]) -> None:
         """Load the weights of another model with the same encoders, and train only the object decoder.
 
-        The latents then equal those of the other model. A diffusion transformer that was trained on them remains valid.
+        Both models then encode a scene to the same latent. A diffusion transformer that was trained on the latents of
+        the other model remains valid.
 
         Args:
             state: State dict of the other model; its object decoder is ignored.
@@ -228,8 +229,7 @@ class LayoutVAE(ConfiguredModel):
 
         Returns:
             Features, existence logits, proposals per category and weights of the matching cost. Without an object
-            branch, there
-            are no proposals.
+            branch, there are no proposals.
         """
         if self.object_decoder:
             return *self.object_decoder(latent), self.object_decoder.proposals, self.object_decoder.match_weights
@@ -244,17 +244,15 @@ class LayoutVAE(ConfiguredModel):
     ) -> tuple[LayoutOutput, Posterior]:
         """Sample latents from the posterior and decode them.
 
-        Differs from the paper, which has no corruption. Zheng et al. (RAE, 2025) train decoders with such noise. Here,
-        encoders
-        are trained together with the decoders, and each scene has its own noise level
+        Differs from the paper, which adds no corruption to the latent. Zheng et al. (RAE, 2025) train decoders with
+        such noise. Here, encoders are trained together with the decoders, and each scene has its own noise level
         (`models.training.sample_corruption`).
 
         Args:
             batch: Layouts.
             noise: Standard normal noise of the reparameterisation.
             corruption: Additional noise on the latent, in units of each channel's standard deviation over the cells of
-                a scene
-                (default: none). It makes decoders tolerate errors in sampled latents.
+                a scene (default: none). The noise makes decoders tolerate errors in sampled latents.
 
         Returns:
             Output of the decoders, and the posterior.

@@ -56,8 +56,7 @@ def draw_seeds(
     """Return one seed per scene.
 
     Args:
-        generator: One generator that draws a seed for all scenes, or one generator per scene. With None, `seed` is
-            used.
+        generator: One generator that draws a seed for all scenes, or one generator per scene. If None, `seed` is used.
         seed: One seed for all scenes, or one per scene.
         count: Number of scenes.
 
@@ -79,7 +78,7 @@ def draw_seeds(
 
 
 def check_noise_scaling(noise_scaling: float) -> float:
-    """Return a noise scaling after a range check.
+    """Check that a noise scaling is between 0.9 and 1.1 and return it.
 
     Args:
         noise_scaling: Divisor of the predicted noise.
@@ -104,8 +103,7 @@ class PrITTIPipeline:
         scheduler: Noise schedule and sampler, as a SchedulerConfig or a scheduler of diffusers (default: the paper's
             DDPM).
         noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`). The
-            paper
-            has no such scaling.
+            paper does not scale the noise.
         existence_threshold: Primitives with a higher existence probability are kept; 0.3 in the paper.
 
     Raises:
@@ -314,8 +312,7 @@ class PrITTIPipeline:
         """Decode latents to scenes.
 
         Latents are decoded one at a time, so that each scene is bit-identical in any batch. A cell decoder may propose
-        the same
-        object in two cells; the proposal with the higher existence probability is kept.
+        the same object in two cells; the proposal with the higher existence probability is kept.
 
         Args:
             latents: Latents.
@@ -420,7 +417,7 @@ class PrITTIPipeline:
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
         """Yield the function that a sampler calls after each step.
 
-        It advances the progress bar and calls the user's callback.
+        The function advances the progress bar and calls the user's callback.
         """
         with tqdm(total=num_evaluations, **self._progress_bar) as bar:
 
@@ -464,7 +461,8 @@ class PrITTIPipeline:
                 schedule = SamplingSchedule(self.diffusion, num_inference_steps)
                 model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
                 return sample(model, schedule, noise, label, on_step=on_step)
-            self.diffusion.select_timesteps(num_inference_steps)  # check the number, because diffusers accepts any
+            # Raise an error for an invalid number, which diffusers would accept.
+            self.diffusion.select_timesteps(num_inference_steps)
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
             timesteps = self.scheduler.timesteps
             if timesteps.is_floating_point():
@@ -499,10 +497,9 @@ class PrITTIPipeline:
             num_inference_steps: Number of denoising steps; 250 in the paper.
             guidance_scale: Scale of classifier-free guidance; 1 is none.
             run: Run name, which is part of the scene ids.
-            generator: Generator that draws the seed, or one generator per scene. It replaces `seed`.
-            callback_on_step_end: Called as (pipeline, step, timestep, {"latents": ...}) after each step; returns such a
-                dict
-                with the latents for the next step.
+            generator: Generator that draws the seed, or one generator per scene. A generator replaces `seed`.
+            callback_on_step_end: Function that is called as f(pipeline, step, timestep, {"latents": ...}) after each
+                step. It returns such a dict with the latents for the next step.
             noise_scaling: Divisor of the predicted noise (default: the pipeline's).
             existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
 
@@ -598,7 +595,8 @@ class PrITTIPipeline:
             guidance_scale: Scale of classifier-free guidance; 1 is none.
             generator: As for `generate`.
             callback_on_step_end: As for `generate`.
-            composite: Take everything outside the regions from the input. If False, it is the decoders' reconstruction.
+            composite: Take everything outside the regions from the input. If False, everything outside is the decoders'
+                reconstruction.
 
         Returns:
             The regenerated scenes.
@@ -611,7 +609,7 @@ class PrITTIPipeline:
         for scene in scenes:
             self.require_grid(scene)
         if contents != "both" and not self.lvae.config.split_latent:
-            raise ValueError(f"this model's latent mixes ground and objects: {contents} cannot be regenerated alone")
+            raise ValueError(f"this model's latent mixes ground and objects, so it cannot regenerate only {contents}")
         shape = self.latent_shape
         mask = make_latent_mask(regions, shape, contents).to(self.device)
         seeds = draw_seeds(generator, seed, len(scenes))
@@ -657,17 +655,15 @@ class PrITTIPipeline:
             index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
             mode: "copy" copies the shifted latent of the neighbours, as in the paper. "reencode" decodes the known
-                part,
-                transforms it into the block's frame and height, and encodes it again. Object latents contain absolute
-                    centres,
-                which a copy does not change.
-            num_blocks: Number of blocks ahead, behind, left and right. One on every side is the paper's outpainting.
+                part, transforms it into the block's frame and height, and encodes it again. Object latents contain
+                absolute centres, which a copy does not change.
+            num_blocks: Number of blocks ahead, behind, left and right. One block on every side is the paper's
+                outpainting.
             repaint: Options of RePaint (default: the paper's).
             guidance_scale: Scale of classifier-free guidance; 1 is none.
             callback_on_step_end: As for `generate`.
-            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right").
-                `num_blocks` is
-                then ignored.
+            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"). With
+                `side`, `num_blocks` is ignored.
 
         Returns:
             One scene that covers all blocks.

@@ -32,8 +32,8 @@ class LVAEPreset:
         grad_clip: Largest gradient norm (None: no clipping).
         ema_decay: Decay of the exponential moving average of the weights (None: no average).
         kl_weight: Weight of the KL term, which is summed over the latent.
-        latent_noise: Standard deviation of noise on the training latents. It makes decoders tolerate errors in sampled
-            latents. The paper uses no such noise.
+        latent_noise: Standard deviation of noise on the training latents. The noise makes decoders tolerate errors in
+            sampled latents. The paper adds no noise.
     """
 
     source: str
@@ -112,13 +112,13 @@ class DiTPreset:
         batch_size: Samples per step.
         steps: Number of training steps.
         normalise_latents: Shift and scale each latent channel to zero mean and unit variance. The paper and SLEDGE do
-            not.
+            not normalise latents.
         learning_rate: Learning rate.
         weight_decay: Weight decay of AdamW.
         grad_clip: Largest gradient norm (None: no clipping).
         ema_decay: Decay of the exponential moving average of the weights (None: no average).
-        label_dropout: Probability of training a sample with the null label. The paper does not specify it; 0.1 is
-            DiT's.
+        label_dropout: Probability of training a sample with the null label. The paper does not specify this
+            probability; DiT uses 0.1.
     """
 
     lvae: str

@@ -1,7 +1,7 @@
 """Scene: one semantic layout of 64 m x 64 m as arrays in metres (paper, Sec. 3.1).
 
-Real and generated scenes use the same class and the same scene frame. Its origin is the ego vehicle, and its axes are
-**x forward, y left, z up**, aligned with gravity.
+Real and generated scenes use the same class and the same scene frame. The origin of the scene frame is the ego vehicle,
+and the axes are **x forward, y left, z up**, aligned with gravity.
 
 Differs from the paper, whose frame keeps the pitch and roll of the IMU. With pitch and roll, the ground of neighbouring
 blocks would not meet.
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-# Paper, supplement Tab. "object categories". Slots have the same order.
+# Paper, supplement Tab. "object categories". The slots of a layout have the same order.
 CATEGORIES = (
     "vegetation_cuboid",
     "vegetation_ellipsoid",
@@ -154,8 +154,7 @@ def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.nda
     """Rewrite boxes so that the height axis is nearest to the vertical, length >= width and yaw in [-pi/2, pi/2).
 
     The point sets of the boxes do not change. A mirrored input (determinant < 0) becomes right-handed, because a box
-    equals
-    its mirror image.
+    equals its mirror image.
 
     Args:
         rotation: (n, 3, 3) axes of the boxes in the scene frame, as columns.
@@ -232,8 +231,8 @@ class Scene:
         occupied: Ground mask per ground class.
         grid: Pixel grid of the rasters.
         existence: Existence probability; 1 for annotated primitives.
-        heading_rad: Direction of travel; NaN where it is unknown. The scatter matrix does not distinguish front and
-            back.
+        heading_rad: Direction of travel; NaN where it is unknown. The scatter matrix does not distinguish the front of
+            an object from its back.
         instance_id: Id of the object in the source's annotation; -1 if there is none.
         label: Class name of the object in the source's annotation (default: the name of the category).
         world_xyz_m: Position of the scene frame's origin in the world frame.
@@ -333,9 +332,8 @@ class Scene:
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Fuse the ground classes into one surface (paper, supplement B.2, Layout Reconstruction).
 
-        The highest class is kept at each pixel. If two classes have the same height, the later one is kept, because a
-        crossing
-        lies on its road.
+        The highest class is kept at each pixel. If two classes have the same height, the class with the higher index is
+        kept, because a crossing lies on its road.
 
         Returns:
             Height (H, W) in metres, and class (H, W) int8 as index into `ground_classes`, -1 without ground.

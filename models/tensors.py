@@ -56,9 +56,8 @@ def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tupl
 def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Resample rasters onto another grid over the same area.
 
-    On a coarser grid, a pixel is occupied if at least half of its area is occupied. Its height is the mean over the
-    occupied
-    part. On a finer grid, values are those of the nearest pixel.
+    On a coarser grid, a pixel is occupied if at least half of its area is occupied. The height of such a pixel is the
+    mean over its occupied part. On a finer grid, values are those of the nearest pixel.
 
     Args:
         height: (G, H, W) heights, in metres or as unsigned integers.

@@ -1,8 +1,7 @@
 """Training of both stages in plain torch: optimisation step, EMA, learning-rate schedule and checkpoint.
 
 This module does not use Ray, so it also trains in a single process. Random numbers are keyed by (seed, step, position
-of
-the sample in the global batch). A resumed run and a run on more workers therefore draw the same numbers.
+of the sample in the global batch). A resumed run and a run on more workers therefore draw the same numbers.
 """
 
 from __future__ import annotations
@@ -82,7 +81,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """Options of the execution of a training step. They change the result only by rounding.
+    """Options of the execution of a training step. These options change the result only by rounding.
 
     Attributes:
         accumulate: Number of parts into which a batch is split to save memory; the parts are computed one after
@@ -207,10 +206,8 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
     """Convert uniform random numbers to training timesteps.
 
     "uniform" is the paper's density. "logit_normal" prefers middle timesteps, as in SD3 (Esser et al., 2024). The
-    existence
-    of objects is decided between timesteps 126 and 467. This interval contains a third of the uniform timesteps and
-    half of
-    the logit-normal ones.
+    existence of objects is decided between timesteps 126 and 467. This interval contains a third of the uniform
+    timesteps and half of the logit-normal ones.
 
     Args:
         uniform: Random numbers between 0 and 1.
@@ -309,7 +306,7 @@ class Trainer:
 
         Args:
             arrays: Batch of this worker.
-            positions: Positions of its samples in the global batch.
+            positions: Positions of the samples of `arrays` in the global batch.
 
         Returns:
             Detached losses, and the gradient norm as `grad_norm`.
@@ -377,7 +374,7 @@ class Trainer:
     def update_ema(self) -> None:
         """Update the exponential moving average of the weights.
 
-        Its decay is min(ema_decay, 1 - (1 + step)^-3/4), as in diffusers.
+        The decay is min(ema_decay, 1 - (1 + step)^-3/4), as in diffusers.
         """
         if self.ema is None or self.settings.ema_decay is None:
             return

@@ -25,8 +25,7 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
 
     Each known object is matched to at most one generated object of its category. The matching maximises the sum of the
     IoU3D over pairs above REGENERATED_IOU3D. In addition, every object that exceeds DUPLICATE_IOU3D with a known object
-    of
-    its category is a copy.
+    of its category is a copy.
 
     Args:
         generated: All decoded objects, on both sides of the border.
@@ -50,8 +49,7 @@ def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
     """Find the solid objects that non-maximum suppression removes.
 
     Of two duplicates (DUPLICATE_IOU3D per category), the object with the higher existence probability is kept.
-    Vegetation
-    is never a duplicate, because tree crowns overlap in reality.
+    Vegetation is never a duplicate, because tree crowns overlap in reality.
 
     Args:
         scene: Decoded scene.

@@ -146,8 +146,7 @@ def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> lis
 
     Returns:
         Window of each block and the mask (rows, cols) of the pixels that it regenerates. The masks consist of whole
-        cells
-        and are disjoint.
+        cells and are disjoint.
 
     Raises:
         ValueError: The scene is smaller than a block, or its resolution or ground classes differ from the model's.
@@ -195,8 +194,7 @@ def inpaint_blocks(
     """Regenerate a region of a scene of any size, block by block, in one variant per index.
 
     The result equals `PrITTIPipeline.inpaint` for a scene on the model's grid. The region grows to whole cells. All
-    other
-    pixels and objects are kept bit for bit.
+    other pixels and objects are kept bit for bit.
 
     Args:
         model: Model.
@@ -214,9 +212,7 @@ def inpaint_blocks(
         One step per block. The canvases of the last step are the result.
 
     Raises:
-        ValueError: The region is empty, the scene is smaller than a block, or its resolution or ground classes differ
-            from
-            the model's.
+        ValueError: The region is empty, or the scene does not fit the model (`require_blocks`).
     """
     if not region.any():
         raise ValueError(f"{scene}: the region contains no pixel of this scene")
@@ -259,8 +255,7 @@ def extend_scene(
     """Extend a scene by (1 - overlap) of a block to one side (see `PrITTIPipeline.outpaint`).
 
     Each new block is conditioned on the known content inside it. This content is encoded in the block's frame and at
-    the
-    block's ground height.
+    the block's ground height.
 
     Args:
         model: Model.
@@ -277,9 +272,8 @@ def extend_scene(
         The extended scene.
 
     Raises:
-        ValueError: The side is unknown, the overlap is not a whole number of cells, the scene is smaller than a block,
-            or
-            its resolution or ground classes differ from the model's.
+        ValueError: The side is unknown, the overlap is not a whole number of cells, or the scene does not fit the model
+            (`require_blocks`).
     """
     spec, block = model.spec, model.spec.grid
     require_blocks(model, scene)

@@ -24,8 +24,7 @@ class InfiniteScene:
     """An unbounded scene of blocks in four ranks (`outpaint.rank_four_colors`).
 
     Each block depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height. Generated
-    blocks
-    are kept in memory until `drop_block` is called.
+    blocks are kept in memory until `drop_block` is called.
 
     Args:
         model: A PrITTIPipeline.

@@ -1,8 +1,7 @@
 """Inpainting: select regions, and combine known and generated parts of scenes (paper, Sec. 3.3).
 
 A region is a mask (rows, cols) over the pixels of a scene, where True means regenerate. The operators |, & and ~
-combine
-regions.
+combine regions.
 """
 
 from __future__ import annotations
@@ -125,7 +124,7 @@ def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
     """
     rows, cols = region.shape
     if rows % size or cols % size:
-        raise ValueError(f"a region of {rows} x {cols} pixels does not divide into {size} x {size} cells")
+        raise ValueError(f"a region of {rows} x {cols} pixels does not divide into {size} x {size} latent cells")
     return np.any(region.reshape(size, rows // size, size, cols // size), axis=(1, 3))
 
 
@@ -179,10 +178,9 @@ def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, content
     Pixels inside the region come from the generated scene. A primitive lies in the region if the pixel under its centre
     does. New ground is blended into the known ground at the border (seam_blending.py).
 
-    Decoders read the whole latent. Their output outside the region therefore differs slightly from the scene, although
-    the
-    latent there is the same. A known object near the border may be decoded slightly inside the region. Such copies are
-    removed.
+    Decoders read the whole latent. Outside the region, the decoded scene therefore differs slightly from the input,
+    although the latent there is the same. A known object near the border may be decoded slightly inside the region.
+    Copies of known objects inside the region are removed.
 
     Args:
         scene: Input scene.

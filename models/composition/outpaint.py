@@ -4,9 +4,8 @@ The paper extends a scene to three by three blocks around it. This module also s
 unbounded grid, which differ only in the order of the blocks.
 
 Block (i, j) lies i steps ahead and j steps left of block (0, 0). A step is (1 - overlap) of a block. The rank of a
-block
-is a function of (i, j) alone. Where blocks overlap, the block of lowest rank owns the cell. Blocks of equal rank never
-overlap in cells that they own. Each block is conditioned on the cells that blocks of lower rank own. The result
+block is a function of (i, j) alone. Where blocks overlap, the block of lowest rank owns the cell. Blocks of equal rank
+never overlap in cells that they own. Each block is conditioned on the cells that blocks of lower rank own. The result
 therefore does not depend on the time, the machine or the order of generation.
 """
 
@@ -106,7 +105,7 @@ class BlockGrid:
             index: Index of the block.
 
         Returns:
-            True if it does; always True for an unbounded grid.
+            True if the grid contains the block; always True for an unbounded grid.
         """
         if self.num_blocks is None:
             return True
@@ -207,7 +206,7 @@ class SceneBlock:
         latent: (c, h, w) latent of the whole block.
         datum_m: Height of the block's frame above the frame of block (0, 0).
         known_ground: Fraction of the known pixels that have ground, or 1 if nothing was known. The paper's outpainting
-            fails if it is near 0.
+            fails if this fraction is near 0.
     """
 
     scene: Scene
@@ -264,7 +263,7 @@ def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
 
 
 class BlockComposer:
-    """Condition blocks on their predecessors and stitch blocks together. It stores no blocks.
+    """Condition blocks on their predecessors and stitch blocks together. The composer stores no blocks.
 
     Args:
         block_grid: Block grid.
@@ -310,8 +309,7 @@ class BlockComposer:
             blocks: Generated blocks, with all predecessors of the block.
             empty: Empty Scene that provides the ids of the result.
             mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms their decoded
-                content into
-                the block's frame and encodes it again, because object latents contain absolute centres.
+                content into the block's frame and encodes it again, because object latents contain absolute centres.
 
         Returns:
             The known part.
@@ -431,7 +429,7 @@ def generate_blocks(
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
     stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
     repaint = repaint or RePaintConfig()
-    if all(condition.is_empty for condition in conditions):  # resampling has no effect without a known part
+    if all(condition.is_empty for condition in conditions):  # without a known part, resampling has no effect
         repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
     latents = model.inpaint_latents(
         stacked,

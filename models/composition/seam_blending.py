@@ -1,9 +1,9 @@
 """Blend generated ground into known ground at seams.
 
-The decoder decodes the new part together with the known part, so both parts are consistent. The result however keeps
-the original known part. Where the original and the decoded known part differ by a pixel at a kerb or by a centimetre of
-height, the seam is visible. The difference at the seam is therefore added to the new side, with a weight that falls off
-with distance.
+The decoder decodes the new part together with the known part, so both parts are consistent. The result keeps the
+original known part instead of the decoded one. If the two differ by a pixel at a kerb or by a centimetre of height, the
+seam is visible. The difference at the seam is therefore added to the new side, with a weight that falls off with
+distance.
 
 A decoder may also draw a height step at the seam between known and new latent cells. A slope at the seam that exceeds
 both MAX_SLOPE and the slope of the known ground is removed in the same way.
@@ -31,10 +31,10 @@ MAX_SLOPE = 0.08  # rise per metre across the seam; a steeper rise is a decoder'
 def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     """Blend generated ground into the known ground at seams; objects keep their height above the ground.
 
-    Near a class's known pixels, two quantities are corrected by their difference at the nearest known pixel. These are
-    the
-    signed distance from the edge of the class, and the height of the class. Elsewhere, the height is corrected by the
-    difference of the two fused surfaces at the nearest known pixel where both have the same class.
+    Near the known pixels of a class, its height and its signed distance from the edge are corrected. The correction is
+    the difference at the nearest known pixel. Elsewhere, the height is corrected by the difference of the fused
+    surfaces of both scenes. This difference is taken at the nearest known pixel where both surfaces have the same
+    class.
 
     Args:
         generated: Scene on the grid of `known`.
@@ -66,8 +66,8 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
             new_mask, given, limit_px
         )
         inside = _compute_edge_distance(new_mask, np.ones_like(new), limit_px) + weight * shift_px[nearest] > 0
-        # Height of the class at every pixel: that of the nearest generated pixel of the class. If there is none, it is
-        # that of the nearest known pixel.
+        # Height of the class at every pixel: that of the nearest generated pixel of the class. If the class has no
+        # generated pixel, the height is that of the nearest known pixel.
         away, place = _find_nearest(known_mask) if known_mask.any() else (np.full(new.shape, np.inf), nearest)
         level_m = new_m[_find_nearest(new_mask)[1]] if new_mask.any() else known_m[place]
         own = _compute_falloff(away * resolution_m)

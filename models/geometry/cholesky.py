@@ -1,13 +1,13 @@
 """Convert rotation and size of a box to six Cholesky parameters and back (paper, Sec. 3.1 and supplement B.1).
 
-The scatter matrix is S = R diag(l, w, h) R^T with full extents (not squared). Its Cholesky factor L fulfils S = L L^T.
-The six parameters c are the lower-triangular entries of L. Entries of L have the unit sqrt(metres); off-diagonal
+The scatter matrix is S = R diag(l, w, h) R^T with full extents (not squared). The Cholesky factor L of S fulfils S = L
+L^T. The six parameters c are the lower-triangular entries of L. Entries of L have the unit sqrt(metres); off-diagonal
 entries may be negative.
 
 The paper does not specify the order and the bounds of the entries. This module uses the row-major order (L00, L10, L11,
 L20, L21, L22). Bounds come from the training split.
 
-The functions use numpy and accept any leading batch shape, because none of them needs a gradient.
+The functions use numpy, because none of them needs a gradient. They accept any leading batch shape.
 """
 
 from __future__ import annotations
@@ -50,16 +50,14 @@ def decode_cholesky_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Decode Cholesky parameters to boxes (supplement, Reconstruction).
 
     Any six finite numbers decode to a box, because S = L L^T is positive semi-definite for every L. If the eigenvectors
-    are
-    left-handed, one axis is flipped. Extents below 1 cm are clamped to 1 cm.
+    are left-handed, one axis is flipped. Extents below 1 cm are clamped to 1 cm.
 
     Args:
         parameters: c (..., 6) in sqrt(metres).
 
     Returns:
         rotation (..., 3, 3), right-handed, and size_m (..., 3) in ascending order; `scene.canonicalize_boxes` reorders
-        the
-        axes.
+        the axes.
     """
     parameters = np.asarray(parameters, np.float64)
     lower = np.zeros((*parameters.shape[:-1], 3, 3))

@@ -1,25 +1,25 @@
 """Encodings of the shape of a box (rotation and size) as numbers that a network can regress.
 
 `cholesky` is the paper's encoding (Sec. 3.1), `quaternion` is the paper's baseline, and `octahedral` is new here. The
-same box has 24 descriptions, which differ in the order and the signs of the axes. An ideal encoding has three
-properties: one code per box, one box per code, and continuity.
+same box has 24 descriptions, which differ in the order and the signs of the axes. An ideal encoding is continuous, has
+one code per box and has one box per code.
 
-* quaternion and size: This encoding has none of the properties. q and -q are the same rotation. A rotation of the box
-  by
-  180 degrees about an axis gives the same box but another q. A convention such as w >= 0 makes the code jump.
+* quaternion and size: This encoding has none of these properties. The quaternions q and -q are the same rotation. A
+  rotation of the box by 180 degrees about an axis gives the same box but another q. A convention such as w >= 0 makes
+  the code jump.
 * Cholesky factor of the scatter matrix: This encoding is continuous and has one code per box, but not one box per code.
   If two extents are equal, the scatter matrix does not determine the angle in their plane. If two extents l and w are
   similar, noise d in S rotates the box by atan(2 d / |l - w|) / 2.
-* octahedral: The code consists of the scatter matrix S = sum_j s_j v_j v_j^T and the frame tensor
-  T = sum_j v_j (x) v_j (x) v_j (x) v_j. Both are polynomials that do not depend on the order and the signs of the axes.
-  Equal boxes therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries of a
-  cube. It therefore determines the three axes for all extents, also for cubes. S then gives the extent along each axis.
-  The encoding has all three properties for every rotation (tests/unit/test_ablation.py).
+* octahedral: The code consists of the scatter matrix S = sum_j s_j v_j v_j^T and the frame tensor T = sum_j v_j (x) v_j
+  (x) v_j (x) v_j. S and T are polynomials that do not depend on the order and the signs of the axes. Equal boxes
+  therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries of a cube. T
+  therefore determines the three axes for all extents, also for cubes. S then gives the extent along each axis. The
+  octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
 
-T is symmetric and has 15 distinct entries. Its trace part is constant, because the v_j are orthonormal. The remaining
-traceless part has nine entries, the spherical harmonics of degree four. They represent cross frames in hexahedral
-meshing (Huang et al., Boundary aligned smooth 3D cross-frame field, 2011). For an upright box, two of them vary as
-cos 4 yaw and sin 4 yaw, and seven are constant.
+T is symmetric and has 15 distinct entries. The trace part of T is constant, because the v_j are orthonormal. The
+remaining traceless part has nine entries, the spherical harmonics of degree four. These harmonics represent cross
+frames in hexahedral meshing (Huang et al., Boundary aligned smooth 3D cross-frame field, 2011). For an upright box, two
+harmonics vary as cos 4 yaw and sin 4 yaw, and seven are constant.
 
 The functions use numpy in float64 and accept any leading batch shape.
 """
@@ -53,8 +53,7 @@ class Encoding(NamedTuple):
         entries: Numbers per box.
         encode: Maps rotation (..., 3, 3) and size_m (..., 3) to codes (..., entries).
         decode: Maps any finite codes to rotation (..., 3, 3), right-handed, and size_m (..., 3). Extents below 1 cm
-            count
-            as 1 cm in both directions.
+            count as 1 cm in both directions.
     """
 
     entries: int
@@ -107,9 +106,8 @@ def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 def compute_harmonics() -> np.ndarray:
     """Compute an orthonormal basis (9, 3, 3, 3, 3) of the traceless symmetric tensors of rank four.
 
-    The order is cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The tensors are the coefficients of t^k in n(t)^4,
-    where
-    n(t) . n(t) = 0. Such powers are traceless, and k = 0 gives (x + iy)^4.
+    The tensors are ordered as cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The tensors are the coefficients of t^k
+    in n(t)^4, where n(t) . n(t) = 0. The powers n(t)^4 are traceless, and k = 0 gives (x + iy)^4.
     """
     parts = np.array([[1, 1j, 0], [0, 0, -2], [-1, 1j, 0]])  # n(t) = parts[0] + parts[1] t + parts[2] t^2
     tensors = np.zeros((9, 3, 3, 3, 3), complex)
@@ -149,8 +147,7 @@ def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Decode scatter matrix and frame tensor to boxes.
 
     The axes are those of the nearest frame tensor. The extents are s_j = v_j^T S v_j. This expression is linear in S,
-    so
-    similar extents do not amplify errors.
+    so similar extents do not amplify errors.
 
     Args:
         parameters: (..., 15) codes of `encode_octahedral`.
@@ -169,10 +166,9 @@ def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
     """Find the axes whose frame tensor is nearest to the given harmonics.
 
     These axes maximise sum_j T(v_j, v_j, v_j, v_j). Each iteration replaces the axes by the orthogonal polar factor of
-    the
-    gradient and never decreases the sum (Zhai et al., Complete dictionary learning via l4-norm maximization, 2020).
-    Near
-    the maximum, an iteration triples the number of correct digits. The search runs from STARTS fixed frames.
+    the gradient, which never decreases the sum. The method is that of Zhai et al. (Complete dictionary learning via
+    l4-norm maximization, 2020). Near the maximum, an iteration triples the number of correct digits. The search starts
+    from STARTS fixed frames and keeps the best result.
 
     Args:
         harmonic: (..., 9) harmonics; their length has no effect.

@@ -1,17 +1,17 @@
 """Exact IoU3D of arbitrarily rotated boxes, vectorised over pairs, and sampled IoU3D of ellipsoids.
 
-Two applications of the divergence theorem give the volume of a convex polytope from its edges. Let d be the distance
-of a face's plane from the origin. Let r be the distance of an edge from the foot point of the origin on that face. Then
+Two applications of the divergence theorem give the volume of a convex polytope from its edges. Let d be the distance of
+a face's plane from the origin. Let r be the distance of an edge from the foot point of the origin on that face. Then
 
     V = 1/3 sum_faces d A_face = 1/6 sum_faces d sum_edges r |edge|.
 
-The edges of A ∩ B are the edges of A inside B, the edges of B inside A, and the intersection lines of their faces.
-These are 12 + 12 + 36 segments, and each one is a line clipped by slabs. No polygon is built, so the code needs no
-branch per pair.
+The edges of A ∩ B are the edges of A inside B, the edges of B inside A, and the intersection lines of their faces. The
+intersection thus has up to 12 + 12 + 36 edges, and each edge is a line clipped by slabs. No polygon is built, so the
+code needs no branch per pair.
 
-Coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the pair's largest extent, which is far above
-rounding errors and far below any tolerance. A face of B that coincides with a face of A then lies outside A, and only
-the face of A counts.
+Without a correction, coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the pair's largest
+extent, which is far above rounding errors and far below any tolerance. A face of B that coincides with a face of A then
+lies outside A, and only the face of A counts.
 """
 
 from __future__ import annotations
@@ -222,8 +222,7 @@ def _clip_own_edges(
     """Return the sum (n,) over one box's 12 edges of d d' |edge inside the other box|.
 
     `other_center` (3, n) is the centre of the other box relative to this box, along the axes of the other box. The two
-    faces
-    of an edge are perpendicular, so r of one face equals d of the other face.
+    faces of an edge are perpendicular, so r of one face equals d of the other face.
     """
     total = np.zeros(half.shape[1])
     for along, second, third in CYCLIC:
@@ -293,10 +292,9 @@ def _list_signs(half: np.ndarray) -> np.ndarray:
 def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     """Estimate the IoU3D of the ellipsoids inscribed in each pair a[i], b[i].
 
-    The estimate counts how many of BALL_POINTS fixed points of the smaller ellipsoid lie in the larger one. It is
-    deterministic. Its error is at most 0.01, and the root mean square error is 0.002 (a test checks both on closed
-    forms).
-    The paper's AP3D does not include ellipsoids.
+    The estimate counts how many of BALL_POINTS fixed points of the smaller ellipsoid lie in the larger one. The result
+    is deterministic. The largest error is 0.01 and the root mean square error is 0.002, as a test checks on closed
+    forms. The paper's AP3D does not include ellipsoids.
 
     Args:
         a: n bounding boxes of ellipsoids.

@@ -43,9 +43,9 @@ class Diffusion:
     def select_timesteps(self, num_inference_steps: int) -> np.ndarray:
         """Select ascending timesteps with "leading" spacing, for example 0, 4, ..., 996 for 250 of 1000.
 
-        Some numbers are rejected. For example, 600 timesteps have a spacing of 1, so sampling starts at timestep 599.
-        There the
-        network expects a signal share of 20 % but the input is pure noise.
+        Numbers that leave out a large part of the schedule are rejected. For example, 600 timesteps have a spacing of
+        1, so sampling starts at timestep 599. The network expects a signal share of 20 % at this timestep, but its
+        input is pure noise.
 
         Args:
             num_inference_steps: Number n of timesteps.
@@ -139,7 +139,7 @@ class SamplingSchedule:
     def step_down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
         """Sample p(z_{state-1} | z_state). With eta 1, mean and variance are those of DDPM's posterior.
 
-        The formula is expressed by z_0, so it also holds for spaced timesteps (beta = 1 - alpha_bar_i /
+        The formula is written in terms of z_0, so it also holds for spaced timesteps (beta = 1 - alpha_bar_i /
         alpha_bar_{i-1}).
 
         Args:
@@ -214,7 +214,7 @@ def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
     Args:
         model: Model that predicts the noise.
         null_label: Index of the null label.
-        scale: Guidance scale. With 1, the model is returned unchanged and evaluated once per step.
+        scale: Guidance scale. If the scale is 1, the model is returned unchanged and evaluated once per step.
 
     Returns:
         A model that predicts the guided noise.
@@ -234,12 +234,11 @@ def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
     """Divide the predicted noise of a model by a number near 1.
 
     This is epsilon scaling (Ning et al., ICLR 2024). During sampling, a network interprets its own earlier errors as
-    noise.
-    The division compensates for that, so samples keep the standard deviation of the data.
+    noise. The division compensates for this error, so samples keep the standard deviation of the data.
 
     Args:
         model: Model that predicts the noise.
-        noise_scaling: Divisor. With 1, the model is returned unchanged.
+        noise_scaling: Divisor. If the divisor is 1, the model is returned unchanged.
 
     Returns:
         A model that predicts the scaled noise.
@@ -276,11 +275,11 @@ def sample(
     """Sample clean latents by ancestral sampling along `transitions`.
 
     Downward transitions denoise; upward transitions add noise back (RePaint). With a condition, each downward step
-    replaces
-    the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0 bit for bit.
+    replaces the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0 bit
+    for bit.
 
-    Differs from the paper, which uses the noise level of the state just left (Eq. "z_known"). The known part and the
-    generated part would then have different noise levels.
+    Differs from the paper, which uses the noise level of the state just left (Eq. "z_known"). With the paper's level,
+    the known part and the generated part would have different noise levels.
 
     Args:
         model: Model that predicts the noise in a latent.
@@ -290,7 +289,7 @@ def sample(
         transitions: Pairs (from, to) of states (default: descending, without jumps).
         condition: Known part of the latents (default: none).
         on_step: Function that is called after every evaluation of the model and returns the latent for the next step.
-        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part. The paper has no such guidance.
+        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part. The paper uses no such guidance.
 
     Returns:
         Clean latents.
@@ -330,11 +329,9 @@ def pseudoinverse_guidance(
     """Predict the noise, and the direction that moves the clean estimate towards the known part.
 
     This is pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement. The direction is the
-    transposed
-    Jacobian of the clean estimate, times its difference from the known part, times sqrt(alpha_bar). If the known part
-    is
-    only pasted, an untrained network ignores it in the generated part. One call costs about two evaluations of the
-    model.
+    transposed Jacobian of the clean estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting
+    the known part is not enough for a network that has not learned to continue a known part. One call costs about two
+    evaluations of the model.
 
     Args:
         model: Model that predicts the noise.

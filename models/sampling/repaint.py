@@ -14,9 +14,8 @@ def repaint_transitions(
 ) -> list[tuple[int, int]]:
     """List the transitions (from, to) between states for RePaint.
 
-    After every `jump_length` states, RePaint adds noise back and denoises again. With 250 steps and J = R = 10, it
-    jumps
-    back at states 0, 10, ..., 230, nine times each. The result has 2,410 denoising steps.
+    After every `jump_length` states, RePaint adds noise back and denoises again. With 250 steps and J = R = 10, RePaint
+    jumps back at states 0, 10, ..., 230, nine times each. RePaint then has 2,410 denoising steps.
 
     Args:
         num_inference_steps: Number of visited timesteps.
@@ -68,7 +67,7 @@ class RePaintConfig:
     def guided(cls, num_inference_steps: int = 50) -> RePaintConfig:
         """Return options with pseudo-inverse guidance instead of resampling.
 
-        They give fewer visible seams and more objects, and they are 24 times as fast as the paper's.
+        These options give fewer visible seams and more objects, and they are 24 times as fast as the paper's.
 
         Args:
             num_inference_steps: Number of visited timesteps.

@@ -1,6 +1,7 @@
-"""Samplers by name. They are schedulers of diffusers, which is imported only when one of them is built.
+"""Samplers by name. The samplers are schedulers of diffusers, which is imported only when a scheduler is built.
 
-DDPM, the paper's sampler, is `diffusion.sample`. It uses the numbers of its config but not diffusers.
+DDPM, the paper's sampler, is `diffusion.sample`. DDPM reads the noise schedule from its config and does not need
+diffusers.
 """
 
 from __future__ import annotations

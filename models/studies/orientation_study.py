@@ -1,13 +1,13 @@
 """The paper's study "Cholesky vs. quaternion" (supplement): how well a small autoencoder reconstructs one box.
 
 The study compares encodings of the box (models/geometry/encodings.py). The autoencoder is a small object branch of the
-layout VAE with one slot and one query. It reconstructs the code of a box with an L1 loss. The encodings differ only in
-the first and the last linear layer. Boxes are centred at zero, and the centre is not predicted.
+layout VAE with one slot and one query. It is trained to reconstruct the code of a box with an L1 loss. The networks of
+different encodings differ only in their first and last linear layers. Boxes are centred at zero, and the centre is not
+predicted.
 
 For boxes that differ only by yaw, some entries of each code are constant: 2 of 6, 2 of 7 and 9 of 15. The L1 gradient
-of
-an entry does not shrink with its error, so constant entries disturb the training. The study therefore regresses either
-all entries, as the paper does, or only the varying ones.
+of an entry does not shrink with its error, so constant entries disturb the training. The study therefore regresses
+either all entries, as the paper does, or only the varying ones.
 
 The paper does not specify the ranges of the sizes, the network, the batch size and the learning rate.
 """
@@ -161,8 +161,7 @@ class StudyConfig:
     """Training options of the autoencoders, equal for all encodings.
 
     The batch size is that of the paper's layout VAE. The learning rate was selected on 1,200 vehicles of a seed that
-    the
-    study does not use. Mean IoU3D at learning rates 5e-4 / 1e-3: Cholesky 0.968 / 0.964, quaternion 0.871 / 0.876,
+    the study does not use. Mean IoU3D at learning rates 5e-4 / 1e-3: Cholesky 0.968 / 0.964, quaternion 0.871 / 0.876,
     octahedral 0.938 / 0.849.
 
     Attributes:
@@ -202,7 +201,8 @@ class TrainedStudy(NamedTuple):
         model: Autoencoder.
         bounds: Bounds of all entries of the code.
         encoding: Encoding of the boxes.
-        kept: (entries,) bool: entries that the autoencoder processes. All others keep their constant training value.
+        kept: (entries,) bool: entries that the autoencoder processes. All other entries keep their constant training
+            value.
     """
 
     model: OneObjectAutoencoder

@@ -1,13 +1,12 @@
 """An object decoder without queries: each latent cell proposes the primitives in and around itself.
 
-Differs from the paper, whose DETR decoder searches the whole latent for every query. The encoder writes a primitive
-into
-the cell under its centre, so this cell has the information about it. Here each cell therefore makes a few proposals per
-category.
+Differs from the paper, whose DETR decoder searches the whole latent for every query. The encoder writes each primitive
+into the cell under its centre, so this cell contains the information about the primitive. Here, each cell therefore
+makes a few proposals per category.
 
 The latent, the outputs and the losses are those of the paper. Matching measures distances in cells. Existence
-probabilities decide only between proposals at almost the same position. Otherwise the cell with the highest existence
-probability would be trained on primitives of all other cells.
+probabilities decide only between proposals at almost the same position. With the paper's matching weights, the cell
+with the highest existence probability would be trained on primitives of all other cells.
 """
 
 from __future__ import annotations
@@ -31,10 +30,9 @@ class CellDecoder(nn.Module):
     """Decode an object latent to features and existence logits of `proposals[k]` primitives per category k.
 
     Features are normalised to [0, 1]. There are SPARE proposals per slot, within the limits of `min_proposals_per_cell`
-    and
-    MAX_PER_CELL proposals per cell and category. The minimum exists because rare objects also occur in groups. One
-    small
-    network decodes each cell separately, because the encoder writes a primitive into one cell only.
+    and MAX_PER_CELL proposals per cell and category. The minimum number of proposals exists because rare objects also
+    occur in groups. One small network decodes each cell separately, because the encoder writes a primitive into one
+    cell only.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:

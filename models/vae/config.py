@@ -14,12 +14,11 @@ class GroundConfig:
     """Options of the ground branch: a convolutional autoencoder of rasters (models/vae/ground.py).
 
     Attributes:
-        channels: Number of channels of each block. All blocks but the last halve the resolution. Four blocks give the
-            paper's factor of 8.
+        channels: Number of channels of each block. All blocks but the last halve the resolution. With four blocks, a
+            latent cell has a side of 8 pixels, as in the paper.
         norm_groups: Number of groups of each group normalisation.
         pixel_unshuffle: Side of the pixel blocks that pixel unshuffle converts to channels before the first
-            convolution.
-            1 means none, as in the paper.
+            convolution. The value 1 means no pixel unshuffle, as in the paper.
         attention: Self-attention over all cells in the middle block of encoder and decoder, as in the paper.
     """
 
@@ -66,9 +65,9 @@ class LayoutVAEConfig:
         ground: Options of the ground branch.
         objects: Options of the object branch.
         shortcut: Add linear maps parallel to the ground networks and a small network parallel to the object encoder.
-            The
-            paper has none.
-        split_latent: Each decoder reads its own half of the latent channels, as in the paper. If False, both read all.
+            The paper has no shortcuts.
+        split_latent: Each decoder reads its own half of the latent channels, as in the paper. If False, both decoders
+            read all channels.
         branches: "both", or the only branch of an ablation model.
     """
 
@@ -93,7 +92,7 @@ def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
     """Nest the options of the branches under `ground` and `objects`.
 
     Args:
-        config: Stored config. Versions before 0.2 wrote a flat one; a nested config is accepted, too.
+        config: Stored config. Versions before 0.2 wrote flat configs; nested configs are accepted, too.
 
     Returns:
         Options of `LayoutVAE`, with one dictionary per branch.

@@ -148,8 +148,7 @@ def compute_smooth_maps(
     """Compute smooth maps from rasters: heights without gaps, and signed distances instead of masks.
 
     Within a cell, the mask of an edge is a step, which needs many linear components. The distance from an edge is a
-    plane,
-    which needs three.
+    plane, which needs three linear components.
 
     Args:
         height: Normalised heights.

@@ -138,7 +138,7 @@ def compute_object_losses(
 def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
     """Compute the KL divergence to the standard normal: sum over channels and cells, mean over the batch.
 
-    The paper does not specify the reduction over cells. They are summed, as in latent diffusion.
+    The paper does not specify the reduction over cells. Cells are summed, as in latent diffusion.
 
     Args:
         posterior: Posterior of the encoders.

@@ -6,8 +6,8 @@ primitive i, the total changes by
 
     6 [BCE(1, p_j) - BCE(0, p_j)] + 3 |t_i - t_j| + 3 |c_i - c_j|,    BCE(1, p) - BCE(0, p) = -logit(p).
 
-A rectangular assignment over the n real primitives is therefore equivalent to the paper's square problem. It is solved
-exactly.
+A rectangular assignment over the n real primitives is therefore equivalent to the paper's square problem. The solution
+is exact.
 """
 
 from __future__ import annotations

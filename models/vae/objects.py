@@ -1,8 +1,7 @@
 """Object branch of the layout VAE (paper, supplement B.2).
 
 A transformer encoder computes one feature per primitive and scatters these features onto the latent grid. A DETR
-decoder
-predicts primitives from the latent.
+decoder predicts primitives from the latent.
 
 Shapes: N slots over all categories, width d, latent grid (h, w).
 """
@@ -148,11 +147,9 @@ class ObjectEncoder(nn.Module):
     A cell is the sum of a learned value and the mean of the features of its primitives. Padded slots are masked in the
     attention and are not scattered.
 
-    With `shortcut`, a small network adds a function of each primitive alone to the mean: its position in the cell, its
-    shape
-    and its category. This network bypasses the transformer, whose normalisations reduce the numerical precision. The
-    paper
-    has no shortcut.
+    With `shortcut`, a small network also maps each primitive to a term of the mean. Its inputs are the position in the
+    cell, the shape and the category. This network bypasses the transformer, whose normalisations reduce the numerical
+    precision. The paper has no shortcut.
     """
 
     slot_category: Tensor

@@ -262,7 +262,7 @@ def test_region_grows_to_whole_cells():
     mask = make_latent_mask([region], (6, 8, 8), "objects")
     assert mask.sum() == 3 and mask[0, 3:, 1, 7].all()
     assert make_latent_mask([region], (6, 8, 8), "both").sum() == 6
-    with pytest.raises(ValueError, match="does not divide into 5 x 5 cells"):
+    with pytest.raises(ValueError, match="does not divide into 5 x 5 latent cells"):
         find_region_cells(region, 5)
     with pytest.raises(ValueError, match="contents 'cars', expected one of: both, ground, objects"):
         make_latent_mask([region], (6, 8, 8), "cars")
@@ -320,7 +320,7 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
     lvae = LayoutVAE(layout=SPEC.to_dict(), **architecture)
     channels, size, _ = lvae.latent_shape
     mixed = PrITTIPipeline(lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2))
-    with pytest.raises(ValueError, match="mixes ground and objects: objects cannot be regenerated alone"):
+    with pytest.raises(ValueError, match="mixes ground and objects, so it cannot regenerate only objects"):
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
 
 
