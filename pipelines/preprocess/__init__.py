@@ -1,1 +1,1 @@
-"""Raw drives to Parquet tables."""
+"""Convert raw drives to Parquet tables."""

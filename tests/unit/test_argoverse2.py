@@ -305,10 +305,10 @@ BROKEN_MAPS = {
         edited(map_json(), pedestrian_crossings={"1": {"edge1": points(*EDGE, (2, 2)), "edge2": []}}),
         "edge1 of None",
     ),
-    "nan": (json.dumps(map_json()).replace("1040.25", "NaN"), "without sensible x, y"),
-    "huge": (json.dumps(map_json()).replace("1040.25", "1e999"), "without sensible x, y"),
-    "text": (json.dumps(map_json()).replace("1040.25", '"east"'), "without sensible x, y"),
-    "true": (json.dumps(map_json()).replace("1040.25", "true"), "without sensible x, y"),
+    "nan": (json.dumps(map_json()).replace("1040.25", "NaN"), "without valid x, y"),
+    "huge": (json.dumps(map_json()).replace("1040.25", "1e999"), "without valid x, y"),
+    "text": (json.dumps(map_json()).replace("1040.25", '"east"'), "without valid x, y"),
+    "true": (json.dumps(map_json()).replace("1040.25", "true"), "without valid x, y"),
 }
 
 

@@ -22,7 +22,7 @@ from pipelines.preprocess.sources.drive import STATIC, Drive, Pose
 from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.tables import Shard, read_scenes
 
-DOCUMENT = ROOT / "docs/own_drives.md"
+DOCUMENT = ROOT / "docs/how_to/own_drives.md"
 ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # a position in UTM
 YAW = 0.7
 Tables = dict[str, list[dict]]
@@ -486,9 +486,9 @@ def test_custom_source_ground_classes_cover_all_drives(tmp_path):
     assert scene.ground_classes == ("road", "sidewalk", "crossing")
     assert scene.occupied.any(axis=(1, 2)).tolist() == [False, False, True]
     (tmp_path / ".cache" / "broken").mkdir()
-    with pytest.raises(ValueError, match=r"broken/polygons.parquet: missing"):
+    with pytest.raises(ValueError, match=r"broken/polygons.parquet and polygons.json are missing"):
         read_ground_classes(tmp_path / ".cache")
-    with pytest.raises(ValueError, match="no drive has a ground polygon; draw at least the road"):
+    with pytest.raises(ValueError, match="no drive has a ground polygon; add at least the road"):
         read_ground_classes(write({"polygons": []}, tmp_path / ".bare"))
 
 
@@ -504,7 +504,7 @@ def test_custom_source_splits_are_as_given(tmp_path):
 BROKEN_SPLITS = {
     "cut off": ('{"a": "tr', "broken JSON"),
     "list": ("[]", "holds a list"),
-    "stranger": ('{"a": "train", "z": "test"}', "'z' is no folder next to it"),
+    "stranger": ('{"a": "train", "z": "test"}', "folder 'z' does not exist next to this file"),
     "forgotten": ("{}", "has no entry for the folder a"),
     "side": ('{"a": "val"}', "a is 'val', expected 'train' or 'test'"),
     "number": ('{"a": 1}', "a is 1"),
@@ -522,12 +522,12 @@ def test_custom_source_names_broken_splits(tmp_path, name):
 
 
 def test_custom_source_error_states_where_drives_belong(tmp_path):
-    with pytest.raises(ValueError, match="no folder here; --input must name the folder of all drives"):
+    with pytest.raises(ValueError, match="holds no folder; --input must name the folder of all drives"):
         list_drives(tmp_path)
     write(street(), tmp_path, "my street")
     with pytest.raises(ValueError, match="rename the folder"):
         list_drives(tmp_path)
-    with pytest.raises(ValueError, match=r"no such drive; there are b"):
+    with pytest.raises(ValueError, match=r"no such drive; the drives are b"):
         read_drive(write(street(), tmp_path / "other", "b"), "a")
 
 
@@ -627,7 +627,7 @@ MISTAKES = {
     "frame -1": (
         changed("boxes", 4, frame=-1),
         "boxes",
-        "frame of row 4 is -1, expected a whole number of 0 or more; null means that a box stands still",
+        "frame of row 4 is -1, expected a whole number of 0 or more; null means that a box is static",
     ),
     "frame 1.5": (changed("boxes", 4, frame=1.5), "boxes", "frame of row 4 is 1.5"),
     "frame nan": (changed("boxes", 4, frame=NAN), "boxes", "frame of row 4 is nan"),
@@ -636,12 +636,12 @@ MISTAKES = {
     "rounded time": (
         changed("boxes", 4, frame=1.5e18),
         "boxes",
-        "frame of row 4 is 1.5e+18, a float that has lost its last digits",
+        "frame of row 4 is 1.5e+18, a float that cannot hold all digits",
     ),
     "other frames": (
         lambda tables: [changed("boxes", row, frame=1000 + row)(tables) for row in (4, 5, 6)],
         "boxes",
-        "no box's frame is a frame of the poses, e.g. 1004 (poses: 10..20)",
+        "the frame of no moving box, such as 1004, is a frame of the poses (10..20)",
     ),
     "id": (changed("boxes", 4, instance_id=-3), "boxes", "instance_id of row 4 is -3"),
     "id list": (
@@ -658,12 +658,12 @@ MISTAKES = {
     "typing error": (
         changed("boxes", 4, frames=3),
         "boxes",
-        "column 'frames' means nothing here (meant frame?); drop it, or rename it to one of category, ",
+        "column 'frames' is unknown (meant frame?); drop it, or rename it to one of category, ",
     ),
     "boxes of elsewhere": (
         lambda tables: [changed("boxes", row, x_m=row, y_m=0.0)(tables) for row in range(7)],
         "boxes",
-        "all of it lies more than 100 m from every pose",
+        "lies more than 100 m from every pose",
     ),
     "class": (
         changed("polygons", 0, **{"class": "grass"}),
@@ -686,13 +686,13 @@ MISTAKES = {
         "polygons",
         "point 1 of the outline of row 1 is [45",
     ),
-    "no points": (with_outline(), "polygons", "outline of row 1 has 0 different points"),
+    "no points": (with_outline(), "polygons", "outline of row 1 has 0 distinct points"),
     "two points": (
         with_outline(corner(0, 0), corner(9, 0), corner(0, 0)),
         "polygons",
-        "outline of row 1 has 2 different points, expected 3 or more",
+        "outline of row 1 has 2 distinct points, expected at least 3",
     ),
-    "one point": (with_outline(*[corner(0, 0)] * 4), "polygons", "outline of row 1 has 0 different points"),
+    "one point": (with_outline(*[corner(0, 0)] * 4), "polygons", "outline of row 1 has 0 distinct points"),
     "nan point": (
         with_outline(corner(0, 0), corner(9, 0), [NAN, 0, 0]),
         "polygons",
@@ -726,17 +726,17 @@ MISTAKES = {
     "cliff": (
         with_outline(corner(0, 0), corner(9, 0), corner(9, 0, 4), corner(9, 9)),
         "polygons",
-        "point 1 of the outline of row 1 has the next one right above or below it",
+        "point 1 of the outline of row 1 lies directly above or below the next point",
     ),
     "open cliff": (
         with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(0, 0, 4)),
         "polygons",
-        "point 3 of the outline of row 1 has the next one",
+        "point 3 of the outline of row 1 lies directly above or below",
     ),
     "ground at 0": (
         lambda tables: [point.__setitem__(2, 0.0) for row in tables["polygons"] for point in row["outline"]],
         "polygons",
-        "all of it lies more than 100 m from every pose: x, y, z of",
+        "lies more than 100 m from every pose; the first pose is",
     ),
     "no pose": (lambda tables: tables["poses"].clear(), "poses", "holds no pose"),
     "no frame": (everywhere("poses", frame=...), "poses", "column frame is missing"),
@@ -748,7 +748,7 @@ MISTAKES = {
     "frame twice": (
         changed("poses", 1, frame=10),
         "poses",
-        "frame of row 1 is 10 after 10; sort the poses by frame, each frame once",
+        "frame of row 1 is 10 after 10; sort the poses by frame without repeated frames",
     ),
     "unsorted": (changed("poses", 1, frame=3), "poses", "frame of row 1 is 3 after 10"),
     "no place": (everywhere("poses", z_m=...), "poses", "column z_m is missing"),
@@ -757,7 +757,7 @@ MISTAKES = {
     "matrix and place": (
         changed("poses", 1, world_from_ego=LEVEL),
         "poses",
-        "has world_from_ego and x_m; give the pose in one way only",
+        "has world_from_ego and x_m; keep only one form of the pose",
     ),
 }
 
@@ -777,7 +777,7 @@ BROKEN_MATRICES = {
     "z down": (np.hstack([np.diag([1, -1, -1]), ORIGIN[:, None]]).ravel().tolist(), "the z axis of row 0 points down"),
     "camera": (
         [0, 0, 1, 5, -1, 0, 0, 6, 0, -1, 0, 115],
-        "the z axis of row 0 points sideways; give the pose of a vehicle",
+        "the z axis of row 0 points sideways; write the pose of a vehicle",
     ),
 }
 
@@ -812,7 +812,7 @@ BROKEN_FILES = {
     "deep": ("boxes.json", b"[" * 100_000, "broken JSON"),
     "latin": ("boxes.json", b'[{"label": "\xe4"}]', "broken JSON"),
     "digits": ("boxes.json", b'[{"x_m": ' + b"9" * 5000 + b"}]", "broken JSON"),
-    "lines": ("boxes.json", b'[{"a\\nb": 1}]', "column 'a\\nb' means nothing here"),
+    "lines": ("boxes.json", b'[{"a\\nb": 1}]', "column 'a\\nb' is unknown"),
     "no parquet": ("boxes.parquet", b"category,x_m\npole,1\n", "broken Parquet file"),
 }
 
@@ -830,17 +830,17 @@ def test_custom_source_names_broken_file(tmp_path, name):
 def test_custom_source_names_missing_and_surplus_table(tmp_path, table):
     folder = write(street(), tmp_path) / "street"
     write({table: street()[table]}, tmp_path, parquet=True)
-    assert_refused(tmp_path, f"{table}.parquet", f"{table}.json lies next to it; keep one of the two")
+    assert_refused(tmp_path, f"{table}.parquet", f"{table}.json both exist; keep one of the two")
     (folder / f"{table}.json").unlink()
     (folder / f"{table}.parquet").unlink()
-    assert_refused(tmp_path, f"{table}.parquet", f"missing, and so is {table}.json")
+    assert_refused(tmp_path, f"{table}.parquet", f"{table}.json are missing")
 
 
 BROKEN_COLUMNS = {
     "strings": ({"x_m": ["far"] * 7}, "x_m of row 0 is 'far', expected a number"),
     "time": ({"frame": pa.array([1] * 7, pa.timestamp("ns"))}, "frame of row 0 is Timestamp("),
     "decimals": ({"z_m": pa.array([1] * 7, pa.decimal128(5, 2))}, "z_m of row 0 is Decimal("),
-    "score": ({"score": [0.5] * 7}, "column 'score' means nothing here; drop it"),
+    "score": ({"score": [0.5] * 7}, "column 'score' is unknown; drop it"),
     "flag as number": ({"heading_known": [1] * 7}, "heading_known of row 0 is 1"),
     "infinite": ({"width_m": [1.0] * 6 + [INF]}, "width_m of row 6 is inf"),
 }
@@ -862,7 +862,7 @@ def test_custom_source_rejects_duplicate_column(tmp_path):
     path = write(street(), tmp_path, parquet=True) / "street" / "boxes.parquet"
     table = pq.read_table(path)
     pq.write_table(table.append_column("x_m", table["y_m"]), path)
-    assert_refused(tmp_path, "boxes.parquet", "column 'x_m' is there twice")
+    assert_refused(tmp_path, "boxes.parquet", "column 'x_m' occurs twice")
 
 
 def test_custom_source_reads_any_number_width_and_dictionaries(tmp_path):

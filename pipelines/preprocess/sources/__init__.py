@@ -1,1 +1,1 @@
-"""Readers of raw drives, one module or package per dataset."""
+"""Readers of raw drives, with one module or package per dataset."""

@@ -1,11 +1,12 @@
-"""Argoverse 2's sensor dataset -> Drive: one pose, so one Scene, per annotated sweep (10 Hz) of a log.
+"""Read Argoverse 2's sensor dataset as a Drive: one pose, and therefore one Scene, per annotated sweep (10 Hz) of a
+log.
 
     ROOT/{train,val}/LOG/annotations.feather              boxes in the ego frame of their sweep
     ROOT/{train,val}/LOG/city_SE3_egovehicle.feather      city from ego, 200 Hz
     ROOT/{train,val}/LOG/map/                             polygons (city frame) and a raster of ground heights
 
-The ego frame is x forward, y left, z up, its origin on the rear axle. The world is the city frame.
-A log that is broken anywhere is a ValueError that names file, value and fix.
+The ego frame is x forward, y left, z up, with its origin on the rear axle. The world frame is the city frame. An
+invalid log raises ValueError, which names file, value and remedy.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SOURCE = "av2"
 SPLITS = ("train", "val")
 GROUND_CLASSES = ("road", "crossing")
 
-# The paper leaves open: it names the seven groups only, not which of the 30 categories falls where.
+# The paper names only the seven groups; it does not assign the 30 categories to them.
 CATEGORY_LABELS = {
     "vehicle_big": (
         "BUS",
@@ -53,12 +54,12 @@ CATEGORY_LABELS = {
     "object": ("CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STROLLER", "WHEELCHAIR", "ANIMAL", "DOG"),
 }
 CATEGORY_OF = {label: CATEGORY_INDEX[name] for name, labels in CATEGORY_LABELS.items() for label in labels}
-EGO_LABEL = "EGO_VEHICLE"  # some logs annotate the recording car itself
+EGO_LABEL = "EGO_VEHICLE"  # Some logs annotate the recording car.
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
-MAX_BOX_DISTANCE_M = 1e3  # real boxes reach 220 m
+MAX_BOX_DISTANCE_M = 1e3  # Real boxes lie up to 220 m away.
 MAX_BOX_SIZE_M = 1e2
 MIN_BOX_SIZE_M = 1e-3
 MAX_COORDINATE_M = 1e6
@@ -66,9 +67,16 @@ MAX_HEIGHT_M = 1e4
 
 
 def list_logs(root: str | Path) -> list[tuple[str, str]]:
-    """(split, log id) of every annotated log under ROOT: train, then val. The test split has no annotations.
+    """Return the annotated logs: train, then val. The test split has no annotations.
 
-    Raises ValueError if there is none.
+    Args:
+        root: Directory of the sensor dataset.
+
+    Returns:
+        (split, log id) of each log.
+
+    Raises:
+        ValueError: The directory holds no annotated log.
     """
     found = [
         (split, folder.name)
@@ -78,24 +86,34 @@ def list_logs(root: str | Path) -> list[tuple[str, str]]:
     ]
     if not found:
         raise ValueError(
-            f"{root}: no train/LOG or val/LOG folder here (the test split has no annotations); --input must"
+            f"{root} holds no train/LOG or val/LOG folder (the test split has no annotations); --input must"
             " name the folder that holds Argoverse 2's sensor logs by split"
         )
     return found
 
 
 def read_drive(root: str | Path, split: str, log: str) -> Drive:
-    """The annotated sweeps of one log, city frame, float64.
+    """Read the annotated sweeps of one log.
 
-    `frame` and `timestamp` are a sweep's time in ns, `instance_id` a hash of the track's uuid, equal on every
-    machine, `heading_rad` the yaw of the box's x axis.
-    Raises ValueError, naming the file, for anything missing, of the wrong type, or no finite sensible value.
+    `frame` and `timestamp` are the time of a sweep (ns). `instance_id` is a hash of the track's uuid, which is equal on
+    all machines. `heading_rad` is the yaw of the box's x axis.
+
+    Args:
+        root: Directory of the sensor dataset.
+        split: train or val.
+        log: Id of the log.
+
+    Returns:
+        The drive in the city frame (float64).
+
+    Raises:
+        ValueError: A file or value is missing or invalid; the message names the file.
     """
     if split == "test":
         raise ValueError(f"{Path(root, split, log)}: Argoverse 2's test split has no annotations; use train or val")
     folder = Path(root, split, log)
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such log; check --input and that the log is unpacked")
+        raise ValueError(f"{folder}: no such log; check --input and unpack the log")
     boxes = _read_annotations(folder / "annotations.feather")
     frame, box_sweep = np.unique(boxes["timestamp_ns"], return_inverse=True)
     city_from_ego = _read_poses(folder / "city_SE3_egovehicle.feather", frame)
@@ -127,11 +145,11 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
 
 
 def _read_annotations(path: Path) -> dict[str, np.ndarray]:
-    """The columns this reader needs, (n,) each, checked."""
+    """Return the required columns of the annotations, (n,) each, after all checks."""
     numbers = (*SIZE, *QUATERNION, *TRANSLATION)
     columns = _read_feather(path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers)
     if len(columns["category"]) == 0:
-        raise ValueError(f"{path}: holds no box; download the log again")
+        raise ValueError(f"{path} holds no box; download the log again")
     unknown = sorted(set(columns["category"]) - set(CATEGORY_OF) - {EGO_LABEL})
     if unknown:
         raise ValueError(f"{path}: unknown category {unknown[0][:40]!r}; add it to CATEGORY_LABELS of {__name__}")
@@ -144,7 +162,7 @@ def _read_annotations(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
-    """city_from_ego (p, 3, 4) at the sorted timestamps frame (p,); metres."""
+    """Return city_from_ego (p, 3, 4) at the sorted timestamps frame (p,), in metres."""
     columns = _read_feather(path, integers=("timestamp_ns",), texts=(), numbers=(*QUATERNION, *TRANSLATION))
     for name in TRANSLATION:
         _check_range(path, name, columns[name], -MAX_COORDINATE_M, MAX_COORDINATE_M)
@@ -161,7 +179,7 @@ def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
 def _read_feather(
     path: Path, integers: tuple[str, ...], texts: tuple[str, ...], numbers: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """Columns of a feather file: int64, str objects, float64. No nulls, every number finite."""
+    """Return columns of a feather file as int64, str objects or float64, without nulls and with finite numbers."""
     _check_file(path)
     try:
         table = pyarrow.feather.read_table(path, memory_map=False)
@@ -178,7 +196,7 @@ def _read_feather(
     for names, is_kind, kind in kinds:
         for name in names:
             if table.schema.get_field_index(name) < 0:
-                raise ValueError(f"{path}: column {name} is missing (or there twice); download the log again")
+                raise ValueError(f"{path}: column {name} is missing or occurs twice; download the log again")
             column = table[name]
             if not is_kind(column.type):
                 raise ValueError(f"{path}: column {name} is {column.type}, expected {kind}; download the log again")
@@ -226,12 +244,12 @@ def _read_columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.
 
 
 def _make_rotation(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of (n, 4) quaternions, scalar first."""
+    """(n, 3, 3) rotations of quaternions (n, 4), scalar first."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
 
 
 def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
-    """(n,) int64 >= 0 of the uuids (n,): the first 63 bits of their BLAKE2 hash."""
+    """(n,) int64 >= 0: the first 63 bits of the BLAKE2 hash of each uuid (n,)."""
     hashes = {
         uuid: int.from_bytes(hashlib.blake2b(uuid.encode(), digest_size=8).digest(), "big") >> 1
         for uuid in set(track_uuid)
@@ -243,7 +261,7 @@ def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
 
 
 def _read_ground(folder: Path) -> MapGround:
-    """Drivable areas as road, pedestrian crossings as crossing, over the log's height raster."""
+    """Return drivable areas as road and pedestrian crossings as crossing, with heights from the log's raster."""
     path = _find_only_file(folder, "log_map_archive_*.json")
     content = _read_json(path)
     areas, crossings = (_read_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
@@ -276,7 +294,7 @@ def _read_json(path: Path) -> dict:
 
 
 def _read_section(path: Path, content: dict, name: str) -> list[dict]:
-    """The entries of one section of the map file."""
+    """Return the entries of one section of the map file."""
     section = content.get(name)
     if not isinstance(section, dict) or not all(isinstance(entry, dict) for entry in section.values()):
         raise ValueError(f"{path}: {name} is missing or no object of objects; download the log again")
@@ -284,7 +302,7 @@ def _read_section(path: Path, content: dict, name: str) -> list[dict]:
 
 
 def _read_points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
-    """(n, 2) x and y of the points entry[name], metres, city frame."""
+    """(n, 2) x and y of the points entry[name] in the city frame, in metres."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
         raise ValueError(
@@ -293,56 +311,58 @@ def _read_points(path: Path, entry: dict, name: str, least: int, most: int | Non
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
     if not _are_all_numbers(values, MAX_COORDINATE_M):
         raise ValueError(
-            f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without sensible x, y; fix or drop it"
+            f"{path}: {name} of {ascii(entry.get('id'))[:40]} has a point without valid x, y; fix or drop it"
         )
     return np.array(values, np.float64).reshape(-1, 2)
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:
-    """Whether these JSON values are numbers in [-largest, largest]; NaN and true are not."""
+    """Return whether all JSON values are numbers in [-largest, largest]; NaN and true are not."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
 def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
-    """(4, 2) outline between two edges (2, 2); they may run the same way or against each other."""
+    """(4, 2) outline between two edges (2, 2), whose directions may be equal or opposite."""
     if (edge1_m[1] - edge1_m[0]) @ (edge2_m[1] - edge2_m[0]) < 0:
         edge2_m = edge2_m[::-1]
     return np.concatenate([edge1_m, edge2_m[::-1]])
 
 
 def _read_heights(path: Path) -> np.ndarray:
-    """(rows, cols) float heights in metres, city frame, NaN where unknown."""
+    """(rows, cols) heights in the city frame, in metres, NaN where unknown."""
     _check_file(path)
     try:
-        # Mapped, so that a header that promises too much asks for no memory.
+        # Memory mapping avoids a large allocation if the header states a wrong shape.
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy evaluates the header as Python, and a broken one fails in as many ways
+    except Exception as error:  # numpy evaluates the header as Python, so a broken header can raise any error.
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise ValueError(f"{path}: broken npy file ({reason}); download the log again") from error
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
         kind = f"{mapped.dtype} {mapped.shape}" if isinstance(mapped, np.ndarray) else type(mapped).__name__
-        raise ValueError(f"{path}: is {kind}, expected a 2D float array; download the log again")
-    with np.errstate(over="ignore"):  # infinite, so refused below
+        raise ValueError(f"{path} holds {kind}, expected a 2D float array; download the log again")
+    with np.errstate(over="ignore"):  # Overflow gives infinity, which the check below rejects.
         height_m = np.array(mapped, np.float32)
     known = height_m[~np.isnan(height_m)]
     if len(known) == 0 or np.abs(known).max() > MAX_HEIGHT_M:
-        raise ValueError(f"{path}: {len(known)} heights, not all sensible; download the log again")
+        raise ValueError(
+            f"{path} holds {len(known)} known heights, expected one or more within ±10 km; download the log again"
+        )
     return height_m
 
 
 def _read_sim2(path: Path) -> np.ndarray:
-    """raster_from_city (3, 3): (column, row, 1) of a city point (x, y, 1), from p = s (R p_city + t)."""
+    """(3, 3) raster_from_city: (column, row, 1) of a city point (x, y, 1), from p = s (R p_city + t)."""
     content = _read_json(path)
     rotation, translation, scale = content.get("R"), content.get("t"), content.get("s")
     if not (
         isinstance(rotation, list) and len(rotation) == 4 and isinstance(translation, list) and len(translation) == 2
     ):
-        raise ValueError(f"{path}: R or t is missing or not of 4 and 2 numbers; download the log again")
+        raise ValueError(f"{path}: R must have 4 numbers and t must have 2; download the log again")
     if scale is None or not _are_all_numbers([*rotation, *translation, scale], MAX_COORDINATE_M) or scale <= 0:
-        raise ValueError(f"{path}: R, t or s is no sensible number; download the log again")
+        raise ValueError(f"{path}: R, t or s is no valid number; download the log again")
     matrix = np.array(rotation, np.float64).reshape(2, 2)
     if np.abs(matrix @ matrix.T - np.eye(2)).max() > 1e-3:
-        raise ValueError(f"{path}: R is {rotation}, no rotation; download the log again")
+        raise ValueError(f"{path}: R is {rotation} and no rotation; download the log again")
     raster_from_city = np.eye(3)
     raster_from_city[:2, :2] = scale * matrix
     raster_from_city[:2, 2] = scale * np.array(translation)
@@ -351,4 +371,4 @@ def _read_sim2(path: Path) -> np.ndarray:
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
-        raise ValueError(f"{path}: missing; download the log again")
+        raise ValueError(f"{path} is missing; download the log again")

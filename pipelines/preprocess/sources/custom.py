@@ -1,13 +1,13 @@
-"""One's own drives -> Drive: boxes, ground polygons and poses as plain Parquet or JSON (docs/own_drives.md).
+"""Read a user's own drives as a Drive: boxes, ground polygons and poses in Parquet or JSON (docs/how_to/own_drives.md).
 
-    ROOT/DRIVE/boxes.parquet       or boxes.json: a row per box
-    ROOT/DRIVE/polygons.parquet    or polygons.json: a row per ground polygon
-    ROOT/DRIVE/poses.parquet       or poses.json: a row per pose, so per scene
+    ROOT/DRIVE/boxes.parquet       or boxes.json: one row per box
+    ROOT/DRIVE/polygons.parquet    or polygons.json: one row per ground polygon
+    ROOT/DRIVE/poses.parquet       or poses.json: one row per pose, and therefore per scene
     ROOT/splits.json               optional: {"DRIVE": "train" or "test"}
 
-One world frame per drive, right-handed, z up; ego frame x forward, y left, z up; metres and radians.
-JSON is a list of objects with the Parquet's column names as keys; a key left out is a null. Rows count from 0.
-Anything that makes no sense is a ValueError that names file, row, value and fix.
+Each drive has one right-handed world frame with z up. The ego frame is x forward, y left, z up. Units are metres and
+radians. A JSON file is a list of objects with the Parquet column names as keys; a missing key means null. Row numbers
+start at 0. Invalid input raises ValueError, which names file, row, value and remedy.
 """
 
 from __future__ import annotations
@@ -48,72 +48,98 @@ BOX_COLUMNS = (
 )
 POLYGON_COLUMNS = ("class", "outline")
 POSE_COLUMNS = ("frame", *PLACE, "yaw_rad", *QUATERNION, "world_from_ego")
-PANDAS_INDEX = "__index_level_0__"  # pandas writes it behind one's back
+PANDAS_INDEX = "__index_level_0__"  # pandas adds this column automatically.
 
-# Whose x axis is taken for the direction of travel, unless heading_known says otherwise.
+# Categories whose x axis is the direction of travel, unless heading_known is set.
 HEADED = tuple(CATEGORY_INDEX[name] for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human"))
 
-MAX_COORDINATE_M = 1e7  # UTM northings reach it
+MAX_COORDINATE_M = 1e7  # UTM northings reach this value.
 MAX_HEIGHT_M = 1e4
 MIN_SIZE_M = 1e-3
 MAX_SIZE_M = 1e3
-MAX_YAW_RAD = 6.2832  # one turn either way; more is degrees
+MAX_YAW_RAD = 6.2832  # One full turn in each direction; larger values are probably degrees.
 MAX_WHOLE = 2**63 - 1
 MAX_EXACT_FLOAT = 2**53
-MIN_UP = 0.5  # cosine between the ego's up and the world's: no road is steeper, no camera frame as upright
-SIGHT_M = 100.0  # a crop reaches 72 m
+# Minimum cosine between the up axes of ego and world. Roads are less steep, and camera frames are less upright.
+MIN_UP = 0.5
+SIGHT_M = 100.0  # A crop extends to 72 m.
 
 
 # ----------------------------------------------------------------------------------------------------- the root
 
 
 def list_drives(root: str | Path) -> list[str]:
-    """The drives under ROOT, sorted: every folder whose name does not begin with a dot.
+    """Return the drives: all folders whose name does not begin with a dot.
 
-    Raises ValueError if there is none, or one whose name could not go into a scene's id.
+    Args:
+        root: Directory of all drives.
+
+    Returns:
+        Names of the drives in alphabetical order.
+
+    Raises:
+        ValueError: The directory holds no drive, or a name contains characters that a scene id cannot contain.
     """
     names = sorted(path.name for path in Path(root).glob("*/") if not path.name.startswith("."))
     if not names:
         raise ValueError(
-            f"{root}: no folder here; --input must name the folder of all drives, with DRIVE/boxes.parquet,"
-            " DRIVE/polygons.parquet and DRIVE/poses.parquet (or .json) in it"
+            f"{root} holds no folder; --input must name the folder of all drives, which holds DRIVE/boxes.parquet,"
+            " DRIVE/polygons.parquet and DRIVE/poses.parquet (or .json)"
         )
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9._-]+", name):
             raise ValueError(
-                f"{Path(root, name)}: a drive's name goes into file names; rename the folder to letters, digits,"
-                " '.', '_' and '-'"
+                f"{Path(root, name)}: the name of a drive is part of file names; rename the folder with letters,"
+                " digits, '.', '_' and '-'"
             )
     return names
 
 
 def read_splits(root: str | Path) -> dict[str, str] | None:
-    """Drive -> train or test for every drive, as ROOT/splits.json says; None if there is no such file.
+    """Read the split of every drive from ROOT/splits.json.
 
-    Raises ValueError for a broken file, a drive it forgets or does not have, and any other side.
+    Args:
+        root: Directory of all drives.
+
+    Returns:
+        Map from drive to train or test; None if the file is absent.
+
+    Raises:
+        ValueError: The file is invalid, lacks a drive, names an unknown drive, or names another split.
     """
     path = Path(root, "splits.json")
     if not path.exists():
         return None
     sides = _load_json(path)
     if not isinstance(sides, dict):
-        raise ValueError(f'{path}: holds a {type(sides).__name__}, expected {{"drive": "train" or "test"}}')
+        raise ValueError(f'{path} holds a {type(sides).__name__}, expected {{"drive": "train" or "test"}}')
     names = list_drives(root)
     for name, side in sides.items():
         if name not in names:
-            raise ValueError(f"{path}: {_show(name)} is no folder next to it; remove the entry or add the drive")
+            raise ValueError(
+                f"{path}: the folder {_show(name)} does not exist next to this file; remove the entry or add the drive"
+            )
         if side not in (TRAIN, TEST):
             raise ValueError(f"{path}: {name} is {_show(side)}, expected {TRAIN!r} or {TEST!r}")
     for name in names:
         if name not in sides:
-            raise ValueError(f"{path}: has no entry for the folder {name}; add one or take the folder away")
+            raise ValueError(f"{path} has no entry for the folder {name}; add an entry or remove the folder")
     return sides
 
 
 def read_ground_classes(root: str | Path) -> tuple[str, ...]:
-    """The ground classes that any drive under ROOT has, in the order of GROUND_CLASSES.
+    """Return the ground classes of all drives.
 
-    A polygons file that cannot be read is left for `read_drive` to report. Raises ValueError if no drive has ground.
+    The function ignores an unreadable polygons file, for which `read_drive` raises an error.
+
+    Args:
+        root: Directory of all drives.
+
+    Returns:
+        Ground classes that at least one drive has, in the order of GROUND_CLASSES.
+
+    Raises:
+        ValueError: No drive has ground.
     """
     found, errors = set(), []
     for name in list_drives(root):
@@ -122,21 +148,31 @@ def read_ground_classes(root: str | Path) -> tuple[str, ...]:
         except ValueError as error:
             errors.append(error)
     if not found:
-        raise errors[0] if errors else ValueError(f"{root}: no drive has a ground polygon; draw at least the road")
+        raise errors[0] if errors else ValueError(f"{root}: no drive has a ground polygon; add at least the road")
     return tuple(name for name in GROUND_CLASSES if name in found)
 
 
 def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = None) -> Drive:
-    """All boxes, the ground and the poses of one drive, world frame, float64.
+    """Read all boxes, the ground and the poses of one drive.
 
-    `classes` are the ground classes of the whole dataset (`ground_classes`), None those of this drive alone.
-    `timestamp` is the frame of a moving box, else STATIC; `instance_id` the given number, of a text a hash that is
-    equal on every machine, -1 where there is none; `heading_rad` the yaw of the x axis where that is known.
-    Raises ValueError naming file and row of a missing or invalid value.
+    `timestamp` is the frame of a moving box, or STATIC. `instance_id` is the given number, or a hash of a given text,
+    which is equal on all machines; -1 means none. `heading_rad` is the yaw of the x axis if x is the direction of
+    travel.
+
+    Args:
+        root: Directory of all drives.
+        name: Name of the drive.
+        classes: Ground classes of the whole dataset (default: only those of this drive).
+
+    Returns:
+        The drive in its world frame (float64).
+
+    Raises:
+        ValueError: A value is missing or invalid; the message names file and row.
     """
     folder = Path(root, name)
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such drive; there are {', '.join(list_drives(root))[:200]}")
+        raise ValueError(f"{folder}: no such drive; the drives are {', '.join(list_drives(root))[:200]}")
     frame, world_from_ego = read_poses(root, name)
     boxes, polygons = _read_boxes(folder), _read_polygons(folder)
     classes = classes or tuple(c for c in GROUND_CLASSES if c in polygons.texts("class"))
@@ -155,8 +191,8 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
     moving = drive.timestamp[drive.timestamp != STATIC]
     if len(moving) and not np.isin(moving, frame).any():
         raise ValueError(
-            f"{boxes.path}: no box's frame is a frame of the poses, e.g. {moving[0]} (poses: {frame[0]}.."
-            f"{frame[-1]}); count frames in one way, or write null for what stands still"
+            f"{boxes.path}: the frame of no moving box, such as {moving[0]}, is a frame of the poses ({frame[0]}.."
+            f"{frame[-1]}); use the same frame numbers, or write null for static boxes"
         )
     return drive
 
@@ -166,11 +202,11 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
 
 @dataclass(frozen=True)
 class _Table:
-    """A file as columns of Python values; what it hands out is checked value by value."""
+    """A file as columns of Python values; its methods check every value."""
 
     path: Path
     rows: int
-    columns: dict[str, list]  # those with a value anywhere
+    columns: dict[str, list]  # Columns with at least one value
 
     def numbers(self, names: Sequence[str], low: float, high: float, unit: str = "") -> np.ndarray:
         """(rows, len(names)) float64 within low..high."""
@@ -184,25 +220,25 @@ class _Table:
         return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
 
     def frames(self, missing: int | None = None) -> np.ndarray:
-        """(rows,) int64 >= 0; `missing` where there is none, unless that is None."""
+        """(rows,) int64 >= 0; an absent frame becomes `missing`, or raises an error if `missing` is None."""
         values = self._optional("frame")
         for row, value in enumerate(values):
             if value is None and missing is not None:
                 continue
             if not _is_whole(value):
-                static = "" if missing is None else "; null means that a box stands still"
+                static = "" if missing is None else "; null means that a box is static"
                 raise ValueError(
                     f"{self.path}: frame of row {row} is {_show(value)}, expected a whole number of 0 or more{static}"
                 )
             if type(value) is float and value >= MAX_EXACT_FLOAT:
                 raise ValueError(
-                    f"{self.path}: frame of row {row} is {value!r}, a float that has lost its last digits; write"
+                    f"{self.path}: frame of row {row} is {value!r}, a float that cannot hold all digits; write"
                     " whole numbers (in pandas: astype('Int64'))"
                 )
         return np.array([missing if value is None else int(value) for value in values], np.int64)
 
     def texts(self, name: str, allowed: Sequence[str] = (), optional: bool = False) -> list:
-        """(rows) str, each one of `allowed` if that is given; None where `optional` and absent."""
+        """(rows) str, each one of `allowed` if given; None for absent values if `optional`."""
         values = self._optional(name)
         for row, value in enumerate(values):
             if value is None and optional:
@@ -225,7 +261,7 @@ class _Table:
         return values
 
     def rotations(self) -> np.ndarray:
-        """(rows, 3, 3) from yaw_rad or a quaternion, whichever there is."""
+        """(rows, 3, 3) rotations from yaw_rad or from a quaternion, depending on which columns the file has."""
         given = [form for form in (("yaw_rad",), QUATERNION) if any(name in self.columns for name in form)]
         if self.rows and len(given) != 1:
             raise ValueError(
@@ -248,36 +284,36 @@ class _Table:
         return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
 
     def places(self) -> np.ndarray:
-        """(rows, 3) world points."""
+        """(rows, 3) points in the world frame."""
         xy_m = self.numbers(PLACE[:2], -MAX_COORDINATE_M, MAX_COORDINATE_M, " m")
         return np.hstack([xy_m, self.numbers(PLACE[2:], -MAX_HEIGHT_M, MAX_HEIGHT_M, " m (z up)")])
 
     def require(self, names: Sequence[str]) -> None:
         for name in names:
             if name not in self.columns and self.rows:
-                raise ValueError(f"{self.path}: column {name} is missing or all null; see docs/own_drives.md")
+                raise ValueError(f"{self.path}: column {name} is missing or all null; see docs/how_to/own_drives.md")
 
     def _optional(self, name: str) -> list:
         return self.columns.get(name, [None] * self.rows)
 
 
 def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequence[str]) -> _Table:
-    """FOLDER/NAME.parquet or .json with its columns by name, none of them unknown."""
+    """Read FOLDER/NAME.parquet or .json as columns by name, and check that all names are known."""
     paths = [folder / f"{name}.parquet", folder / f"{name}.json"]
     found = [path for path in paths if path.is_file()]
     if not found:
-        empty = "; if there are none, write [] into the .json" if name != "poses" else ""
-        raise ValueError(f"{paths[0]}: missing, and so is {paths[1].name}; see docs/own_drives.md{empty}")
+        empty = "; if the drive has none, write [] into the .json" if name != "poses" else ""
+        raise ValueError(f"{paths[0]} and {paths[1].name} are missing; see docs/how_to/own_drives.md{empty}")
     if len(found) > 1:
-        raise ValueError(f"{paths[0]}: {paths[1].name} lies next to it; keep one of the two")
+        raise ValueError(f"{paths[0]} and {paths[1].name} both exist; keep one of the two")
     path = found[0]
     rows, columns = _load_parquet(path) if path.suffix == ".parquet" else _load_records(path)
     for column in columns:
         if column not in known and column != PANDAS_INDEX:
             meant = difflib.get_close_matches(str(column), known, 1)
             raise ValueError(
-                f"{path}: column {_show(column)} means nothing here{f' (meant {meant[0]}?)' if meant else ''}; drop"
-                f" it, or rename it to one of {', '.join(known)}"
+                f"{path}: column {_show(column)} is unknown{f' (meant {meant[0]}?)' if meant else ''}; drop it,"
+                f" or rename it to one of {', '.join(known)}"
             )
     filled = {name: values for name, values in columns.items() if any(value is not None for value in values)}
     table = _Table(path, rows, filled if rows else {name: [] for name in known})
@@ -296,14 +332,14 @@ def _load_parquet(path: Path) -> tuple[int, dict[str, list]]:
         raise ValueError(f"{path}: broken Parquet file ({reason}); write it again") from error
     twice = [name for name in table.column_names if table.column_names.count(name) > 1]
     if twice:
-        raise ValueError(f"{path}: column {_show(twice[0])} is there twice; drop one of them")
+        raise ValueError(f"{path}: column {_show(twice[0])} occurs twice; drop one of them")
     return len(table), dict(zip(table.column_names, columns, strict=True))
 
 
 def _load_records(path: Path) -> tuple[int, dict[str, list]]:
     records = _load_json(path)
     if not isinstance(records, list):
-        raise ValueError(f"{path}: holds a {type(records).__name__}, expected a list of objects, one per row")
+        raise ValueError(f"{path} holds a {type(records).__name__}, expected a list of objects, one per row")
     for row, record in enumerate(records):
         if not isinstance(record, dict):
             raise ValueError(f"{path}: row {row} is {_show(record)}, expected an object of columns")
@@ -319,10 +355,10 @@ def _load_json(path: Path) -> object:
 
 
 def _show(value: object) -> str:
-    """The value as an error names it."""
+    """Return a value as text for an error message, at most 40 characters."""
     if value is None:
         return "null"
-    # Python refuses to write out an integer of thousands of digits.
+    # Python raises an error when it formats an integer of thousands of digits.
     shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of over 40 digits"
     return shown if len(shown) <= 40 else f"{shown[:37]}..."
 
@@ -331,20 +367,28 @@ def _show(value: object) -> str:
 
 
 def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """frame (p,) int64, ascending, and world_from_ego (p, 3, 4) float64, x forward, y left, z up, of one drive.
+    """Read the poses of one drive.
 
-    Raises ValueError, naming file and row, for anything else than poses of an upright vehicle in driving order.
+    Args:
+        root: Directory of all drives.
+        name: Name of the drive.
+
+    Returns:
+        frame (p,) int64, ascending, and world_from_ego (p, 3, 4) float64 (m), with x forward, y left and z up.
+
+    Raises:
+        ValueError: The poses are not those of an upright vehicle in driving order; the message names file and row.
     """
     table = _read_table(Path(root, name), "poses", POSE_COLUMNS, ("frame",))
     if not table.rows:
-        raise ValueError(f"{table.path}: holds no pose; every pose becomes a scene, give at least one")
+        raise ValueError(f"{table.path} holds no pose; every pose becomes a scene, so add at least one")
     frame = table.frames()
     late = np.flatnonzero(np.diff(frame) <= 0)
     if len(late):
         row = late[0] + 1
         raise ValueError(
-            f"{table.path}: frame of row {row} is {frame[row]} after {frame[row - 1]}; sort the poses by frame,"
-            " each frame once"
+            f"{table.path}: frame of row {row} is {frame[row]} after {frame[row - 1]}; sort the poses by frame"
+            " without repeated frames"
         )
     if "world_from_ego" in table.columns:
         world_from_ego = _read_matrices(table)
@@ -355,8 +399,7 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     if len(fallen):
         raise ValueError(
             f"{table.path}: the z axis of row {fallen[0]} points {_read_direction(world_from_ego[fallen[0], 2, 2])};"
-            " give the pose of a vehicle frame with x forward, y left, z up (a camera's or a z-down IMU's has other"
-            " axes)"
+            " write the pose of a vehicle frame with x forward, y left, z up (cameras and z-down IMUs have other axes)"
         )
     return frame, world_from_ego
 
@@ -366,10 +409,10 @@ def _read_direction(up: float) -> str:
 
 
 def _read_matrices(table: _Table) -> np.ndarray:
-    """(rows, 3, 4) of the column world_from_ego: 12 numbers, row-major."""
+    """Return the column world_from_ego (rows, 3, 4), which stores 12 numbers row by row."""
     others = [name for name in (*PLACE, "yaw_rad", *QUATERNION) if name in table.columns]
     if others:
-        raise ValueError(f"{table.path}: has world_from_ego and {others[0]}; give the pose in one way only")
+        raise ValueError(f"{table.path} has world_from_ego and {others[0]}; keep only one form of the pose")
     for row, matrix in enumerate(table.columns["world_from_ego"]):
         if type(matrix) is not list or len(matrix) != 12 or not _are_all_numbers(matrix, MAX_COORDINATE_M):
             raise ValueError(
@@ -383,7 +426,7 @@ def _read_matrices(table: _Table) -> np.ndarray:
     if len(bad):
         raise ValueError(
             f"{table.path}: world_from_ego of row {bad[0]} holds no rotation in its first three columns; write 3 x 4"
-            " matrices row by row, right-handed, not transposed"
+            " matrices row by row, with right-handed axes and without transposition"
         )
     high = np.flatnonzero(np.abs(world_from_ego[:, 2, 3]) > MAX_HEIGHT_M)
     if len(high):
@@ -395,17 +438,17 @@ def _read_matrices(table: _Table) -> np.ndarray:
 
 
 def _is_text(value: object) -> bool:
-    """Whether this is a str that files can hold: JSON may escape half a character."""
+    """Return whether a value is a str that files can store; JSON escapes can produce half of a surrogate pair."""
     return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
 
 
 def _is_whole(value: object) -> bool:
-    """Whether this is an integer of 0 or more; a float may hold it, as in pandas' columns with nulls."""
+    """Return whether a value is an integer of at least 0, possibly as a float, as in pandas columns with nulls."""
     return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:
-    """Whether these are numbers in [-largest, largest]; NaN and true are not."""
+    """Return whether all values are numbers in [-largest, largest]; NaN and true are not."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
@@ -417,7 +460,7 @@ def _read_boxes(folder: Path) -> _Table:
 
 
 def _make_boxes(table: _Table) -> dict[str, np.ndarray]:
-    """The per-box arrays of a Drive."""
+    """Return the per-box arrays of a Drive."""
     names = table.texts("category", CATEGORIES)
     category = np.array([CATEGORY_INDEX[name] for name in names], np.int8)
     rotation = table.rotations()
@@ -457,14 +500,14 @@ def _make_instance_ids(table: _Table) -> np.ndarray:
 
 
 def _check_in_sight(path: Path, points_m: np.ndarray, world_from_ego: np.ndarray) -> None:
-    """ValueError if the poses are all farther than SIGHT_M from the bounding box of these points (n, 3)."""
+    """Raise ValueError if all poses are farther than SIGHT_M from the bounding box of these points (n, 3)."""
     if len(points_m) == 0:
         return
     low, high, position_m = points_m.min(axis=0), points_m.max(axis=0), world_from_ego[:, :, 3]
     if not ((position_m >= low - SIGHT_M) & (position_m <= high + SIGHT_M)).all(axis=1).any():
         raise ValueError(
-            f"{path}: all of it lies more than {SIGHT_M:g} m from every pose: x, y, z of {_point(low)}..{_point(high)},"
-            f" the first pose {_point(position_m[0])}; bring all three files into one world frame"
+            f"{path}: the content at x, y, z of {_point(low)}..{_point(high)} lies more than {SIGHT_M:g} m from every"
+            f" pose; the first pose is {_point(position_m[0])}; use one world frame in all three files"
         )
 
 
@@ -482,7 +525,7 @@ def _read_polygons(folder: Path) -> _Table:
 
 
 def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
-    """Every outline cut into triangles between its own vertices."""
+    """Triangulate every outline between its own vertices."""
     of_row = [classes.index(name) for name in table.texts("class", classes)]
     parts = [_triangulate_polygon(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
     return SurfaceGround(
@@ -492,23 +535,24 @@ def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
 
 
 def _triangulate_polygon(path: Path, row: int, value: object) -> np.ndarray:
-    """(t, 3, 3) corners of the constrained Delaunay triangulation of one outline, world."""
+    """(t, 3, 3) corners of the constrained Delaunay triangulation of one outline, in the world frame."""
     outline_m = _make_outline(path, row, value)
     flat = outline_m[:, :2] - outline_m[0, :2]
     reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
     if reason != "Valid Geometry":
         raise ValueError(
-            f"{path}: outline of row {row} is no simple polygon, {reason[:80]} (x y); draw it without crossing or"
-            " touching itself, and cut a polygon with a hole in two"
+            f"{path}: outline of row {row} is no simple polygon, {reason[:80]} (x y); the outline must not cross or"
+            " touch itself, and a polygon with a hole must be cut in two"
         )
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(flat))
-    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]  # each a closed ring
+    # Each triangle is a closed ring of four points.
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
     vertex = {tuple(point): k for k, point in enumerate(flat.tolist())}
     return outline_m[[[vertex[tuple(corner)] for corner in triangle] for triangle in corners.tolist()]]
 
 
 def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
-    """(n, 3) float64, not closed, no point twice in succession."""
+    """(n, 3) float64 vertices of an open outline, without repeated successive points."""
     if type(value) is not list:
         raise ValueError(f"{path}: outline of row {row} is {_show(value)}, expected a list of points [x, y, z]")
     for k, point in enumerate(value):
@@ -527,10 +571,10 @@ def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
     steps = np.flatnonzero(repeated & (outline_m[:, 2] != following[:, 2]))
     if len(steps) and len(value) > 1:
         raise ValueError(
-            f"{path}: point {steps[0]} of the outline of row {row} has the next one right above or below it; a"
-            " surface has one height at a point"
+            f"{path}: point {steps[0]} of the outline of row {row} lies directly above or below the next point; a"
+            " surface must have one height per position"
         )
     outline_m = outline_m[~repeated]
     if len(outline_m) < 3:
-        raise ValueError(f"{path}: outline of row {row} has {len(outline_m)} different points, expected 3 or more")
+        raise ValueError(f"{path}: outline of row {row} has {len(outline_m)} distinct points, expected at least 3")
     return outline_m

@@ -1,7 +1,7 @@
-"""A Drive: everything annotated along one sequence, in the world frame. Every source becomes one, and every Scene
-is cut out of one by the same code (paper, supplement A, Dataset Construction).
+"""A Drive holds all annotations along one sequence in the world frame.
 
-numpy only: the town is usable without ray or pyarrow.
+Every source is read as a Drive, and the same code crops all Scenes (paper, supplement A, Dataset Construction). This
+module depends only on numpy. The town can therefore be used without ray or pyarrow.
 """
 
 from __future__ import annotations
@@ -17,36 +17,72 @@ from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
 from pipelines.geometry.rasterize import fill_polygon, rasterize_heights
 
 STATIC = -1
-EXTRUSION_M = 1e-3  # how far a slab's underside may be from a shifted copy of its top
+EXTRUSION_M = 1e-3  # Maximum deviation of a slab's underside from a shifted copy of its top
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Gravity-aligned ego pose: position and yaw of the vehicle in the world, z up."""
+    """Gravity-aligned ego pose in the world frame, with z up.
+
+    Attributes:
+        xyz_m: Position of the vehicle in the world frame (m).
+        yaw_rad: Angle of the vehicle's x axis from the world's x axis (rad).
+    """
 
     xyz_m: np.ndarray  # (3,) float64
     yaw_rad: float
 
     def to_ego(self, points_m: np.ndarray | Sequence[Any]) -> np.ndarray:
-        """World points (..., 3) in the ego frame. Subtracts in float64 before anything else."""
+        """Transform points from the world frame to the ego frame.
+
+        The subtraction uses float64, because world coordinates may be large.
+
+        Args:
+            points_m: (..., 3) points in the world frame (m).
+
+        Returns:
+            (..., 3) points in the ego frame (m).
+        """
         return (np.asarray(points_m, np.float64) - self.xyz_m) @ make_yaw_rotation(self.yaw_rad)
 
     def to_world(self, points_m: np.ndarray | Sequence[Any]) -> np.ndarray:
+        """Transform points from the ego frame to the world frame.
+
+        Args:
+            points_m: (..., 3) points in the ego frame (m).
+
+        Returns:
+            (..., 3) points in the world frame (m).
+        """
         return np.asarray(points_m, np.float64) @ make_yaw_rotation(self.yaw_rad).T + self.xyz_m
 
 
 @dataclass(frozen=True, eq=False)
 class SlabGround:
-    """Ground as extruded polygons (KITTI-360, the town): closed triangle meshes, one class per slab."""
+    """Ground as extruded polygons (KITTI-360 and the town): closed triangle meshes with one class per slab.
 
-    slab_class: np.ndarray  # (s,) index into the drive's ground_classes
-    vertices_m: np.ndarray  # (v, 3) float64, world
+    Attributes:
+        slab_class: Index of each slab's class in the drive's ground_classes.
+        vertices_m: Vertices in the world frame (m).
+        vertex_slab: Slab of each vertex.
+        triangles: Vertex indices; a triangle belongs to the slab of its first vertex.
+    """
+
+    slab_class: np.ndarray  # (s,)
+    vertices_m: np.ndarray  # (v, 3) float64
     vertex_slab: np.ndarray  # (v,)
-    triangles: np.ndarray  # (t, 3) indices into vertices_m
-    # a triangle's slab is its first vertex's
+    triangles: np.ndarray  # (t, 3)
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SlabGround:
-        """The slabs with a vertex in a rectangle of the world, low_m (2,) to high_m (2,)."""
+        """Select the slabs that have a vertex in a rectangle.
+
+        Args:
+            low_m: (2,) lower corner in the world frame (m).
+            high_m: (2,) upper corner in the world frame (m).
+
+        Returns:
+            The ground with only these slabs.
+        """
         xy = self.vertices_m[:, :2]
         kept = np.zeros(len(self.slab_class), bool)
         kept[self.vertex_slab[((xy >= low_m) & (xy <= high_m)).all(axis=1)]] = True
@@ -60,10 +96,10 @@ class SlabGround:
 
     @cached_property
     def _upper(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the triangles without undersides, and the slab of each.
+        """Return the triangles except undersides, and the slab of each triangle.
 
-        A vertical ray hits the top or a side of an extruded slab before its underside. A slab is an extrusion if the
-        second half of its vertices is its first half, moved down (format of KITTI-360).
+        A vertical ray hits the top or a side of an extruded slab before its underside. In the format of KITTI-360, the
+        second half of an extruded slab's vertices is the first half, shifted down.
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
@@ -80,9 +116,17 @@ class SlabGround:
         return self.triangles[upper], slab[upper]
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """height_m and occupied (G, H, W): slab tops seen from above, of slabs with a vertex inside the grid.
+        """Rasterise the tops of the slabs, seen from above.
 
-        The paper keeps a ground polygon if at least one of its vertices lies in the crop (supplement A).
+        As in the paper (supplement A), a ground polygon counts only if at least one of its vertices lies in the crop.
+
+        Args:
+            pose: Ego pose of the scene.
+            grid: Raster grid in the scene frame.
+            num_classes: Number G of ground classes.
+
+        Returns:
+            height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
         """
         local = pose.to_ego(self.vertices_m)
         inside = np.zeros(len(self.slab_class), bool)
@@ -96,15 +140,30 @@ class SlabGround:
 
 @dataclass(frozen=True, eq=False)
 class MapGround:
-    """Ground as map polygons over a height raster (Argoverse 2)."""
+    """Ground as map polygons with heights from a raster (Argoverse 2).
+
+    Attributes:
+        polygon_class: Index of each polygon's class in the drive's ground_classes.
+        polygons_m: Outlines (n, 2) in the world frame, which is the city frame (m).
+        raster_m: Ground heights in the world frame (m), NaN where unknown.
+        raster_from_world: Similarity from a world point to pixel coordinates (column, row).
+    """
 
     polygon_class: list[int]
-    polygons_m: list[np.ndarray]  # (n, 2) outlines, world (city frame)
-    raster_m: np.ndarray  # (rows, cols) heights, NaN where unknown
-    raster_from_world: np.ndarray  # (3, 3) similarity: pixel coordinates (column, row) of a world point
+    polygons_m: list[np.ndarray]  # (n, 2) each
+    raster_m: np.ndarray  # (rows, cols)
+    raster_from_world: np.ndarray  # (3, 3)
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> MapGround:
-        """The polygons that reach into a rectangle of the world, low_m (2,) to high_m (2,); the raster whole."""
+        """Select the polygons whose bounding box meets a rectangle; the height raster is kept whole.
+
+        Args:
+            low_m: (2,) lower corner in the world frame (m).
+            high_m: (2,) upper corner in the world frame (m).
+
+        Returns:
+            The ground with only these polygons.
+        """
         reach = [(p.max(axis=0) >= low_m).all() and (p.min(axis=0) <= high_m).all() for p in self.polygons_m]
         return replace(
             self,
@@ -113,7 +172,16 @@ class MapGround:
         )
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """height_m and occupied (G, H, W): polygon interiors at pixel centres, heights where the raster knows them."""
+        """Rasterise the polygons; a pixel is occupied if a polygon covers its centre and the height there is known.
+
+        Args:
+            pose: Ego pose of the scene.
+            grid: Raster grid in the scene frame.
+            num_classes: Number G of ground classes.
+
+        Returns:
+            height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
+        """
         x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
         world = pose.to_world(np.stack([x, y, np.zeros_like(x)], axis=-1))[..., :2]
         pixel = world @ self.raster_from_world[:2, :2].T + self.raster_from_world[:2, 2]
@@ -136,22 +204,43 @@ class MapGround:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGround:
-    """Ground as triangles of the true surface (own drives), one class each."""
+    """Ground as triangles of the real surface (own drives), each with a class.
 
-    triangles_m: np.ndarray  # (t, 3, 3) float64 corners, world
-    triangle_class: np.ndarray  # (t,) index into the drive's ground_classes
+    Attributes:
+        triangles_m: Corners in the world frame (m).
+        triangle_class: Index of each triangle's class in the drive's ground_classes.
+    """
+
+    triangles_m: np.ndarray  # (t, 3, 3) float64
+    triangle_class: np.ndarray  # (t,)
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SurfaceGround:
-        """The triangles that reach into a rectangle of the world, low_m (2,) to high_m (2,)."""
+        """Select the triangles whose bounding box meets a rectangle.
+
+        Args:
+            low_m: (2,) lower corner in the world frame (m).
+            high_m: (2,) upper corner in the world frame (m).
+
+        Returns:
+            The ground with only these triangles.
+        """
         xy = self.triangles_m[..., :2]
         kept = ((xy.max(axis=1) >= low_m) & (xy.min(axis=1) <= high_m)).all(axis=1)
         return SurfaceGround(self.triangles_m[kept], self.triangle_class[kept])
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """height_m and occupied (G, H, W): the surface at pixel centres; where a class lies twice, its upper one.
+        """Rasterise the surface at pixel centres; of two surfaces of one class, the upper one counts.
 
-        Unlike a slab, a polygon counts wherever it covers a pixel, even if none of its vertices lies in the crop:
-        it may be a road of a kilometre.
+        A polygon counts in every pixel that it covers, even if none of its vertices lies in the crop. A road of 1 km
+        may have no vertex there. This differs from SlabGround.
+
+        Args:
+            pose: Ego pose of the scene.
+            grid: Raster grid in the scene frame.
+            num_classes: Number G of ground classes.
+
+        Returns:
+            height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
         """
         middle_m = np.array([(grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2, 0.0])
         center_m, reach_m = pose.to_world(middle_m)[:2], np.hypot(grid.rows, grid.cols) * grid.resolution_m / 2
@@ -162,23 +251,36 @@ class SurfaceGround:
 
 
 def _interpolate_heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """float32 heights, zero where there is none (-inf, which is overwritten), and where there is one."""
+    """Return float32 heights and the mask of pixels with a height.
+
+    Pixels without a height are -inf in the input, which is overwritten, and 0 in the result.
+    """
     occupied = height_m > -np.inf
     height_m[~occupied] = 0.0
     return height_m.astype(np.float32, copy=False), occupied
 
 
 def _compute_reach_m(grid: Grid) -> float:
-    """Distance from the ego vehicle to the farthest corner of its crop."""
+    """Return the distance from the ego vehicle to the farthest corner of its crop (m)."""
     return float(np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m))))
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """All primitives, the ground and the poses of one sequence; n boxes, p poses; world frame, z up, float64.
+    """All n boxes, the ground and all p poses of one sequence, in the world frame (z up, m, float64).
 
-    `rotation` may be any proper rotation: scenes canonicalise it. `heading_rad` is the world yaw of the direction
-    of travel, NaN where unknown. `timestamp` is STATIC or the frame in which a moving box is where it is.
+    Attributes:
+        source: Value of the source column.
+        sequence: Name of the drive.
+        category: Index into CATEGORIES.
+        rotation: Any proper rotation; scenes convert it to the canonical form.
+        size_m: Full extents along the columns of `rotation`.
+        heading_rad: Yaw of the direction of travel in the world frame; NaN if unknown.
+        instance_id: Number of the object, or -1.
+        label: Class name in the source dataset.
+        timestamp: Frame to which the position of a moving box belongs; STATIC for other boxes.
+        frame: Frame of each pose.
+        world_from_imu: Pose matrices with x forward.
     """
 
     source: str
@@ -186,7 +288,7 @@ class Drive:
     category: np.ndarray  # (n,) int8
     center_m: np.ndarray  # (n, 3)
     rotation: np.ndarray  # (n, 3, 3)
-    size_m: np.ndarray  # (n, 3) full extents along rotation's columns
+    size_m: np.ndarray  # (n, 3)
     heading_rad: np.ndarray  # (n,)
     instance_id: np.ndarray  # (n,) int64
     label: np.ndarray  # (n,) str objects
@@ -194,13 +296,22 @@ class Drive:
     ground_classes: tuple[str, ...]
     ground: SlabGround | MapGround | SurfaceGround
     frame: np.ndarray  # (p,) int64
-    world_from_imu: np.ndarray  # (p, 3, 4), x forward
+    world_from_imu: np.ndarray  # (p, 3, 4)
 
     def __len__(self) -> int:
+        """Return the number of poses."""
         return len(self.frame)
 
     def at(self, poses: np.ndarray, grid: Grid | None = None) -> Drive:
-        """The drive with these poses only, and of its content what their crops can hold: scenes are cut faster."""
+        """Select poses and the content that their crops can contain, which makes the creation of scenes faster.
+
+        Args:
+            poses: Indices of the poses.
+            grid: Raster grid of the scenes (default: the paper's).
+
+        Returns:
+            The drive with only these poses.
+        """
         xy = self.world_from_imu[poses, :2, 3]
         reach_m = _compute_reach_m(grid or Grid())
         low_m, high_m = xy.min(axis=0) - reach_m, xy.max(axis=0) + reach_m
@@ -216,12 +327,33 @@ class Drive:
         )
 
     def pose(self, index: int) -> Pose:
-        """Position and yaw of pose `index`: differs from the paper, which keeps pitch and roll."""
+        """Return the gravity-aligned ego pose.
+
+        This differs from the paper, which keeps pitch and roll.
+
+        Args:
+            index: Index of the pose.
+
+        Returns:
+            Position and yaw.
+        """
         matrix = self.world_from_imu[index]
         return Pose(matrix[:, 3], float(np.arctan2(matrix[1, 0], matrix[0, 0])))
 
     def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
-        """The Scene ahead of pose `index`: primitives whose centre lies in the crop, static or of this very frame."""
+        """Crop the Scene ahead of a pose.
+
+        The scene contains the primitives whose centre lies in the crop. They are static or belong to the frame of the
+        pose.
+
+        Args:
+            index: Index of the pose.
+            split: Value of the split column.
+            grid: Raster grid of the scene (default: the paper's).
+
+        Returns:
+            The scene.
+        """
         grid = grid or Grid()
         pose, frame = self.pose(index), int(self.frame[index])
         near = np.abs(self.center_m[:, :2] - pose.xyz_m[:2]).max(axis=1) <= _compute_reach_m(grid)

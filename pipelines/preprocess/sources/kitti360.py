@@ -1,11 +1,11 @@
-"""KITTI-360's own files -> Drive: 3D boxes and ground polygons of a sequence (XML), and its poses.
+"""Read KITTI-360's own files as a Drive: 3D boxes and ground polygons of a sequence (XML), and its poses.
 
     ROOT/data_3d_bboxes/train_full/2013_05_28_drive_0003_sync.xml
     ROOT/data_poses/2013_05_28_drive_0003_sync/poses.txt
 
-A sequence is named by its four digits. The world is z up; the IMU's x points forward, y right, z down.
-The XML (over 100 MB for the longest drives) is streamed. One defective object is dropped and reported; a
-file that is broken as a whole is a ValueError.
+The name of a sequence is its four digits. The z axis of the world frame points up. The axes of the IMU are x forward, y
+right and z down. The XML file (over 100 MB for the longest drives) is streamed. The reader skips and reports single
+defective objects. It raises ValueError for a file that is invalid as a whole.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 
 SOURCE = "kitti360"
 
-# Label -> category, the paper's Tab. "object categories". Labels are compared by `_convert_to_plain`: without case,
-# blanks and underscores, so the XML's "trafficSign" and the development kit's "traffic sign" are one.
+# Labels of each category, from the paper's table "object categories". `_convert_to_plain` removes case, blanks and
+# underscores from labels. The XML's "trafficSign" therefore equals the development kit's "traffic sign".
 CATEGORY_LABELS = {
-    "vegetation_cuboid": ("vegetation",),  # vegetation_ellipsoid if it is a sphere mesh
+    "vegetation_cuboid": ("vegetation",),  # A sphere mesh becomes vegetation_ellipsoid.
     "vehicle_big": ("truck", "bus"),
     "vehicle_small": ("car", "trailer", "unknownvehicle"),
     "two_wheelers": ("motorcycle", "bicycle"),
@@ -40,7 +40,7 @@ CATEGORY_LABELS = {
     "traffic_control": ("trafficlight", "trafficsign", "lamp"),
     "object": ("trashbin", "box", "unknownobject"),
 }
-# Traps: the XML says "ground" for terrain, "unknownGround" for ground and "driveway" for parking.
+# The XML uses "ground" for terrain, "unknownGround" for ground, and "driveway" for parking.
 GROUND_LABELS = {
     "road": ("road",),
     "sidewalk": ("sidewalk",),
@@ -48,7 +48,7 @@ GROUND_LABELS = {
     "terrain": ("ground", "terrain"),
     "ground": ("unknownground",),
 }
-# The first five are dropped by the paper; it says nothing of the others.
+# The paper drops the first five labels and does not mention the other four.
 DROPPED_LABELS = (
     "tunnel",
     "bridge",
@@ -65,21 +65,23 @@ CATEGORY_OF = {label: CATEGORY_INDEX[name] for name, labels in CATEGORY_LABELS.i
 GROUND_CLASS_OF = {
     label: KITTI_GROUND_CLASSES.index(name) for name, labels in GROUND_LABELS.items() for label in labels
 }
-# Local +x is the direction of travel of these.
+# The local +x axis is the direction of travel for these labels.
 HEADED_LABELS = {label for name in ("vehicle_big", "vehicle_small", "two_wheelers") for label in CATEGORY_LABELS[name]}
 HEADED_LABELS |= {"rider"}
 
 SPHERE_VERTICES = 63
-# An object written twice, in two annotation windows that meet, keeps its size to micrometres, but the windows were
-# registered apart: in real data copies are shifted by up to 0.4 m and turned by up to 0.33 degrees. A copy shifted
-# further, or by more than half its size, is a neighbour.
+# Some objects occur twice, in two adjacent annotation windows. Both copies have equal sizes to a micrometre. The
+# windows
+# were registered separately: real copies differ by up to 0.4 m and 0.33 degrees. An object with a larger shift,
+# or with a shift above half its size, is another object.
 DUPLICATE_SIZE_M = 1e-3
 DUPLICATE_SHIFT_M = 0.5
 DUPLICATE_TURN_RAD = 0.01
-MAX_COORDINATE_M = 1e5  # the real world frame spans several km
+MAX_COORDINATE_M = 1e5  # The real world frame spans several km.
 MAX_SIZE_M = 1e3
 MIN_SIZE_M = 1e-3
-# Of the unit axes: two of them closer than about 40 degrees make no sheared box but a broken one.
+# Minimum singular value of the unit axes. If two axes are closer than about 40 degrees, the box is invalid rather than
+# sheared.
 MIN_SINGULAR = 0.5
 
 SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
@@ -87,27 +89,40 @@ SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
 
 @dataclass(frozen=True)
 class Defect:
-    """An object that could not be read, and why."""
+    """An object that cannot be read, with the reason.
 
-    index: int  # the object's own <index>, -1 if it has none
+    Attributes:
+        index: The object's <index> in the XML, -1 if absent.
+        label: Label in the XML.
+        reason: Fault of the object.
+    """
+
+    index: int
     label: str
     reason: str
 
 
 @dataclass(frozen=True)
 class ReadReport:
-    """What became of the objects of one XML file: boxes + slabs + everything dropped = objects."""
+    """Number of objects of one XML file by outcome: `objects` is the sum of boxes, slabs and all dropped objects.
+
+    Attributes:
+        dropped: Number of objects by label, for known labels without a category.
+        unknown: Number of objects by label, for labels in no table.
+        duplicates: Number of second copies of an object.
+        defects: Objects that cannot be read.
+    """
 
     objects: int
     boxes: int
     slabs: int
-    dropped: dict[str, int]  # known labels without a category: label -> count
-    unknown: dict[str, int]  # labels that are in no table: label -> count
-    duplicates: int  # objects written a second time
+    dropped: dict[str, int]
+    unknown: dict[str, int]
+    duplicates: int
     defects: tuple[Defect, ...]
 
     def summary(self) -> str:
-        """One line for a log."""
+        """Return one line for a log."""
         parts = [f"{self.objects} objects: {self.boxes} boxes, {self.slabs} ground slabs"]
         parts += [f"{self.duplicates} duplicates dropped"] if self.duplicates else []
         parts += [f"dropped labels {_count_labels(self.dropped)}"] if self.dropped else []
@@ -119,31 +134,49 @@ class ReadReport:
 
 
 def list_sequences(root: str | Path) -> list[str]:
-    """The annotated sequences under ROOT, by their four digits.
+    """Return the annotated sequences.
 
-    Raises ValueError if there is none, or none that has poses: `read_poses` names a single one that has not.
+    A sequence without poses is included; `read_poses` raises an error for it.
+
+    Args:
+        root: Directory of KITTI-360.
+
+    Returns:
+        Four digits of each sequence, in ascending order.
+
+    Raises:
+        ValueError: No sequence exists, or none has poses.
     """
     folder = Path(root) / "data_3d_bboxes" / "train_full"
     names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
     if not names:
         raise ValueError(
-            f"{folder}: no 2013_05_28_drive_NNNN_sync.xml here; --input must name the KITTI-360 folder that"
+            f"{folder} holds no 2013_05_28_drive_NNNN_sync.xml; --input must name the KITTI-360 folder that"
             " holds data_3d_bboxes and data_poses"
         )
     if not any(_make_poses_path(root, name).is_file() for name in names):
         raise ValueError(
-            f"{_make_poses_path(root, names[0])}: missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
+            f"{_make_poses_path(root, names[0])} is missing, but sequence {names[0]} is annotated; unpack KITTI-360's"
             " data_poses.zip here"
         )
     return names
 
 
 def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
-    """Everything annotated along one sequence, world frame, float64; and what was dropped on the way.
+    """Read all annotations along one sequence.
 
-    `instance_id` is the track number (dynamicSeq) of a moving object, else the object's index in the file;
-    the two count separately. `timestamp` is the frame of a moving box, else STATIC.
-    Raises ValueError, naming the file, for a missing or broken XML or poses file.
+    `instance_id` is the track number (dynamicSeq) of a moving object, or the index of a static object in the file. The
+    two kinds are numbered separately. `timestamp` is the frame of a moving box, or STATIC.
+
+    Args:
+        root: Directory of KITTI-360.
+        sequence: Four digits of the sequence.
+
+    Returns:
+        The drive in the world frame (float64), and a report on dropped objects.
+
+    Raises:
+        ValueError: The XML or poses file is missing or invalid; the message names the file.
     """
     frame, world_from_imu = read_poses(root, sequence)
     boxes, slabs, report = _read_objects(_make_boxes_path(root, sequence))
@@ -160,7 +193,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
 
 
 def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
-    """The boxes and slabs of one XML file in its order, each once, and what was dropped."""
+    """Return the boxes and slabs of one XML file in file order without duplicates, and a report on dropped objects."""
     boxes: list[_Box] = []
     slabs: list[_Slab] = []
     seen: dict[tuple, list[np.ndarray]] = {}
@@ -191,7 +224,7 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
     objects = len(boxes) + len(slabs) + dropped.total() + unknown.total() + duplicates + len(defects)
     report = ReadReport(objects, len(boxes), len(slabs), dict(dropped), dict(unknown), duplicates, tuple(defects))
     if objects == 0:
-        raise ValueError(f"{path}: holds no <objectN>; unpack data_3d_bboxes.zip of KITTI-360 again")
+        raise ValueError(f"{path} holds no <objectN>; unpack data_3d_bboxes.zip of KITTI-360 again")
     return boxes, slabs, report
 
 
@@ -207,10 +240,19 @@ def _make_poses_path(root: str | Path, sequence: str) -> Path:
 
 
 def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]:
-    """frame (p,) int64, ascending, and world_from_imu (p, 3, 4) float64, metres.
+    """Read the poses of one sequence.
 
-    Frames in which the car hardly moved are absent from the file.
-    Raises ValueError, naming file and line, for a missing file, a bad line or a matrix that is no pose.
+    The file omits frames in which the car hardly moves.
+
+    Args:
+        root: Directory of KITTI-360.
+        sequence: Four digits of the sequence.
+
+    Returns:
+        frame (p,) int64, ascending, and world_from_imu (p, 3, 4) float64 (m).
+
+    Raises:
+        ValueError: The file is missing, or a line is no valid pose; the message names file and line.
     """
     path = _make_poses_path(root, sequence)
     text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
@@ -220,7 +262,9 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
         if not words:
             continue
         if len(words) != 13:
-            raise ValueError(f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; is it cut off?")
+            raise ValueError(
+                f"{path}, line {number}: {len(words)} numbers, expected a frame and 12; the line may be truncated"
+            )
         if not words[0].isdecimal() or len(words[0]) > 18:
             raise ValueError(f"{path}, line {number}: frame {words[0]!r} is not a whole number")
         row = _read_floats(words[1:])
@@ -231,15 +275,17 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
         frame.append(int(words[0]))
         rows.append(row)
     if not rows:
-        raise ValueError(f"{path}: holds no pose; unpack data_poses.zip of KITTI-360 again")
+        raise ValueError(f"{path} holds no pose; unpack data_poses.zip of KITTI-360 again")
     world_from_imu = np.array(rows).reshape(-1, 3, 4)
     rotation = world_from_imu[:, :, :3]
     skew = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((skew > 1e-2) | (np.linalg.det(rotation) < 0))
     if len(bad):
         raise ValueError(f"{path}: the matrix of frame {frame[bad[0]]} is no rotation; restore the line")
-    if not text.endswith(("\n", "\r")):  # cut off within its last number, that is a wrong pose
-        raise ValueError(f"{path}: line {number} does not end; is the file cut off? Unpack data_poses.zip again")
+    if not text.endswith(("\n", "\r")):  # A file that ends within its last number would give a wrong pose.
+        raise ValueError(
+            f"{path}: line {number} has no line end, so the file may be truncated; unpack data_poses.zip again"
+        )
     return np.array(frame, np.int64), world_from_imu
 
 
@@ -247,9 +293,9 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def _stream_objects(path: Path) -> Iterator[dict]:
-    """The fields of each <objectN>, tag -> element; what was read before is freed.
+    """Yield the fields of each <objectN> as a map from tag to element, and free the previous elements.
 
-    Raises ValueError for a missing or malformed file, and for one with a document type, as entity bombs need.
+    The function raises ValueError for a missing or malformed file, and for a document type, which entity bombs need.
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:
@@ -267,13 +313,15 @@ def _stream_objects(path: Path) -> Iterator[dict]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror}); {again}") from error
     except DefusedXmlException as error:
-        raise ValueError(f"{path}: declares a document type or entities, which no real file does; {again}") from error
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of encodings
+        raise ValueError(
+            f"{path} declares a document type or entities, which files of KITTI-360 never do; {again}"
+        ) from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # Encodings cause the last two types of errors.
         raise ValueError(f"{path}: broken XML ({error}); {again}") from error
 
 
 class DefectiveObject(ValueError):
-    """One object cannot be read; the message says why."""
+    """Error for one object that cannot be read; the message gives the reason."""
 
 
 def _read_text(fields: dict, tag: str, default: str | None = None) -> str:
@@ -286,7 +334,7 @@ def _read_text(fields: dict, tag: str, default: str | None = None) -> str:
 
 
 def _read_label(fields: dict) -> str:
-    """The object's label as written, empty if it has none."""
+    """Return the label of an object as written, or "" if absent."""
     return " ".join(_read_text(fields, "label", " ").split())[:40]
 
 
@@ -298,7 +346,7 @@ def _read_integer(fields: dict, tag: str) -> int:
 
 
 def _read_index(fields: dict) -> int:
-    """The object's own index, -1 if it has none."""
+    """Return the <index> of an object, or -1 if absent."""
     try:
         return _read_integer(fields, "index")
     except DefectiveObject:
@@ -306,7 +354,7 @@ def _read_index(fields: dict) -> int:
 
 
 def _read_floats(words: list[str]) -> np.ndarray | None:
-    """(n,) float64, or None if a word is no finite number."""
+    """Return (n,) float64, or None if a word is no finite number."""
     try:
         values = np.array(words, np.float64)
     except ValueError:
@@ -315,7 +363,7 @@ def _read_floats(words: list[str]) -> np.ndarray | None:
 
 
 def _read_matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
-    """(rows, cols) float64 of an OpenCV matrix."""
+    """Return an OpenCV matrix (rows, cols) as float64."""
     if tag not in fields:
         raise DefectiveObject(f"no {tag}")
     parts = {child.tag: child for child in fields[tag]}
@@ -330,7 +378,7 @@ def _read_matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
 
 
 def _read_vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Local vertices (v, 3), world_from_local (4, 4), world vertices (v, 3) in metres, all float64."""
+    """Return local vertices (v, 3), world_from_local (4, 4) and world vertices (v, 3), in metres, all float64."""
     world_from_local = _read_matrix(fields, "transform", 4)
     if world_from_local.shape != (4, 4) or np.abs(world_from_local[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DefectiveObject("transform is not an affine 4 x 4 matrix")
@@ -381,12 +429,20 @@ def _parse_box(fields: dict, label: str) -> _Box:
 def compute_box_geometry(
     world_from_local: np.ndarray, vertices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """center_m (3,), proper rotation (3, 3), full size_m (3,) of a box or ellipsoid mesh under an affine map.
+    """Compute centre, rotation and size of a box or ellipsoid mesh under an affine transform.
 
-    world_from_local (4, 4); vertices (v, 3), of which the extent counts: 1 for the unit cube, 2 for the
-    sphere of radius 1. A mirrored map is the same box with its y axis flipped (x may be a heading); of a
-    sheared one come the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
-    Raises DefectiveObject for a box without volume, of absurd size, or with axes too close to one another.
+    A mirrored transform gives the same box with its y axis flipped, because x may be a heading. A sheared transform
+    gives the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+
+    Args:
+        world_from_local: (4, 4) transform.
+        vertices: (v, 3) local vertices. Only their extent counts: 1 for the unit cube, 2 for the sphere of radius 1.
+
+    Returns:
+        center_m (3,), proper rotation (3, 3) and full size_m (3,) in the world frame.
+
+    Raises:
+        DefectiveObject: The box has no volume or an implausible size, or its axes are too close to each other.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     axes_m = world_from_local[:3, :3] * (high - low)
@@ -404,7 +460,7 @@ def compute_box_geometry(
 
 
 def _stack_boxes(boxes: list[_Box]) -> dict[str, np.ndarray]:
-    """The per-box arrays of a Drive."""
+    """Return the per-box arrays of a Drive."""
     n = len(boxes)
     return {
         "category": np.array([box.category for box in boxes], np.int8),
@@ -424,7 +480,7 @@ def _stack_boxes(boxes: list[_Box]) -> dict[str, np.ndarray]:
 @dataclass(frozen=True, eq=False)
 class _Slab:
     ground_class: int
-    timestamp: int  # the ground never moves
+    timestamp: int  # always STATIC
     vertices_m: np.ndarray
     triangles: np.ndarray
 
@@ -443,7 +499,7 @@ def _parse_slab(fields: dict, plain: str) -> _Slab:
 
 
 def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
-    """All slabs as one set of meshes."""
+    """Return all slabs as one set of meshes."""
     counts = np.array([len(slab.vertices_m) for slab in slabs], np.int64)
     first = np.cumsum(counts) - counts
     no_triangles = np.zeros((0, 3), np.int64)
@@ -459,7 +515,7 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
 
 
 def _find_copies(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
-    """Whether an object of this key had this shape (v, 3) nearly here; if not, remembers it."""
+    """Return whether `seen` holds a copy of this object at nearly the same position; otherwise add the object."""
     center_m = vertices_m.mean(axis=0)
     low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
     for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):
@@ -470,7 +526,7 @@ def _find_copies(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np
 
 
 def _is_copy(one_m: np.ndarray, other_m: np.ndarray) -> bool:
-    """Whether two vertex lists (v, 3) are one rigid shape, hardly moved."""
+    """Return whether two vertex lists (v, 3) are copies of one rigid shape at nearly the same position."""
     if one_m.shape != other_m.shape:
         return False
     center_m, other_center_m = one_m.mean(axis=0), other_m.mean(axis=0)
