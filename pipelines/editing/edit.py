@@ -32,7 +32,7 @@ from pipelines.editing.repair import GroundFaults, find_removable_objects, separ
 from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.schema.tables import PRIMITIVES, make_primitives_table
 
-SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit
+SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit.
 
 
 @dataclass(frozen=True)
@@ -498,7 +498,7 @@ class ObjectChange(NamedTuple):
         primitive: Index of the primitive in the scene before the edit.
         change: One of removed, copied and changed.
         moved_m: Displacement of the centre (m); for a copy, the distance from its original.
-        turned_rad: Largest angle between an axis before and after the edit (rad), ignoring its sign.
+        turned_rad: Largest angle by which an axis turned (rad); opposite directions count as equal.
         resized: Largest relative change of length, width or height.
     """
 

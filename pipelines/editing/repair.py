@@ -20,9 +20,9 @@ GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
 GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
 DIRECTIONS = 24
-STEPS = 20  # Number of displacement lengths to try
+STEPS = 20  # Number of displacement lengths to try.
 PAIRS_AT_ONCE = 256  # Number of pairs that are processed together, which takes 50 MB.
-CANDIDATES = 6  # Number of directions, with the shortest displacements, that are tested against all other primitives
+CANDIDATES = 6  # Number of directions that are tested against all other primitives, the shortest displacements first.
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
@@ -134,7 +134,7 @@ class _Separation:
         to_m = share[:, None, None, :, None] * [[-1.0], [1.0]] * pushes_m[:, :, None]  # (p, directions, steps, 2, 3)
         center_m = start.center_m[:, None, None] + to_m
         moved_m = np.linalg.norm((center_m - self.given.center_m[pairs][:, None, None])[..., :2], axis=-1)
-        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): limit of the displacement
+        within = (moved_m <= self.most_m).all(axis=-1)  # (p, directions, steps): limit of the displacement.
         within &= share.any(axis=1)[:, None, None]
 
         def parted(where: np.ndarray) -> np.ndarray:
@@ -147,7 +147,7 @@ class _Separation:
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
         found = parted(within & parted(longest).any(axis=2, keepdims=True))
-        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none.
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]

@@ -18,14 +18,14 @@ from skimage.morphology import skeletonize
 from models.scene import ROAD_CLASSES, Scene
 from pipelines.geometry.masks import find_nearest_true, label_parts, measure_depth
 
-CELL_M = 0.5  # Cell size of the mask that is thinned
+CELL_M = 0.5  # Cell size of the mask that is thinned.
 HOLE_M2, ISLAND_M2 = 25.0, 40.0  # Smaller holes are filled and smaller islands are removed.
-MARGIN_M = 16.0  # Width of the mask's extension beyond the scene's border
+MARGIN_M = 16.0  # Width of the mask's extension beyond the scene's border.
 SPUR = 1.6  # A dead end shorter than this multiple of the half width at its fork is not a road.
 ONE_NODE = 1.0  # Forks closer than this multiple of the sum of their half widths become one node.
-SMOOTH_M = 3.0  # Standard deviation of the Gaussian that smooths a line
+SMOOTH_M = 3.0  # Standard deviation of the Gaussian that smooths a line.
 LEAST_M = 4.0  # A shorter line is not a road.
-AROUND = np.ones((3, 3), int)  # Neighbourhood of eight pixels
+AROUND = np.ones((3, 3), int)  # Neighbourhood of eight pixels.
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def extract_road_network(scene: Scene, spacing_m: float = 1.0) -> RoadNetwork:
     """Extract the centrelines of a scene's roads.
 
     Args:
-        scene: Scene; the network is empty if it has no road class.
+        scene: Scene; the network is empty if the scene has no road class.
         spacing_m: Approximate distance between points of a centreline (m).
 
     Returns:
@@ -234,7 +234,7 @@ def _straighten(graph: nx.MultiGraph) -> None:
             for u, v, _, path in edges:
                 other = v if u == node else u
                 ends.append(other)
-                parts.append(path if other <= node else path[::-1])  # directed towards the node
+                parts.append(path if other <= node else path[::-1])  # Directed towards the node.
             graph.remove_node(node)
             _join(graph, ends[0], ends[1], np.concatenate([parts[0][1:-1], parts[1][::-1][1:-1]]))
 
@@ -275,7 +275,10 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
-    """Yield the sections of a line (k, 2) inside the scene, and whether each includes the line's first and last point."""
+    """Yield the sections of a line (k, 2) inside the scene.
+
+    The two flags state whether a section includes the first and the last point of the line.
+    """
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
     for start, stop in border.tolist():

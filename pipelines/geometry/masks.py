@@ -1,4 +1,4 @@
-"""Wrap functions of scipy.ndimage on masks with exact return types, which their own annotations lack."""
+"""Wrappers of scipy.ndimage functions on masks; scipy's own annotations lack the exact return types."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def label_parts(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[
         structure: Neighbourhood of an element, as in `scipy.ndimage.label` (default: elements that share a face).
 
     Returns:
-        (...) int32 number of each element's part, from 1 and 0 outside the mask; and the number of parts.
+        (...) int32 number of each element's part (1, 2, ... inside the mask and 0 outside), and the number of parts.
     """
     return cast("tuple[np.ndarray, int]", ndimage.label(mask, structure))
 

@@ -10,7 +10,7 @@ import numpy as np
 from models.scene import ELLIPSOID, Grid, Scene
 from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, list_integers_between
 
-FILL = 0.95  # Share of the image width or height, whichever limits the scale, that the scene fills.
+FILL = 0.95  # Share of the image width or height that the scene fills; the tighter of the two sets the scale.
 ROUNDING_M = 1e-6  # Tolerance that exceeds the rounding error of a depth.
 BELOW_M, ABOVE_M = 2.0, 14.0  # Vertical range below and above the ego vehicle's origin that the camera covers.
 
@@ -28,7 +28,7 @@ class Camera:
     """
 
     camera_from_scene: np.ndarray  # (3, 3)
-    view: Grid  # pixel grid in the camera frame
+    view: Grid  # Pixel grid in the camera frame.
 
     def turn(self, points_m: np.ndarray) -> np.ndarray:
         """Rotate points from the scene frame into the camera frame.
@@ -111,7 +111,7 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
         camera: Orthographic camera.
 
     Returns:
-        depth_m (H, W) float64: z in the camera frame (m), -inf without a hit. primitive (H, W) int64: index of the
+        depth_m (H, W) float64, z in the camera frame (m), -inf without a hit; and primitive (H, W) int64, index of the
         primitive, -1 without a hit.
     """
     pixel, chord, chords = _compute_chords(scene, camera)
@@ -125,8 +125,8 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
     """Find the pixels where `cast_ellipsoids` returns a larger depth than a given one.
 
-    The function compares a lower bound of the depth first. It computes the exact depth only where the lower bound
-    decides nothing.
+    The function first compares a lower bound of the depth. It computes the exact depth only where this bound does not
+    exceed the given depth.
 
     Args:
         scene: Scene.
@@ -147,10 +147,10 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
 class _Chords(NamedTuple):
     """Chords of ellipsoids along rows of pixel centres, seen from a camera; m chords, ordered by ellipsoid."""
 
-    primitive: np.ndarray  # (m,) index of the primitive in the scene
-    row_start: np.ndarray  # (m,) flat index of the first pixel in the row
-    least_m: np.ndarray  # (m,) lower bound of the depth of any hit
-    terms: tuple[np.ndarray, ...]  # (m,) each, the terms that `_compute_depth_m` needs
+    primitive: np.ndarray  # (m,) index of the primitive in the scene.
+    row_start: np.ndarray  # (m,) flat index of the first pixel in the row.
+    least_m: np.ndarray  # (m,) lower bound of the depth of any hit.
+    terms: tuple[np.ndarray, ...]  # (m,) each, the terms that `_compute_depth_m` needs.
 
 
 def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:

@@ -90,8 +90,8 @@ def _find_column_intervals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest column coordinate of triangles in pixel rows (s,).
 
-    spans (t,) is the number of rows per triangle. u and v (3, t) are the row and column coordinates of the corners in
-    pixels; pixel centres have integer coordinates.
+    The argument spans (t,) is the number of rows per triangle. The arguments u and v (3, t) are row and column
+    coordinates of the corners, in pixels. Pixel centres have integer coordinates.
     """
     u_end, v_end = u[[1, 2, 0]], v[[1, 2, 0]]  # Edge k leads from corner k to the next corner.
     per_row = (v_end - v) / np.where(u == u_end, 1.0, u_end - u)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-FIT_M = 0.01  # Maximum distance of a vertex from the fitted box or ellipsoid
-LIMITS_M = (1e-3, 1e3)  # Smallest and largest valid size
-SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij")).reshape(3, 8)  # Corners of the unit box
+FIT_M = 0.01  # Maximum distance of a vertex from the fitted box or ellipsoid.
+LIMITS_M = (1e-3, 1e3)  # Smallest and largest valid size.
+SIGNS = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij")).reshape(3, 8)  # Corners of the unit box.
 
 # center_m (n, 3), rotation (n, 3, 3), size_m (n, 3); axes in any order
 Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -15,8 +15,8 @@ Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]
 def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit boxes to edge vectors.
 
-    The longest edge determines the first axis of the box. Rounding changes the direction of a short edge most, which
-    would displace the corners of a long box.
+    The longest edge determines the first axis of the box. Rounding errors change the direction of a short edge most. A
+    first axis along a short edge would displace the corners of a long box.
 
     Args:
         edges_m: (n, 3, 3); columns are the edge vectors of a box (m).
@@ -26,8 +26,7 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
         rotation (n, 3, 3) and size_m (n, 3).
 
     Raises:
-        ValueError: The edges are not perpendicular, so that a corner moves by more than FIT_M; or a size lies outside
-            LIMITS_M.
+        ValueError: A corner of the fitted box is off by more than FIT_M, or a size lies outside LIMITS_M.
     """
     order = np.argsort(-np.linalg.norm(edges_m, axis=1), axis=1, kind="stable")[:, None, :]
     first, second, third = np.moveaxis(np.take_along_axis(edges_m, order, axis=2), 2, 0)
@@ -96,9 +95,7 @@ def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
 
 
 def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
-    """Fit the quadric x^T M x + 2 b^T x = 1 to points, in coordinates where the points have equal spread along each
-    axis.
-    """
+    """Fit the quadric x^T M x + 2 b^T x = 1 to points, in coordinates in which all axes have equal spread."""
     mean_m = points_m.mean(axis=0)
     _, spread, axes = np.linalg.svd(points_m - mean_m, full_matrices=False)
     if not spread[-1] > 1e-9 * spread[0]:

@@ -1,6 +1,6 @@
 """Convert scenes to semantic voxels, in which layouts of any method are comparable (paper, Sec. 4.1 Metrics, Tab. 1).
 
-Only this module defines the class of a voxel:
+The class of a voxel follows these rules, which only this module implements:
 
 * A primitive fills a voxel if it contains the centre of the voxel. The test is exact for rotated boxes and ellipsoids
   and includes the boundary (EDGE_M). Of several primitives, the finer category wins (PRECEDENCE). The order of
@@ -46,7 +46,7 @@ EDGE_M = 1e-9  # A voxel centre this close to the boundary of a primitive counts
 LEVEL_AXIS = 1e-12  # An axis with a smaller |z| counts as horizontal.
 NUM_CLASSES = len(CLASS_COLORS)
 CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
-MAX_LEVELS = 64  # Number of bits in the integer of a column
+MAX_LEVELS = 64  # Number of bits in the integer of a column.
 PART_COLUMNS = 2**20  # Number of columns that are processed together, which takes 100 MB.
 
 assert sorted(PRECEDENCE) == sorted(CATEGORIES) and EMPTY == 0
@@ -103,7 +103,7 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
         (rows, cols, levels) uint8 class ids. Rows and columns have the order of the rasters; levels ascend.
     """
     rows, cols, levels = voxels.shape
-    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # entry k has the bits of all levels below k
+    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # Entry k has the bits of all levels below k.
     place = np.empty(len(CATEGORIES), np.int64)
     place[[CATEGORY_INDEX[name] for name in PRECEDENCE]] = np.arange(len(PRECEDENCE))
     filled = np.zeros((len(PRECEDENCE), rows * cols), np.uint64)
@@ -149,7 +149,10 @@ def _unpack_grid(planes: np.ndarray, levels: int) -> np.ndarray:
 
 
 def _find_levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first level with its centre in [low, high] and the level after the last; equal if there is none."""
+    """Return the first level with its centre in [low, high] and the level after the last one.
+
+    Both numbers are equal if no centre lies in the interval.
+    """
     first = np.ceil((low_m - EDGE_M - voxels.bottom_m) / voxels.step_m - 0.5).clip(0, voxels.levels)
     beyond = np.floor((high_m + EDGE_M - voxels.bottom_m) / voxels.step_m + 0.5).clip(0, voxels.levels)
     return first.astype(np.int8), np.maximum(first, beyond).astype(np.int8)
@@ -175,10 +178,10 @@ def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.nd
 class _Runs(NamedTuple):
     """Intersections of m vertical lines through column centres with primitives."""
 
-    column: np.ndarray  # (m,) flat index of the column
-    primitive: np.ndarray  # (m,) index of the primitive in the scene
-    low_m: np.ndarray  # (m,) z of the lower end; rounding errors can place it above high_m
-    high_m: np.ndarray  # (m,) z of the upper end
+    column: np.ndarray  # (m,) flat index of the column.
+    primitive: np.ndarray  # (m,) index of the primitive in the scene.
+    low_m: np.ndarray  # (m,) z of the lower end; rounding errors can place it above high_m.
+    high_m: np.ndarray  # (m,) z of the upper end.
 
 
 def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
@@ -319,7 +322,7 @@ def count_outside(scene: Scene, voxels: VoxelGrid) -> OutsideCounts:
     surface_m, _ = _voxelize_ground(scene, voxels)
     known = np.isfinite(surface_m)
     beyond = known & ((surface_m < voxels.bottom_m) | (surface_m >= voxels.top_m))
-    half_m = np.abs(scene.rotation[:, 2]).astype(np.float64) * scene.size_m / 2  # Extent of each half axis along z
+    half_m = np.abs(scene.rotation[:, 2]).astype(np.float64) * scene.size_m / 2  # Extent of each half axis along z.
     reach_m = np.where(scene.category == ELLIPSOID, np.sqrt((half_m**2).sum(axis=1)), half_m.sum(axis=1))
     low_m, high_m = scene.center_m[:, 2] - reach_m, scene.center_m[:, 2] + reach_m
     partly = (low_m < voxels.bottom_m) | (high_m > voxels.top_m)

@@ -17,7 +17,7 @@ JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 POINTS, TRIANGLES = 0, 4
-HARMLESS = {"KHR_materials_unlit", "KHR_mesh_quantization"}  # Required extensions that do not affect the reader
+HARMLESS = {"KHR_materials_unlit", "KHR_mesh_quantization"}  # Required extensions that do not affect the reader.
 MOVES_VERTICES = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing"}
 FAR_M = 1e6
 # Limit on vertices and triangle corners after placement, because a small file can place one mesh a million times.

@@ -23,16 +23,16 @@ import trimesh.visual
 from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
-GROUND = -1  # Value of `primitive` for a ground triangle
-ABOUT = (  # Scene-level fields that a file holds
+GROUND = -1  # Value of `primitive` for a ground triangle.
+ABOUT = (  # Scene-level fields that a file holds.
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
     *("vegetation_density", "vehicle_density", "ground_classes"),
 )
 
-# The glTF axes are +z forward, +y up and +x left; the scene axes are x, z and y. The permutation is cyclic and
-# therefore a proper rotation.
+# In glTF, +z points forward, +y points up and +x points left. These are the x, z and y axes of the scene frame. The
+# permutation is cyclic and therefore a proper rotation.
 GLTF_FROM_SCENE = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF constants for buffers of vertices and of indices
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963  # glTF constants for buffers of vertices and of indices.
 
 
 class Triangles(NamedTuple):
@@ -172,7 +172,7 @@ def export_glb(scene: Scene) -> bytes:
     * `<category>_<index>` is the node of a primitive. Its extras hold category, class id, colour, label, instance id
       and the exact parameters.
 
-    The extras of the file hold the grid and the fields of ABOUT. mesh_import.py reads the same scene from the file,
+    The extras of the file hold the grid and the fields of ABOUT. From this file, mesh_import.py reads the same scene,
     except that only the fused ground is kept. Colours are in linear light, as glTF requires. A viewer then shows the
     sRGB values of the palette.
 

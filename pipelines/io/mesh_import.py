@@ -11,10 +11,10 @@ Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), wi
 * The class of a vertex is the palette colour within COLOR_TOLERANCE (mesh_segmentation.py) of its vertex or material
   colour. The reader chooses between sRGB and linear light (the glTF standard) by comparing the colours of the file with
   the palette. It ignores textures.
-* Ground has one vertex per occupied pixel, with or without triangles. The vertex of pixel (i, j) lies at the corner x =
-  64 - .25 i, y = -32 + .25 j (y right) as in the authors' grid, or at the pixel centre as in this project's exports. On
-  the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the nearest vertex
-  with a class colour.
+* Ground has one vertex per occupied pixel, with or without triangles. In the authors' grid, the vertex of pixel (i, j)
+  lies at its corner x = 64 - .25 i, y = -32 + .25 j (y right). In exports of this project, the vertex lies at the pixel
+  centre. On the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the
+  nearest vertex with a class colour.
 * Primitives are connected pieces of one class. A mesh may hold any number of primitives. The reader first merges
   vertices that are repeated along edges. A piece with eight vertices is a box, fitted to its edges. A piece with more
   vertices is an ellipsoid, fitted as a quadric for any triangulation. Boxes of vegetation become vegetation_cuboid.
@@ -58,7 +58,7 @@ from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
 # Changes below this value are rounding errors and no edits: relative change of a size, or change of a yaw (rad).
 UNMOVED = 1e-4
-MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid
+MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid.
 
 
 def import_glb(

@@ -13,9 +13,9 @@ from models.scene import ELLIPSOID, Grid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY, GROUND_CLASS_ID
 
 COLOR_TOLERANCE = 12  # Tolerance per channel, of 255. Dark colours stored as 8-bit linear light are off by up to 7.
-FAR = 64  # Limit on the colour distance of one vertex (of 255) in the comparison of sRGB with linear light
-ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre
-MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes
+FAR = 64  # Limit on the colour distance of one vertex (of 255) in the comparison of sRGB with linear light.
+ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre.
+MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes.
 VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # Both classes have the same colour.
 CLASS_IDS = np.array(sorted(set(CLASS_ID.values()) - {VEGETATION[1]}))
 IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values()))

@@ -19,11 +19,11 @@ from scipy.interpolate import CubicSpline
 from models.scene import Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
-KNOT_M = 5.0  # Distance between points of a reference line
-LANE_M = 3.5  # One lane per side for about this half width of a road
-LEAST_ROAD_M = 2.0  # Minimum length of a road between its junctions
-CLEAR = 1.3  # Distance of road ends from a node, in half widths of the widest road
-SAMPLES = 64  # Number of samples per cubic that measure its length
+KNOT_M = 5.0  # Distance between points of a reference line.
+LANE_M = 3.5  # One lane per side for about this half width of a road.
+LEAST_ROAD_M = 2.0  # Minimum length of a road between its junctions.
+CLEAR = 1.3  # Distance of road ends from a node, in half widths of the widest road.
+SAMPLES = 64  # Number of samples per cubic that measure its length.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
-"""Other methods' files -> what the evaluator reads: one Ray Data graph, one task per batch of files.
+"""Import files of other methods for the evaluation, in one Ray Data graph with one task per batch of files.
 
-GLB meshes become scene tables, source=imported-<name>; voxel grids, which no primitives can be had from, pictures from
-above. A file that cannot be read becomes a row of `rejects`.
+GLB meshes become scene tables with source=imported-<name>. Voxel grids contain no primitives and therefore become
+images from above. An unreadable file becomes a row of `rejects`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,16 @@ WANTED_SHARDS = 8
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """What to import: `files` below `base`, sorted, into `output` under a name."""
+    """Files to import, and the destination.
+
+    Attributes:
+        base: Directory of the files.
+        files: Sorted names relative to `base`.
+        kind: glb for meshes, npz for voxel grids.
+        axes: Directions of the axes of the files.
+        output: Output directory.
+        name: Name of the import.
+    """
 
     base: str
     files: tuple[str, ...]
@@ -41,36 +50,48 @@ class ImportRequest:
     name: str
 
     def shards(self) -> list[Shard]:
+        """Return the shards of the import."""
         count = -(-len(self.files) // self.files_per_shard)
         return [Shard(self.output, f"imported-{self.name}", "generated", k) for k in range(count)]
 
     @property
     def files_per_shard(self) -> int:
+        """Number of files per shard, except the last one."""
         return min(MAX_FILES_PER_SHARD, -(-len(self.files) // WANTED_SHARDS))
 
     def files_of(self, shard: Shard) -> Iterator[tuple[int, str, str]]:
-        """Index, scene id and URI of each of a shard's files."""
+        """Yield index, scene id and URI of each file of a shard."""
         start = shard.number * self.files_per_shard
         for index, file in enumerate(self.files[start : start + self.files_per_shard], start):
             yield index, make_scene_id(file), storage.join_uri(self.base, file)
 
     def pictures_path(self, shard: Shard) -> str:
+        """Return the path of the images of a shard of voxel grids."""
         return storage.join_uri(self.output, f".pictures-{self.name}", f"part-{shard.number:05d}.npz")
 
     @property
     def target(self) -> str:
+        """Path of the final file with the images of all voxel grids."""
         return storage.join_uri(self.output, f"{self.name}.npz")
 
 
 def make_scene_id(file: str) -> str:
-    """Name of a scene by its file: "night/007.glb" is night-007."""
+    """Return the scene id for a file name: "night/007.glb" gives night-007."""
     return file.rsplit(".", 1)[0].replace("/", "-")
 
 
 def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
-    """Directory and sorted relative names of the files that a directory or a glob names.
+    """Find the files of a directory or a glob pattern.
 
-    Raises ValueError if there is none, or if two would give scenes of one name.
+    Args:
+        pattern: Path or URI of a directory, or a pattern such as DIR/*.glb.
+        suffix: File name extension, such as .glb.
+
+    Returns:
+        Directory, and sorted names relative to it.
+
+    Raises:
+        ValueError: No file matches, or two files give the same scene id.
     """
     fixed = pattern
     while any(sign in fixed for sign in "*?[") or (suffix and fixed.endswith(suffix)):
@@ -80,12 +101,12 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
         files = [file for file in files if fnmatch(storage.join_uri(fixed, file), pattern)]
     if not files:
         raise ValueError(
-            f"{pattern}: no {suffix} files there; give a directory or a quoted pattern such as 'DIR/*{suffix}'"
+            f"{pattern} matches no {suffix} file; pass a directory or a quoted pattern such as 'DIR/*{suffix}'"
         )
     names = [make_scene_id(file) for file in files]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{pattern}: two files would both be scene {twice!r}; rename one")
+        raise ValueError(f"{pattern}: two files give the same scene id {twice!r}; rename one")
     return fixed, tuple(files)
 
 
@@ -93,7 +114,16 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
 
 
 def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, str], object]) -> tuple[list[str], list]:
-    """Return the scene ids of a shard's files and the results of `read(index, scene id, uri)`; write its rejects."""
+    """Read the files of a shard and write its rejects.
+
+    Args:
+        request: Import.
+        shard: Shard of the import.
+        read: Called with index, scene id and URI of each file.
+
+    Returns:
+        Scene ids of the readable files, and the results of `read`.
+    """
     names, contents, rejects = [], [], []
     for index, name, uri in request.files_of(shard):
         try:
@@ -106,11 +136,12 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
     return names, contents
 
 
-# Rejects are written before the shard and deleted after it: a shard without rejects is done, whenever its writer dies.
+# The writer writes rejects before the shard and deletes them after it. A shard without rejects is therefore complete,
+# even if its writer is killed.
 
 
 def write_tables(row: dict, request: ImportRequest) -> dict:
-    """Row in: number of a shard. Row out: its scene ids. Writes the shard's tables."""
+    """Import the GLB files of the shard number in `row` as tables, and return the number with the scene ids."""
     shard = request.shards()[row["shard"]]
 
     def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
@@ -129,7 +160,7 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
 
 
 def write_pictures(row: dict, request: ImportRequest) -> dict:
-    """Row in: number of a shard. Row out: its scene ids. Writes the shard's pictures next to the final file."""
+    """Import the voxel grids of the shard number in `row` as images, and return the number with the scene ids."""
     shard = request.shards()[row["shard"]]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
@@ -144,7 +175,7 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
 
 
 def make_pictures_shard(path: str) -> np.ndarray:
-    """(n, 256, 256, 3) uint8, as `write_pictures` left them."""
+    """Read the images that `write_pictures` wrote: (n, 256, 256, 3) uint8."""
     return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
 
 
@@ -152,17 +183,19 @@ def make_pictures_shard(path: str) -> np.ndarray:
 
 
 def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
-    """Import all files of a request. Another call resumes an interrupted one, and reads shards with rejects again.
+    """Import all files of a request.
+
+    A second call resumes an interrupted one and reads shards with rejects again.
 
     Args:
-        request: Files, and the name and directory of the import.
-        on_shard: Receives the number of files of each finished shard.
+        request: Files, name and output directory.
+        on_shard: Called with the number of files of each finished shard.
 
     Returns:
-        Content of imported-<name>.json: ids of the scenes, in order, and number of rejected files.
+        Content of imported-<name>.json: ids of the scenes in order, and number of rejected files.
 
     Raises:
-        ValueError: The output holds an import of other files under this name, or no file can be read.
+        ValueError: The output holds an import of other files under this name, or no file is readable.
     """
     record = storage.join_uri(request.output, f"imported-{request.name}.json")
     options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}
@@ -189,7 +222,7 @@ def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None 
     rejects = len(request.files) - len(scenes)
     if not scenes:
         reason = shards[0].read("rejects")["reason"][0]
-        raise ValueError(f"none of the {rejects} files could be read; the first: {reason}")
+        raise ValueError(f"none of the {rejects} files could be read; error of the first file: {reason}")
     if request.kind == "npz":
         parts = (make_pictures_shard(request.pictures_path(shard)) for shard in shards)
         write_npz(request.target, (part for part in parts if len(part)), len(scenes))

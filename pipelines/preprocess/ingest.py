@@ -1,9 +1,10 @@
-"""Raw drives -> Parquet tables: one Ray Data graph a pass, two passes (paper, supplement A).
+"""Convert raw drives to Parquet tables in two passes, with one Ray Data graph per pass (paper, supplement A).
 
-Pass 1 cuts scenes: one task per shard writes its own files to a staging directory, by temporary name and move, so
-that a killed task leaves nothing and a finished shard is never redone. Pass 2 knows the whole training split: it
-fixes density thresholds, slot counts and bounds, labels the scenes, and moves everything into place; dataset.json
-comes last and means "complete". The driver sees manifests only, never a scene.
+Pass 1 creates scenes. Each task writes the files of one shard to a staging directory, under a temporary name that it
+then renames. A killed task therefore leaves no partial file, and a finished shard is not written again. Pass 2 needs
+the whole training split. It computes density thresholds, slots per category and value bounds, labels the scenes, and
+moves all files to the dataset directory. It writes dataset.json last, which marks the dataset as complete. The driver
+process reads only manifests and never a scene.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ STAGING = ".staging"
 
 
 def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
-    """Ray task. A drive into the object store, once for all its shards; or why it cannot be read."""
+    """Ray task that reads a drive into the object store, once for all its shards; return a str if the read fails."""
     try:
         return read_drive(source, key)
     except ValueError as error:
@@ -42,7 +43,18 @@ def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
 
 
 def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[dict]:
-    """Yield manifests in order of completion; one Ray task per shard, and one more per drive with several shards."""
+    """Yield manifests in order of completion, from one Ray task per shard.
+
+    A drive with several shards has one more task, which reads the drive.
+
+    Args:
+        tasks: Shards to write.
+        staging: Staging directory.
+        grid: Raster grid of the scenes.
+
+    Yields:
+        Manifest of each shard.
+    """
     finished = set(storage.list_files(storage.join_uri(staging, "manifest"), ".json"))
     todo = [task for task in tasks if make_manifest_path(staging, task) not in finished]
     shards_of = Counter((task.source, part.key) for task in todo for part in task.parts)
@@ -58,7 +70,7 @@ def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[d
         return found
 
     def write(row: dict) -> dict:
-        """Row in: number of a task. Row out: its manifest."""
+        """Write the shard of the task number in the row, and return its manifest."""
         return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
@@ -70,10 +82,22 @@ def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[d
 
 
 def publish_shards(root: str, staging: str, manifests: list[dict], statistics: Statistics) -> None:
-    """Label the scenes and move every staged file into place. Safe to repeat after a crash at any point."""
+    """Label the scenes and move all staged files to the dataset directory.
+
+    The function can run again after a crash at any point.
+
+    Args:
+        root: Dataset directory.
+        staging: Staging directory.
+        manifests: Manifests of all shards.
+        statistics: Statistics of the training split.
+    """
 
     def move(row: dict) -> dict:
-        """Row in: a shard. Row out: the same, now visible. Its scenes come last: they name the shard."""
+        """Move the files of the shard in the row.
+
+        The scenes are last, because their file marks the shard as written.
+        """
         staged, final = (Shard(base, row["source"], row["split"], row["number"]) for base in (staging, root))
         moved = ["primitives", "rasters"] * bool(row["scenes"]) + ["rejects"] * bool(row["rejects"])
         for table in moved:
@@ -95,10 +119,18 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What a run of `ingest` did."""
+    """Result of a run of `ingest_drives`.
 
-    scenes: dict[str, int]  # split -> scenes
-    rejects: dict[str, int]  # reason -> scenes
+    Attributes:
+        scenes: Number of scenes by split.
+        rejects: Number of rejected scenes by reason.
+        duplicates: Number of dropped duplicate objects.
+        seconds: Duration of the run (s).
+        already_complete: Whether an earlier run had completed the dataset.
+    """
+
+    scenes: dict[str, int]
+    rejects: dict[str, int]
     duplicates: int
     seconds: float
     already_complete: bool = False
@@ -113,22 +145,37 @@ def ingest_drives(
     skip_unreadable: bool = False,
     on_shard: Callable[[dict], None] | None = None,
 ) -> IngestResult:
-    """Write the dataset directory `root`. Another call resumes an interrupted one.
+    """Write a dataset directory.
 
-    dataset.json records `options`, the user's options; a directory with other options is refused. An unreadable drive
-    stops the run with a ValueError after all other drives are staged, unless `skip_unreadable` is set.
+    A second call resumes an interrupted one.
+
+    Args:
+        tasks: Shards to write.
+        root: Dataset directory.
+        options: Options of the user, which dataset.json records.
+        slots: Number of slots per category (default: 95th percentiles of the counts in the training split).
+        grid: Raster grid of the scenes (default: the paper's).
+        skip_unreadable: Whether unreadable drives become rejects. Otherwise, the run raises an error after all other
+            drives are staged.
+        on_shard: Called with the manifest of each finished shard.
+
+    Returns:
+        Number of scenes and rejects.
+
+    Raises:
+        ValueError: The directory has other options, no drive exists, or a drive is unreadable.
     """
     started = time.perf_counter()
     grid = grid or Grid()
     description, staging = storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING)
     _refuse_other_options(root, options)
     if storage.exists(description):
-        storage.delete_directory(staging)  # of a run that was killed while it tidied up
+        storage.delete_directory(staging)  # A run that was killed during its last step leaves the staging directory.
         made = storage.read_json(description)
         rejects, duplicates = made.get("rejects", {}), made.get("duplicates", 0)
         return IngestResult(made["scenes"], rejects, duplicates, time.perf_counter() - started, already_complete=True)
     if not tasks:
-        raise ValueError("there is nothing to preprocess: no drive was found")
+        raise ValueError("no drive was found; check the input directory")
     storage.clean_temporaries(root)
     storage.write_json(options, storage.join_uri(staging, "options.json"))
 
@@ -142,8 +189,8 @@ def ingest_drives(
     if unreadable and not skip_unreadable:
         more = f" (and {len(unreadable) - 1} more)" if len(unreadable) > 1 else ""
         raise ValueError(
-            f"{unreadable[0]}{more}. All other drives are staged: repair the file and run the same command again, "
-            "or add --skip-unreadable to leave it out"
+            f"{unreadable[0]}{more}. All other drives are staged. Repair the file and run the same command again, "
+            "or add --skip-unreadable to skip the drive"
         )
     statistics = ray.get(ray.remote(compute_training_statistics).remote(manifests, staging, grid, slots))
     publish_shards(root, staging, manifests, statistics)
@@ -172,7 +219,7 @@ def ingest_drives(
 
 
 def _refuse_other_options(root: str, options: dict) -> None:
-    """Raises ValueError if `root` was made, or begun, with other options."""
+    """Raise ValueError if an earlier run wrote to `root` with other options."""
     for path in (storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING, "options.json")):
         if storage.exists(path):
             recorded = storage.read_json(path)

@@ -1,6 +1,6 @@
-"""Write one shard: read its drives, cut its scenes, write its tables and a manifest.
+"""Write one shard: read its drives, crop its scenes, and write its tables and a manifest.
 
-A worker holds a few scenes at a time, regardless of the length of the drive.
+A worker keeps at most BATCH_SCENES scenes in memory, even for a long drive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,18 @@ ReadDrive = Callable[[str, tuple], tuple[Drive, dict]]
 
 
 def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
-    """Read a drive, and report what its reader dropped. Raises ValueError naming a file that cannot be read."""
+    """Read a drive and report the objects that its reader dropped.
+
+    Args:
+        source: town, kitti360, av2 or own.
+        key: Arguments of the reader of the source.
+
+    Returns:
+        The drive, and the report as a dictionary, which is empty for most sources.
+
+    Raises:
+        ValueError: A file cannot be read; the message names the file.
+    """
     if source == "town":
         seed, num_scenes = key
         drive = generator.generate_town(seed)
@@ -43,39 +54,54 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
 
 
 class Rejected(ValueError):
-    """The reason why a scene is left out."""
+    """Error with the reason why a scene becomes a reject."""
 
 
 def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
-    """Cut the scene ahead of a pose. Raises Rejected."""
+    """Crop the scene ahead of a pose.
+
+    Args:
+        drive: Drive.
+        pose: Index of the pose.
+        split: Value of the split column.
+        grid: Raster grid of the scene.
+
+    Returns:
+        The scene.
+
+    Raises:
+        Rejected: The scene is empty, or its ground heights exceed the range of the tables.
+    """
     try:
         scene = drive.scene(pose, split, grid)
     except ValueError as error:
         raise Rejected(str(error)) from error
     highest_m = np.abs(scene.height_m).max(initial=0)
     if not highest_m <= MAX_HEIGHT_M:
-        raise Rejected(f"ground at {highest_m:.3g} m from the vehicle's height, tables hold {MAX_HEIGHT_M:g} m")
+        raise Rejected(
+            f"the ground lies {highest_m:.3g} m above or below the vehicle, but tables hold at most {MAX_HEIGHT_M:g} m"
+        )
     # The paper drops poses without any annotation (supplement A).
     if len(scene) == 0 and not scene.occupied.any():
-        raise Rejected("nothing is annotated in the crop")
+        raise Rejected("the crop holds no annotation")
     return scene
 
 
 def _check_poses(drive: Drive, part: ShardPart, poses: tuple[int, ...]) -> Drive:
-    """Return the drive. Raises ValueError unless it has the planned poses of the part."""
+    """Return the drive, or raise ValueError if its poses differ from the planned poses of the part."""
     if drive.frame.take(poses, mode="clip").tolist() != list(part.frames or ()):
-        raise ValueError(f"{part.sequence}: its poses changed after this run began; run the same command again")
+        raise ValueError(f"the poses of {part.sequence} changed after this run began; run the same command again")
     return drive
 
 
 class ShardCut:
-    """Cuts the scenes of a task, one after another, and lists rejected scenes and unreadable drives."""
+    """Iterator over the scenes of a task, which collects rejected scenes and unreadable drives."""
 
     def __init__(self, task: ShardTask, grid: Grid, read: ReadDrive = read_drive) -> None:
         self.task, self.grid, self.read = task, grid, read
         self.rejects: list[dict] = []
-        self.unreadable: list[str] = []  # reasons, one per drive
-        self.reports: dict[str, dict] = {}  # sequence -> report of what its reader dropped
+        self.unreadable: list[str] = []  # One reason per unreadable drive.
+        self.reports: dict[str, dict] = {}  # Report on dropped objects, by sequence.
 
     def __iter__(self) -> Iterator[Scene]:
         for part in self.task.parts:
@@ -100,7 +126,14 @@ class ShardCut:
 
 
 def compute_extremes(scenes: list[Scene]) -> Extremes:
-    """The lowest and highest of what a model normalises; a name is absent where there is nothing to measure."""
+    """Return the lowest and highest values of the quantities that a model normalises.
+
+    Args:
+        scenes: Scenes.
+
+    Returns:
+        Extremes of cholesky (m^0.5), height (m) and z (m); a name without values is absent.
+    """
     values = {
         "cholesky": np.concatenate([compute_cholesky_parameters(s.rotation, s.size_m) for s in scenes]),
         "height": np.concatenate([s.height_m[s.occupied] for s in scenes])[:, None],
@@ -110,7 +143,14 @@ def compute_extremes(scenes: list[Scene]) -> Extremes:
 
 
 def join_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
-    """The tables of one shard from those of its batches of scenes."""
+    """Concatenate the tables of several batches of scenes to the tables of one shard.
+
+    Args:
+        parts: Tables of each batch by name.
+
+    Returns:
+        Tables of the shard by name, with updated primitive offsets.
+    """
     tables = {name: pa.concat_tables([part[name] for part in parts]) for name in parts[0]}
     scenes = tables["scenes"]
     count = scenes["num_primitives"].to_numpy().astype(np.int64)
@@ -120,13 +160,32 @@ def join_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
 
 
 def make_manifest_path(staging: str, task: ShardTask) -> str:
+    """Return the path of the manifest of a task.
+
+    Args:
+        staging: Staging directory.
+        task: Task.
+
+    Returns:
+        Path or URI of the JSON file.
+    """
     return storage.join_uri(staging, "manifest", f"{task.source}-{task.split}-{task.number:05d}.json")
 
 
 def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
-    """Row in: a task. Row out: its manifest. One shard per task; a finished one is not redone.
+    """Write one shard and its manifest; a finished shard is not written again.
 
-    It is redone if it was cut from other parts: a drive was added, or its poses repaired, since the run began.
+    A finished shard is written again if its parts changed since the run began, because a drive was added or its poses
+    were repaired.
+
+    Args:
+        task: Shard to write.
+        staging: Staging directory.
+        grid: Raster grid of the scenes.
+        read: Reader of a drive.
+
+    Returns:
+        The manifest.
     """
     path, shard = make_manifest_path(staging, task), task.shard(staging)
     parts = hashlib.blake2b(repr(task.parts).encode(), digest_size=16).hexdigest()
@@ -145,7 +204,8 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
     if tables:
         joined = join_tables(tables)
         num_scenes = len(joined["scenes"])
-        for name in ("primitives", "rasters", "scenes"):  # a shard is there when its scenes are
+        # A shard counts as written once its scenes exist, so its scenes are written last.
+        for name in ("primitives", "rasters", "scenes"):
             storage.write_parquet(joined[name], shard.path(name))
     if cuts.rejects:
         storage.write_parquet(make_rejects_table(cuts.rejects), shard.path("rejects"))
@@ -162,6 +222,6 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
         "ground_classes": list(classes),
         "seconds": time.perf_counter() - started,
     }
-    if not cuts.unreadable:  # a file that gets repaired is read again
+    if not cuts.unreadable:  # The shard is written again after a repair of the unreadable file.
         storage.write_json(manifest, path)
     return manifest

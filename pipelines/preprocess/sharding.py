@@ -1,4 +1,4 @@
-"""The shards of a dataset, planned before any scene is cut, so that runs resume and scale by shard."""
+"""Plan the shards of a dataset before any scene is created; runs resume and scale by shard."""
 
 from __future__ import annotations
 
@@ -14,24 +14,31 @@ from pipelines.schema.splits import ARGOVERSE2_SPLIT, TEST, TRAIN, UNUSED, make_
 from pipelines.schema.tables import Shard
 
 SHARD_SCENES = 256
-LOGS_PER_SHARD = 2  # Argoverse 2: about 160 sweeps each
+LOGS_PER_SHARD = 2  # Argoverse 2 has about 160 sweeps per log.
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ShardPart:
-    """Some poses of one drive. `key` holds the arguments that its source's reader needs (shard_writer.read_drive)."""
+    """Some poses of one drive.
+
+    Attributes:
+        key: Arguments of the reader of the source (shard_writer.read_drive).
+        sequence: Name of the drive.
+        poses: Indices of the poses; None means all poses.
+        frames: Frames of these poses, used in the rejects of an unreadable drive.
+    """
 
     key: tuple
     sequence: str
-    poses: tuple[int, ...] | None = None  # None: all
-    frames: tuple[int, ...] | None = None  # of those poses, for the rejects of a drive that cannot be read
+    poses: tuple[int, ...] | None = None
+    frames: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
 class ShardTask:
-    """One shard to write: its source, split, number and parts."""
+    """A shard to write: source, split, number and parts."""
 
     source: str
     split: str
@@ -39,11 +46,28 @@ class ShardTask:
     parts: tuple[ShardPart, ...]
 
     def shard(self, root: str) -> Shard:
+        """Return the shard in a dataset directory.
+
+        Args:
+            root: Dataset directory.
+
+        Returns:
+            The shard.
+        """
         return Shard(root, self.source, self.split, self.number)
 
 
 def plan_town(num_train: int, num_test: int, seed: int) -> list[ShardTask]:
-    """Plan one task per town."""
+    """Plan one task per town.
+
+    Args:
+        num_train: Number of training scenes.
+        num_test: Number of test scenes.
+        seed: Seed that selects the towns.
+
+    Returns:
+        The tasks.
+    """
     plan = [
         (split, ShardPart((town_seed, count), f"{town_seed:05d}"))
         for town_seed, split, count in generator.plan_town_parts(num_train, num_test, seed)
@@ -52,9 +76,18 @@ def plan_town(num_train: int, num_test: int, seed: int) -> list[ShardTask]:
 
 
 def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:
-    """Tasks of at most SHARD_SCENES poses of one sequence and one side of the paper's split.
+    """Plan tasks of at most SHARD_SCENES poses of one sequence and one split.
 
-    Raises ValueError for missing or broken poses, unless `skip_unreadable`: then the sequence becomes a reject.
+    Args:
+        root: Directory of KITTI-360.
+        split: Whether to use the paper's split; otherwise all poses are train.
+        skip_unreadable: Whether a sequence with missing or invalid poses becomes a reject instead of an error.
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: Poses are missing or invalid, and skip_unreadable is False.
     """
     poses, unreadable = _read_poses(
         kitti360.list_sequences(root), lambda name: kitti360.read_poses(root, name), skip_unreadable
@@ -65,7 +98,19 @@ def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) 
 
 
 def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:
-    """Tasks of at most SHARD_SCENES poses of one own drive and one side of splits.json, or of the paper's split."""
+    """Plan tasks of at most SHARD_SCENES poses of one own drive and one split.
+
+    Args:
+        root: Directory of all drives.
+        split: Whether to use the paper's split if splits.json is absent; otherwise all poses are train.
+        skip_unreadable: Whether a drive with missing or invalid poses becomes a reject instead of an error.
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: Poses are missing or invalid, and skip_unreadable is False; or no drive has ground.
+    """
     poses, unreadable = _read_poses(
         custom.list_drives(root), lambda name: custom.read_poses(root, name), skip_unreadable
     )
@@ -82,7 +127,14 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
 
 
 def plan_argoverse2(root: str) -> list[ShardTask]:
-    """Tasks of a few logs each; AV2's own train is train, its val is test."""
+    """Plan tasks of LOGS_PER_SHARD logs each; train logs become train, and val logs become test.
+
+    Args:
+        root: Directory of the sensor dataset.
+
+    Returns:
+        The tasks.
+    """
     plan = []
     for theirs, side in ARGOVERSE2_SPLIT.items():
         logs = [log for split, log in argoverse2.list_logs(root) if split == theirs]
@@ -93,21 +145,21 @@ def plan_argoverse2(root: str) -> list[ShardTask]:
     return _number_tasks("av2", plan)
 
 
-Poses = tuple[np.ndarray, np.ndarray]  # frame (p,), world_from_imu (p, 3, 4)
+Poses = tuple[np.ndarray, np.ndarray]  # frame (p,) and world_from_imu (p, 3, 4)
 
 
 def _read_poses(
     names: list[str], read: Callable[[str], Poses], skip_unreadable: bool
 ) -> tuple[dict[str, Poses], list[str]]:
-    """Return the poses of the drives that have them, and the names of the other drives."""
+    """Return the poses of all readable drives, and the names of the other drives."""
     poses, unreadable = {}, []
     for name in names:
         try:
             poses[name] = read(name)
         except ValueError as error:
             if not skip_unreadable:
-                raise ValueError(f"{error}. Or add --skip-unreadable to leave this drive out") from error
-            logger.warning("left out: %s", error)
+                raise ValueError(f"{error}. Or add --skip-unreadable to skip this drive") from error
+            logger.warning("skipped a drive: %s", error)
             unreadable.append(name)
     return poses, unreadable
 
@@ -115,9 +167,9 @@ def _read_poses(
 def _plan_drives(
     source: str, keys: dict[str, tuple], frames: dict[str, np.ndarray], labels: dict[str, np.ndarray]
 ) -> list[ShardTask]:
-    """Make tasks drive after drive, so that consecutive tasks share the drive that they read.
+    """Plan tasks one drive after the other, so that consecutive tasks share a drive in memory.
 
-    A drive without frames is unreadable: its task fails to read it and writes one reject.
+    A drive without frames is unreadable. Its task fails to read the drive and writes one reject.
     """
     plan = [(UNUSED, (ShardPart(key, name),)) for name, key in keys.items() if name not in frames]
     for name, frame in frames.items():
@@ -131,7 +183,7 @@ def _plan_drives(
 
 
 def _number_tasks(source: str, plan: list[tuple[str, tuple[ShardPart, ...]]]) -> list[ShardTask]:
-    """Make tasks from (split, parts), with shards numbered within their split."""
+    """Make tasks from (split, parts), and number the shards within each split."""
     tasks: list[ShardTask] = []
     numbers: dict[str, int] = dict.fromkeys((TRAIN, TEST, UNUSED), 0)
     for split, parts in plan:

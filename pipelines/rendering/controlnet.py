@@ -18,7 +18,7 @@ from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 from pipelines.schema.run_guard import find_changed_option
 
-SKY = (70, 130, 180)  # Sky colour of the KITTI-360 and Cityscapes palette, used where a street view is empty
+SKY = (70, 130, 180)  # Sky colour of the KITTI-360 and Cityscapes palette, used where a street view is empty.
 MULTIPLE_PX = 8  # Width and height of the network's images are multiples of this value.
 
 

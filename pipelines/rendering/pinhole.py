@@ -20,7 +20,7 @@ from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, fin
 from pipelines.io.mesh_export import GROUND, Triangles, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY
 
-NEAR_M = 0.1  # Surfaces closer to the camera are invisible.
+NEAR_M = 0.1  # Surfaces closer to the camera than this distance are invisible.
 # Rotation for a camera that looks along x
 CAMERA_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -264,7 +264,8 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     # In pixel coordinates, the direction is d = J (u, v, 1).
     pixels = np.array([[1 / lens.fx, 0, -lens.cx / lens.fx], [0, 1 / lens.fy, -lens.cy / lens.fy], [0, 0, 1]])
     k = pixels.T @ cone @ pixels
-    # Rows are valid where the discriminant in u is positive: a quadratic in v that opens downwards.
+    # The ellipsoid covers a row where the discriminant in u is positive. The discriminant is a quadratic in v
+    # that opens downwards.
     qa = k[:, 0, 1] ** 2 - k[:, 0, 0] * k[:, 1, 1]
     qb = k[:, 0, 1] * k[:, 0, 2] - k[:, 0, 0] * k[:, 1, 2]
     qc = k[:, 0, 2] ** 2 - k[:, 0, 0] * k[:, 2, 2]

@@ -21,7 +21,7 @@ from pipelines.io.mesh_export import triangulate_cuboids
 from pipelines.rendering.shading import render_lit
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
-MARK_COLOR = (230, 0, 0)  # sRGB colour of lines over an image
+MARK_COLOR = (230, 0, 0)  # sRGB colour of lines over an image.
 
 
 def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:

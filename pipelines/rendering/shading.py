@@ -25,12 +25,12 @@ from pipelines.geometry.rasterize import cast_rays_down
 from pipelines.io.mesh_export import make_unit_cuboid, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
 
-PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids after those of the classes
+PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids after those of the classes.
 _SRGB = np.vstack([CLASS_COLORS, [[226, 228, 232], [243, 245, 248]]]) / 255
 LINEAR_COLORS = (_SRGB**2.2).astype(np.float32)
 
-SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0  # Direction of the sun's rays, defined like a camera direction
-SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0  # Direction of the sun's rays, defined like a camera direction.
+SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface.
 SKY = 1 - SUN
 SHADOW_PX, SHADOW_BIAS_PX = 900, 1.2
 # Height map: pixels along the longer side, standard deviation of the blur, margin around the grid
@@ -38,7 +38,7 @@ SKY_PX, NEARBY_M, MARGIN_M = 640, 1.6, 12.0
 # Share of light removed on a line between two primitives, and between two faces of one primitive
 OUTLINE, CREASE = 0.5, 0.25
 
-SCENERY = 0  # Part number of ground, plate and table, which have no lines between them
+SCENERY = 0  # Part number of ground, plate and table, which have no lines between them.
 
 
 class Faces(NamedTuple):
@@ -155,7 +155,7 @@ def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
     rows, cols = sheet_m.shape
     x, y = np.linspace(grid.front_m, grid.back_m, rows), np.linspace(grid.left_m, grid.right_m, cols)
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), sheet_m], axis=-1)
-    rim = np.concatenate([top[0], top[1:, -1], top[-1, -2::-1], top[-2::-1, 0]])  # clockwise seen from above
+    rim = np.concatenate([top[0], top[1:, -1], top[-1, -2::-1], top[-2::-1, 0]])  # Clockwise seen from above.
     foot = rim * [1, 1, 0] + [0, 0, table_z_m]
     corners = np.concatenate([_make_quads(top), _make_quads(np.stack([foot, rim]))])
     return Faces(corners, np.full(len(corners), PLATE, np.uint8), np.full(len(corners), SCENERY))
@@ -205,7 +205,7 @@ def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray
     """(H, W) share of the sun in [0, 1] at each point, from a shadow map averaged over neighbouring pixels."""
     blocker = _add_rim(_find_top(scene, solid, sun), -np.inf)
     x, y, z = (a * point[0] + b * point[1] + c * point[2] for a, b, c in sun.camera_from_scene.tolist())
-    z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # larger at grazing incidence
+    z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # The bias is larger at grazing incidence.
     pixel = _project_flat(sun.view, x, y)
     free = np.zeros(z.shape, np.float32)
     neighbours = (0, 1, -1, SHADOW_PX, -SHADOW_PX)

@@ -59,7 +59,7 @@ def _list_colors_by_class_id() -> np.ndarray:
 
 
 CLASS_COLORS = _list_colors_by_class_id()  # (18, 3) uint8 sRGB; row k is the colour of class id k; EMPTY is white.
-CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) class id of each category
+CATEGORY_IDS = np.array([CATEGORY_CLASS_ID[name] for name in CATEGORIES], np.uint8)  # (11,) class id of each category.
 
 assert set(GROUND_CLASS_ID) == set(GROUND_CLASSES) and set(COLOR_HEX) == set(CLASS_ID)
 

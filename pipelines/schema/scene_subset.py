@@ -54,7 +54,7 @@ class SceneSubset:
             raise ValueError(f"apart_m is {self.apart_m}, expected a distance above 0")
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
-        """Return the selected rows of each shard that has at least one.
+        """Return each shard that has selected rows, together with the numbers of these rows.
 
         The first call makes the selection; later calls return the same result.
 

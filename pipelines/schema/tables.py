@@ -133,8 +133,8 @@ PRIMITIVES = _make_schema(
      "y of the centre in the scene frame: distance to the left of the ego vehicle."),
     ("z_m",         pa.float32(), "m",
      "z of the centre in the scene frame: height above the scene's origin, not above the ground."),
-    ("length_m",    pa.float32(), "m",   "Full extent along the length axis, the longer axis besides the height axis."),
-    ("width_m",     pa.float32(), "m",   "Full extent along the width axis, the shorter axis besides the height axis."),
+    ("length_m",    pa.float32(), "m",   "Full extent along the longer of the two axes other than the height axis."),
+    ("width_m",     pa.float32(), "m",   "Full extent along the shorter of the two axes other than the height axis."),
     ("height_m",    pa.float32(), "m",   "Full extent along the height axis, the axis closest to vertical."),
     ("yaw_rad",     pa.float32(), "rad", "Direction of the length axis in the scene frame, in [-pi/2, pi/2)."),
     ("heading_rad", pa.float32(), "rad",
@@ -183,7 +183,7 @@ EDITS = _make_schema(
     ("primitive",  pa.int32(),   "1",   "Number (from 0) of the primitive in the scene before this step."),
     ("change",     pa.string(),  "",    "Effect on the primitive: removed, copied or changed."),
     ("moved_m",    pa.float32(), "m",   "Displacement of the centre; for a copy, the distance from its original."),
-    ("turned_rad", pa.float32(), "rad", "Largest angle between an axis before and after the step, ignoring its sign."),
+    ("turned_rad", pa.float32(), "rad", "Largest angle by which an axis turned; opposite directions count as equal."),
     ("resized",    pa.float32(), "1",   "Largest relative change of length, width or height."),
 )
 

@@ -376,7 +376,7 @@ def test_write_shard_detects_poses_changed_during_run(raw, tmp_path):
     (task,) = plan_kitti360(str(root), split=False)
     path.write_text("".join(lines[:2]))
     manifest = write_shard(task, staging, CROP)
-    assert manifest["scenes"] == 0 and "0007: its poses changed after this run began" in manifest["unreadable"][0]
+    assert manifest["scenes"] == 0 and "the poses of 0007 changed after this run began" in manifest["unreadable"][0]
     path.write_text("".join([*lines[:3], lines[3].replace(str(task.parts[0].frames[3]), "99999", 1)]))
     assert write_shard(task, staging, CROP)["unreadable"]
 

@@ -187,7 +187,7 @@ def test_preprocess_rejects_bad_scene_and_keeps_others(cluster, tmp_path, monkey
 
 
 def test_preprocess_rejects_empty_training_split(cluster, tmp_path):
-    with pytest.raises(ValueError, match="nothing to preprocess"):
+    with pytest.raises(ValueError, match="no drive was found"):
         ingest.ingest_drives([], str(tmp_path), {})
     only_test = [task for task in plan_town(24, 8, 0) if task.split == "test"]
     with pytest.raises(ValueError, match="the training split is empty"):

@@ -112,16 +112,16 @@ def test_import_rejects_input_without_scenes(cluster, tmp_path):
     from jobs.import_scenes import Config
 
     (tmp_path / "a.glb").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"none of the 1 files could be read; the first: .*a\.glb"):
+    with pytest.raises(ValueError, match=r"none of the 1 files could be read; error of the first file: .*a\.glb"):
         import_scenes(Config(str(tmp_path), output=str(tmp_path / "out")))
-    with pytest.raises(ValueError, match=r"no \.npz files there"):
+    with pytest.raises(ValueError, match=r"matches no \.npz file"):
         import_scenes(Config(str(tmp_path), format="npz"))
     with pytest.raises(ValueError, match=r"--name is 'a/b'"):
         import_scenes(Config(str(tmp_path), name="a/b"))
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub/b.glb").write_bytes(b"x")
     (tmp_path / "sub-b.glb").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"two files would both be scene 'sub-b'"):
+    with pytest.raises(ValueError, match=r"two files give the same scene id 'sub-b'"):
         import_scenes(Config(str(tmp_path)))
 
 

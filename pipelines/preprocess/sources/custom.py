@@ -53,16 +53,17 @@ PANDAS_INDEX = "__index_level_0__"  # pandas adds this column automatically.
 # Categories whose x axis is the direction of travel, unless heading_known is set.
 HEADED = tuple(CATEGORY_INDEX[name] for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human"))
 
-MAX_COORDINATE_M = 1e7  # UTM northings reach this value.
+MAX_COORDINATE_M = 1e7  # Largest valid world coordinate; UTM northings reach this value.
 MAX_HEIGHT_M = 1e4
 MIN_SIZE_M = 1e-3
 MAX_SIZE_M = 1e3
 MAX_YAW_RAD = 6.2832  # One full turn in each direction; larger values are probably degrees.
 MAX_WHOLE = 2**63 - 1
 MAX_EXACT_FLOAT = 2**53
-# Minimum cosine between the up axes of ego and world. Roads are less steep, and camera frames are less upright.
+# The cosine between the up axes of ego and world must reach this value. The cosine is larger on real roads
+# and smaller for camera frames.
 MIN_UP = 0.5
-SIGHT_M = 100.0  # A crop extends to 72 m.
+SIGHT_M = 100.0  # At least one pose must lie within this distance; a crop extends to 72 m.
 
 
 # ----------------------------------------------------------------------------------------------------- the root
@@ -206,7 +207,7 @@ class _Table:
 
     path: Path
     rows: int
-    columns: dict[str, list]  # Columns with at least one value
+    columns: dict[str, list]  # Columns with at least one value.
 
     def numbers(self, names: Sequence[str], low: float, high: float, unit: str = "") -> np.ndarray:
         """(rows, len(names)) float64 within low..high."""

@@ -17,7 +17,7 @@ from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
 from pipelines.geometry.rasterize import fill_polygon, rasterize_heights
 
 STATIC = -1
-EXTRUSION_M = 1e-3  # Maximum deviation of a slab's underside from a shifted copy of its top
+EXTRUSION_M = 1e-3  # Maximum deviation of a slab's underside from a shifted copy of its top.
 
 
 @dataclass(frozen=True)

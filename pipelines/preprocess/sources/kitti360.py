@@ -77,7 +77,7 @@ SPHERE_VERTICES = 63
 DUPLICATE_SIZE_M = 1e-3
 DUPLICATE_SHIFT_M = 0.5
 DUPLICATE_TURN_RAD = 0.01
-MAX_COORDINATE_M = 1e5  # The real world frame spans several km.
+MAX_COORDINATE_M = 1e5  # Largest valid coordinate; the real world frame spans several km.
 MAX_SIZE_M = 1e3
 MIN_SIZE_M = 1e-3
 # Minimum singular value of the unit axes. If two axes are closer than about 40 degrees, the box is invalid rather than
@@ -316,7 +316,8 @@ def _stream_objects(path: Path) -> Iterator[dict]:
         raise ValueError(
             f"{path} declares a document type or entities, which files of KITTI-360 never do; {again}"
         ) from error
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # Encodings cause the last two types of errors.
+    # Invalid encodings raise LookupError or ValueError.
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise ValueError(f"{path}: broken XML ({error}); {again}") from error
 
 

@@ -1,1 +1,1 @@
-"""The procedural town."""
+"""The procedural town, the built-in data source."""

@@ -1,4 +1,4 @@
-"""Single things and groups of them, drawn on a Sheet: sizes, cars, trees, hedges and walls, gardens. Metres."""
+"""Add single objects and groups of objects to a Sheet: cars, trees, hedges, walls and gardens (m)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
 Rect = tuple[float, float, float, float]  # s0, s1, t0, t1
 
-# label: median (l, w, h), spread of the common factor, spread of each extent, smallest and largest (l, w, h)
+# Per label: median (l, w, h), spread of the common factor, spread of each extent, smallest (l, w, h), largest (l, w, h)
 SIZES = {
     "building": ((16, 12, 11), 0.16, 0.14, (8, 6.5, 4), (34, 22, 24)),
     "garage": ((8, 6.4, 3.4), 0.10, 0.08, (5, 3, 2.4), (12, 9, 5)),
@@ -37,7 +37,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Site:
-    """A block under construction: the sheet it is drawn on, its randomness, its district and mood."""
+    """A block under construction: its sheet, random generator, district and mood."""
 
     sheet: Sheet
     rng: np.random.Generator
@@ -48,7 +48,7 @@ class Site:
 def draw_sizes(
     rng: np.random.Generator, what: str, n: int, scale: float | np.ndarray | tuple[float, float, float] = 1.0
 ) -> np.ndarray:
-    """(n, 3) random extents of a kind of object, in metres, length >= width; `scale` is one factor or (3,)."""
+    """Sample sizes (n, 3) of a kind of object, in metres, with length >= width; `scale` is one factor or (3,)."""
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
     drawn = (np.array(median) * scale * factor).clip(low, high)
@@ -59,14 +59,14 @@ def draw_sizes(
 def plant_strip(
     site: Site, frame: LocalFrame, ground_class: str, start: float, end: float, t0: float, t1: float, piece: float
 ) -> None:
-    """Slabs side by side from s = start to end, about `piece` long."""
+    """Add adjacent slabs from s = start to s = end, each about `piece` metres long."""
     cuts = np.linspace(start, end, max(1, round((end - start) / piece)) + 1).tolist()
     for a, b in pairwise(cuts):
         site.sheet.slab(frame, ground_class, [(a, t0), (b, t0), (b, t1), (a, t1)])
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
-    """Park cars at s; most point in the direction of the adjacent lane."""
+    """Park cars at s; most of them point in the direction of the adjacent lane."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
     site.sheet.boxes(
@@ -80,7 +80,7 @@ def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: floa
 
 
 def plant_trees(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray, what: str) -> None:
-    """Ellipsoids at (s, t): crowns of trees start above the ground, bushes on it."""
+    """Add ellipsoids at (s, t); tree crowns start above the ground, and bushes start on the ground."""
     n = len(s)
     scale = site.district.tree_scale * site.mood.tree_size if what == "tree" else 1.0
     size = draw_sizes(site.rng, what, n, scale)
@@ -91,7 +91,7 @@ def plant_trees(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray, wha
 def plant_border(
     site: Site, frame: LocalFrame, s0: float, t0: float, s1: float, t1: float, kind: str, cover: float
 ) -> None:
-    """A hedge or wall from (s0, t0) to (s1, t1), in pieces; `cover` is the share of its length that stands."""
+    """Build a hedge or wall from (s0, t0) to (s1, t1), in pieces; `cover` is the covered share of its length."""
     length = float(np.hypot(s1 - s0, t1 - t0))
     if length < 1.5:
         return
@@ -110,7 +110,7 @@ def plant_border(
     if kind == "hedge":
         site.sheet.boxes(frame, "vegetation", s, t, size, yaw + site.rng.normal(0, 0.03, n))
         return
-    # A wall keeps its thickness and height along its run.
+    # A wall has nearly constant thickness and height along its length.
     size[:, 1:] = size[0, 1:] * np.exp(0.08 * site.rng.standard_normal((n, 2)))
     label = np.array(["wall", "fence", "wall", "gate", "guardrail"])[site.rng.choice(5, p=[0.5, 0.3, 0.08, 0.1, 0.02])]
     site.sheet.boxes(frame, str(label), s, t, size, yaw)
@@ -119,7 +119,7 @@ def plant_border(
 def plant_garden(
     site: Site, frame: LocalFrame, width: float, depth: float, taken: list[Rect], lush: float = 1.0
 ) -> None:
-    """Shrubs, bushes and trees in a rectangle, outside the `taken` rectangles (s0, s1, t0, t1)."""
+    """Plant shrubs, bushes and trees in a rectangle, outside the `taken` rectangles (s0, s1, t0, t1)."""
     free = width * depth - sum((b - a) * (d - c) for a, b, c, d in taken)
     wanted = (
         ("shrub", site.district.shrubs_per_100m2 * site.mood.green),
@@ -135,7 +135,7 @@ def plant_garden(
         s, t = s[clear][:n], t[clear][:n]
         if what == "shrub":
             size = draw_sizes(site.rng, "shrub", len(s))
-            turned = np.minimum(s, width - s) < np.minimum(t, depth - t)  # along the nearest border
+            turned = np.minimum(s, width - s) < np.minimum(t, depth - t)  # Parallel to the nearest border.
             yaw = np.pi / 2 * turned + site.rng.normal(0, 0.05, len(s))
             edge = site.rng.random(len(s)) < 0.55
             s = np.where(edge & turned, np.where(s < width / 2, size[:, 1] / 2, width - size[:, 1] / 2), s)

@@ -1,6 +1,6 @@
-"""What fills a block: sidewalks and street furniture on its sides; inside, rows of houses, a park or a court.
+"""Build the content of a block: sidewalks and street furniture on its sides, and houses, a park or a court inside.
 
-Everything is drawn in frames (s along the street, t away from it), see town_land. Lengths in metres.
+All positions are in local frames (land.py): s along the street and t away from it, in metres.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BAY_DEPTH_M = 2.3
 
 
 def furnish_block(site: Site, block: CityBlock) -> None:
-    """Fills a block: its sides first, then what is left inside."""
+    """Build the content of a block: first its sides, then its interior."""
     depths = [_compute_side_depth(site) if faces else (0.0, False, False) for faces in block.streets]
     for k in range(4):
         if block.streets[k]:
@@ -62,7 +62,7 @@ def furnish_block(site: Site, block: CityBlock) -> None:
 
 
 def _fill_interior(block: CityBlock, depths: list) -> tuple[LocalFrame, float, float]:
-    """What the sides leave of a block: a frame along its longer side, width, depth."""
+    """Return the interior of a block: a frame along its longer side, width and depth."""
     south, east, north, west = (d[0] for d in depths)
     width, depth = block.u1 - block.u0 - west - east, block.v1 - block.v0 - south - north
     if width >= depth:
@@ -74,7 +74,7 @@ def _fill_interior(block: CityBlock, depths: list) -> tuple[LocalFrame, float, f
 
 
 def _compute_side_depth(site: Site) -> tuple[float, bool, bool]:
-    """(depth, has a sidewalk, has parking bays) of one side."""
+    """Return the depth of one side, and whether it has a sidewalk and parking bays."""
     sidewalk, bay = bool(site.rng.random() < site.district.sidewalks), bool(site.rng.random() < site.district.bays)
     return float(site.rng.uniform(2.25, 3.0)) + BAY_DEPTH_M * bay, sidewalk, bay
 
@@ -102,13 +102,13 @@ def _build_side(site: Site, block: CityBlock, k: int, depths: list) -> None:
 def _build_corner(
     site: Site, frame: LocalFrame, r: float, size: float, depth: float, depth_before: float, ground_class: str
 ) -> None:
-    """The piece of sidewalk round a kerb of radius r; `size` along both streets."""
+    """Build the sidewalk around a kerb of radius r; `size` is its extent along both streets."""
     inside = [(0.0, size), (depth_before, size), (depth_before, depth), (size, depth), (size, 0.0)]
     site.sheet.slab(frame, ground_class, inside + trace_kerb(0.0, 0.0, r))
 
 
 def _place_bays(site: Site, frame: LocalFrame, start: float, end: float, paved: str) -> None:
-    """Parking bays along the road, with a tree between every few."""
+    """Build parking bays along the road, with trees between groups of bays."""
     s = start
     occupancy = min(0.9, 1.5 * site.district.curb_parking * site.mood.cars)
     while s < end:
@@ -135,7 +135,7 @@ def _place_curb_cars(site: Site, frame: LocalFrame, start: float, end: float) ->
         return
     at = start + (np.arange(slots) + 0.5) * (end - start) / slots
     taken = site.rng.random(slots) < min(0.85, site.district.curb_parking * site.mood.cars)
-    place_cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)  # half on the sidewalk as a rule
+    place_cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)  # Most cars park half on the sidewalk.
     free = at[~taken]
     trucks = free[site.rng.random(len(free)) < site.district.trucks_per_100m * CAR_SLOT_M / 100]
     if len(trucks):
@@ -146,7 +146,7 @@ def _place_curb_cars(site: Site, frame: LocalFrame, start: float, end: float) ->
 
 
 def _place_furniture(site: Site, frame: LocalFrame, start: float, end: float, depth: float, corner: bool) -> None:
-    """Lamps, signs, traffic lights, street trees, people on one side."""
+    """Place lamps, traffic signs, traffic lights, street trees and pedestrians on one side."""
     length = max(0.0, end - start)
     n = site.rng.poisson(site.district.lamps_per_100m * site.mood.furniture * length / 100)
     if n:
@@ -194,7 +194,7 @@ def _place_sign(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray) -> 
 
 
 def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """Lawn with a path through it, trees, a hedge or wall round it, benches, people."""
+    """Build a lawn with a path, trees, a hedge or wall around it, benches and pedestrians."""
     frame, width, depth = interior
     middle = float(site.rng.uniform(0.35, 0.65)) * depth
     for low, high, ground_class in (
@@ -231,7 +231,7 @@ def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
 
 
 def _build_meadow(site: Site, block: CityBlock) -> None:
-    """Land outside the last street's corner: lawn where the district has lawns, and its vegetation."""
+    """Build the area outside the outermost street corners: a lawn if the district has lawns, and vegetation."""
     frame, width, depth = (
         LocalFrame((block.u0, block.v0), (1.0, 0.0), (0.0, 1.0)),
         block.u1 - block.u0,
@@ -244,7 +244,7 @@ def _build_meadow(site: Site, block: CityBlock) -> None:
 
 
 def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """Two rows of garages that face each other across a court, hedges behind them, a house at each end."""
+    """Build a court between two rows of garages, with hedges behind them and a house at one end."""
     frame, width, depth = interior
     g = draw_sizes(site.rng, "garage", 1)[0]
     margin, aisle = (depth - 2 * g[0] - 9.0) / 2, 9.0
@@ -273,7 +273,7 @@ def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -
 
 
 def _build_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """A large building behind its car park, with rows of cars, a garden and a wall at the back."""
+    """Build a large building behind its car park, with parked cars, a garden, and a wall at the back."""
     frame, width, depth = interior
     lot = float(site.rng.uniform(16.0, 19.0))
     beds = np.linspace(0, width, max(2, round(width / 22)) + 1).tolist()

@@ -1,4 +1,4 @@
-"""The kinds of neighbourhood in a town, as data: the differences between districts and between their blocks."""
+"""Parameters of the districts of a town and of the random variation between their blocks."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ import numpy as np
 
 @dataclass(frozen=True)
 class District:
-    """How one kind of neighbourhood looks. Shares are probabilities; `per_100m2` and `per_100m` are intensities."""
+    """Parameters of one kind of neighbourhood.
+
+    Shares are probabilities. Names with `per_100m2` and `per_100m` are intensities per area and per length.
+    """
 
     house_scale: tuple[float, float, float]
-    setback_m: float  # median from sidewalk to house
-    gap_m: tuple[float, float]  # free ground between houses next to driveways
+    setback_m: float  # Median distance from sidewalk to house.
+    gap_m: tuple[float, float]  # Free ground between houses, next to driveways.
     garages: float
     terrain_front: float
     terrain_back: float
-    court_front: float  # share of front yards that are paved
-    rough_drives: float  # share of driveways that are ground rather than parking
+    court_front: float  # Share of front yards that are paved.
+    rough_drives: float  # Share of driveways with the class ground instead of parking.
     terrace: float
     sidewalks: float
     bays: float
-    curb_parking: float  # mean share of curb slots taken
+    curb_parking: float  # Mean share of occupied parking slots along the kerb.
     driveway_cars: float
     parks: float
-    courts: float  # share of blocks with a big building and its car park
-    hedges: float  # share of plot borders that are hedges
-    walls: float  # share that are walls or fences
+    courts: float  # Share of blocks with a large building and a car park.
+    hedges: float  # Share of plot borders that are hedges.
+    walls: float  # Share of plot borders that are walls or fences.
     shrubs_per_100m2: float
     bushes_per_100m2: float
     trees_per_100m2: float
@@ -35,15 +38,15 @@ class District:
     tree_scale: float
     lamps_per_100m: float
     signs_per_100m: float
-    lights: float  # share of street corners with a traffic light
-    things_per_plot: float  # bins and boxes
+    lights: float  # Share of street corners with a traffic light.
+    things_per_plot: float  # Number of bins and boxes per plot.
     bicycles_per_plot: float
     people_per_100m: float
     trucks_per_100m: float
 
 
-# Tuned on samples of 1,000 scenes until `measure_town` agreed with TARGETS (TOWN_VERSION 1): over plan seeds 0..2 all
-# means lie within their tolerance, most within half of it.
+# Values are fitted on samples of 1,000 scenes so that `measure_town` agrees with TARGETS (TOWN_VERSION 1). Over plan
+# seeds 0..2, all means lie within their tolerance, and most lie within half of it.
 DISTRICTS = {
     "centre": District(
         house_scale=(1.16, 1.14, 1.03),
@@ -143,10 +146,10 @@ DISTRICTS = {
 
 @dataclass(frozen=True)
 class Mood:
-    """What makes one block differ from the next of its district: factors of mean 1."""
+    """Random variation between the blocks of a district: factors with mean 1."""
 
-    room: float  # of plots: houses and the gaps between them
-    vacant: float  # share of plots without a house
+    room: float  # Scale of houses and of the gaps between them.
+    vacant: float  # Share of plots without a house.
     garages: float
     green: float
     trees: float
@@ -160,13 +163,17 @@ class Mood:
 
 
 def draw_mood(rng: np.random.Generator) -> Mood:
-    """A block's Mood. The gammas' shapes are what makes counts over-dispersed: 1 is widest."""
+    """Sample the Mood of a block.
+
+    The gamma distributions give the counts more variance than a Poisson distribution. A smaller shape gives more
+    variance.
+    """
 
     def gamma(shape: float) -> float:
         return float(rng.gamma(shape) / shape)
 
     size, room = np.exp(rng.normal(0, [0.13, 0.16])).tolist()
-    if rng.random() < 0.25:  # a terrace of narrow houses
+    if rng.random() < 0.25:  # Row of narrow houses.
         room = 0.46
     vacant = 0.6 if rng.random() < 0.13 else 0.02
     green = gamma(9)
@@ -181,7 +188,7 @@ def draw_mood(rng: np.random.Generator) -> Mood:
         cars=gamma(3),
         furniture=gamma(6),
         things=gamma(4),
-        # Where it is green, people are out and ride.
+        # Green blocks have more pedestrians and bicycles.
         bicycles=gamma(1.5) * green**2,
         people=gamma(1.5) * green,
     )

@@ -1,9 +1,10 @@
-"""A seeded procedural town: the built-in source, held to the statistics of KITTI-360 scenes (town_targets).
+"""A procedural town with a seed: the built-in source, fitted to statistics of KITTI-360 (reference_statistics.py).
 
-    drive = town_drive(7)          # one town and one drive through its streets
-    scene = drive.scene(0)         # what lies ahead of the first pose
+    drive = generate_town(7)       # one town and one drive through its streets
+    scene = drive.scene(0)         # the scene ahead of the first pose
 
-numpy only. The same seed gives the same town (under one numpy); a change of its output raises TOWN_VERSION.
+The module depends only on numpy. The same seed and numpy version give the same town. TOWN_VERSION increases with every
+change of the output.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ TOWN_VERSION = 1
 TRAIN_SEEDS_START = 0
 TEST_SEEDS_START = 1_000_000
 MAX_POSES = 256
-SCENES_PER_TOWN = 200  # every town has at least this many poses
+SCENES_PER_TOWN = 200  # Every town has at least this number of poses.
 POSE_SPACING_M = 10.0
-IMU_HEIGHT_M = 0.93  # above the true surface of the road, as KITTI-360's
+IMU_HEIGHT_M = 0.93  # Height above the real road surface, as in KITTI-360.
 METRES_PER_FRAME = 0.7
 
-# KITTI-360's names (in the spelling of its XML) -> our categories; the shape decides the category of vegetation.
+# Category of each KITTI-360 label in the spelling of its XML. The shape determines the category of vegetation.
 LABEL_CATEGORY = {
     "vegetation": "vegetation_cuboid",
     "truck": "vehicle_big",
@@ -72,16 +73,16 @@ LABEL_CATEGORY = {
     "box": "object",
 }
 
-# A town's main district and the one at its edge, by seed modulo 4: any four towns in a row show all of them.
+# Main district and edge district of a town, by seed modulo 4. Four successive seeds give all four pairs.
 TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
 SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
 
 
 def generate_town(seed: int) -> Drive:
-    """One town and one drive of up to MAX_POSES poses through its streets, at least 10 m apart.
+    """Generate one town, and one drive of up to MAX_POSES poses through its streets, at least 10 m apart.
 
-    Frames grow along the drive; moving boxes carry the frame they belong to. Which districts a town has follows
-    from seed modulo 4; all else is drawn from a generator seeded by `seed`.
+    Frames ascend along the drive, and a moving box has the frame that it belongs to. Seed modulo 4 determines the
+    districts. A random generator with this seed determines all other properties.
     """
     rng = np.random.default_rng([7301, seed])
     main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
@@ -117,15 +118,15 @@ def generate_town(seed: int) -> Drive:
 
 
 def plan_town_parts(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> list[tuple[int, str, int]]:
-    """(town seed, split, scenes taken) of every town, exactly num_train and num_test scenes in all.
+    """Return (town seed, split, number of scenes) of every town, with num_train and num_test scenes in total.
 
-    Train and test are different towns. Small requests are spread over several towns too; `take` says which poses of
-    a town are taken. `seed` moves to other towns.
+    Train and test use different towns. Small requests also use several towns. `select_poses` selects the poses of a
+    town. `seed` selects other towns.
     """
     plan = []
     for split, wanted, start in (("train", num_train, TRAIN_SEEDS_START), ("test", num_test, TEST_SEEDS_START)):
         if wanted < 0:
-            raise ValueError(f"number of {split} scenes is {wanted}; ask for 0 or more")
+            raise ValueError(f"the number of {split} scenes is {wanted}, expected 0 or more")
         towns = max(-(-wanted // SCENES_PER_TOWN), min(24, -(-wanted // 6)))
         towns = -(-towns // len(TOWN_KINDS)) * len(TOWN_KINDS) if wanted >= len(TOWN_KINDS) else wanted
         share = np.diff(np.linspace(0, wanted, towns + 1).round().astype(int)) if towns else []
@@ -135,12 +136,20 @@ def plan_town_parts(num_train: int = 10_000, num_test: int = 1_000, seed: int = 
 
 
 def select_poses(num_poses: int, num_scenes: int) -> np.ndarray:
-    """(num_scenes,) indices of the poses taken when fewer scenes than poses are wanted: spread over the drive.
+    """Select num_scenes evenly spaced poses of a drive.
 
-    Raises ValueError if the drive has too few poses.
+    Args:
+        num_poses: Number of poses of the drive.
+        num_scenes: Number of poses to select.
+
+    Returns:
+        (num_scenes,) indices of the poses.
+
+    Raises:
+        ValueError: The drive has too few poses.
     """
     if num_scenes > num_poses:
-        raise ValueError(f"{num_scenes} scenes wanted of a drive with {num_poses} poses; plan more towns")
+        raise ValueError(f"{num_scenes} scenes are requested, but the drive has {num_poses} poses; plan more towns")
     return ((np.arange(num_scenes) + 0.5) * num_poses / max(1, num_scenes)).astype(np.int64)
 
 
@@ -153,7 +162,7 @@ def _measure_travel(route: Route, land: Land) -> np.ndarray:
 
 
 def _sample_poses(rng: np.random.Generator, route: Route, land: Land) -> np.ndarray:
-    """Samples of the route at which a pose is kept: each at least POSE_SPACING_M from every other, even on revisits."""
+    """Return the route samples that become poses, each at least POSE_SPACING_M from all others."""
     xy = land.xy(route.uv)
     kept: list[int] = []
     points = np.empty((0, 2))
@@ -170,7 +179,10 @@ def _sample_poses(rng: np.random.Generator, route: Route, land: Land) -> np.ndar
 
 
 def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -> np.ndarray:
-    """(p, 3, 4) world from IMU: x forward, y right, z down; tilted by about 3 degrees as a car's IMU is."""
+    """Return world_from_imu (p, 3, 4) with x forward, y right and z down.
+
+    The poses are tilted by about 3 degrees, like the IMU of a car.
+    """
     xy = land.xy(route.uv[at])
     ahead = land.direction(route.uv[at], route.heading[at])
     z = land.surface_m(xy) + IMU_HEIGHT_M
@@ -187,9 +199,9 @@ def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: La
 
 
 def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
-    """Moving boxes: cars ahead and oncoming, a truck or bicycle now and then, people on the sidewalk.
+    """Add moving boxes: cars ahead and oncoming, a few trucks and bicycles, and pedestrians on the sidewalk.
 
-    A track appears at a few successive poses; each of its boxes belongs to that pose's frame.
+    A track appears at a few successive poses. Each of its boxes belongs to the frame of one pose.
     """
     vehicles = np.array([label in ("car", "truck", "bus") for label in sheet.box_label])
     parked = np.concatenate(sheet.box_rows)[vehicles, :2]
@@ -224,7 +236,7 @@ def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.
 
 
 def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
-    """The Drive's arrays of primitives: placed on the surface and turned with the streets."""
+    """Return the per-box arrays of a Drive: boxes on the surface, rotated with the streets."""
     rows, label = np.concatenate(sheet.box_rows), np.array(sheet.box_label, dtype=object)
     category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
     category[rows[:, 8] > 0] = CATEGORY_INDEX["vegetation_ellipsoid"]
@@ -232,7 +244,7 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
     along = land.direction(rows[:, :2], rows[:, 2:4])
     grade = land.grade(xy)
 
-    # Low things follow the slope; tall ones stand upright. A few are tilted, as annotators' boxes are.
+    # Low objects follow the slope, and tall objects are upright. A few objects are tilted, like annotated boxes.
     leans = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle", "wall", "fence", "gate", "guardrail"])
     leans |= np.isin(category, CATEGORY_INDEX["vegetation_cuboid"])
     tilt = np.where(leans[:, None], -grade, 0.0)
@@ -251,7 +263,7 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
     heading = np.where(directed, np.arctan2(along[:, 1], along[:, 0]), np.nan)
     timestamp, track = rows[:, 9].astype(np.int64), rows[:, 10].astype(np.int64)
     static = timestamp == STATIC
-    instance = np.where(static, np.arange(len(label)) + 1, track)  # counted apart, as KITTI-360 does
+    instance = np.where(static, np.arange(len(label)) + 1, track)  # Numbered separately, as in KITTI-360.
     return {
         "category": category,
         "center_m": center,
@@ -265,7 +277,7 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
 
 
 def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
-    """Closed slabs: top SLAB_THICKNESS_M / 2 above the surface, n top vertices, then n bottom ones."""
+    """Return closed slabs with tops SLAB_THICKNESS_M / 2 above the surface: n top vertices, then n bottom vertices."""
     outlines = [subdivide_outline(outline) for _, outline in sheet.slabs]
     xy = land.xy(np.concatenate(outlines))
     middle = land.surface_m(xy)
@@ -284,7 +296,7 @@ def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
 
 
 def list_slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
-    """(4 n - 4, 3) faces of a slab in KITTI-360's order: top, bottom, then two per side."""
+    """Return the faces (4 n - 4, 3) of a slab in KITTI-360's order: top, bottom, then two per side."""
     upper = np.array(top)
     ring = np.arange(n - 1)
     first = np.stack([ring, ring + 1, n + ring], axis=1)

@@ -1,9 +1,9 @@
-"""Drive -> KITTI-360's own files, so that its reader is exercised without the data set, defects and all.
+"""Write a Drive in KITTI-360's own file format, including typical defects, to test the reader without the dataset.
 
     ROOT/data_3d_bboxes/train_full/2013_05_28_drive_0007_sync.xml
     ROOT/data_poses/2013_05_28_drive_0007_sync/poses.txt
 
-What is written reads back as the same drive: a mirrored box is the same box, a duplicate an exact one.
+The reader returns the same drive from these files. A mirrored box is the same box, and a duplicate is an exact copy.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from models.scene import ELLIPSOID
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 
-WINDOW_POSES = 20  # an annotation window covers about 200 m of a drive of a pose every 10 m
-# Our ground class -> its name in the XML. Traps: "ground" is terrain, "unknownGround" is ground.
+WINDOW_POSES = 20  # An annotation window covers about 200 m of a drive with one pose every 10 m.
+# Name of each ground class in the XML: "ground" means terrain, and "unknownGround" means ground.
 XML_GROUND = {
     "road": "road",
     "sidewalk": "sidewalk",
@@ -24,7 +24,7 @@ XML_GROUND = {
     "terrain": "ground",
     "ground": "unknownGround",
 }
-# Labels that no category takes, sprinkled among the objects.
+# Labels without a category, placed at random among the objects.
 STRAY_LABELS = ("stop", "caravan", "sky", "vendingmachine", "railtrack", "train")
 
 BOX_VERTICES = np.array(
@@ -48,7 +48,10 @@ BOX_FACES = np.array(
 
 
 def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """(63, 3) vertices and (80, 3) faces of the unit sphere: 7 rows from pole to pole of y, 9 columns, first = last."""
+    """Return vertices (63, 3) and faces (80, 3) of the unit sphere.
+
+    The mesh has 7 rows from pole to pole of y and 9 columns, of which the first equals the last.
+    """
     row, column = np.meshgrid(np.arange(7) * np.pi / 6, np.arange(9) * np.pi / 4, indexing="ij")
     vertices = np.stack([-np.sin(row) * np.cos(column), np.cos(row), np.sin(row) * np.sin(column)], axis=-1)
     faces = [[k + 1, 9 + k, 10 + k] for k in range(8)]
@@ -60,14 +63,14 @@ def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: int = 0) -> None:
-    """Write the XML and poses.txt of one drive, as sequence int(drive.sequence) % 10000.
+    """Write the XML file and poses.txt of one drive, as sequence int(drive.sequence) % 10000.
 
     Args:
         drive: Drive with slab ground.
         root: Directory in KITTI-360's layout.
-        defects: Whether to add the defects of KITTI-360's files: mirrored and slightly sheared boxes, objects written
-            twice where annotation windows meet, empty plane matrices, labels of no category, fields and objects in any
-            order.
+        defects: Whether to add the defects of KITTI-360's files: mirrored and slightly sheared boxes, duplicate objects
+        at borders of annotation windows, empty plane matrices, labels without a category, and random order of fields
+        and objects.
         seed: Seed of the defects.
 
     Raises:
@@ -75,7 +78,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
     """
     ground = drive.ground
     if not isinstance(ground, SlabGround):
-        raise ValueError(f"drive {drive.sequence} has no slab ground; KITTI-360's format holds no other ground")
+        raise ValueError(f"drive {drive.sequence} has no slab ground; KITTI-360's format supports only slabs")
     rng = np.random.default_rng([7302, seed])
     name = f"2013_05_28_drive_{int(drive.sequence) % 10_000:04d}_sync"
     boxes, poses = Path(root) / "data_3d_bboxes" / "train_full", Path(root) / "data_poses" / name
@@ -130,7 +133,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
 
 
 def _list_windows(drive: Drive, points_m: np.ndarray) -> list[list[int]]:
-    """The annotation windows an object belongs to: that of its nearest pose, and the next one if that is near too."""
+    """Return the annotation windows of each object: the window of its nearest pose, and the next window at a border."""
     poses = drive.world_from_imu[:, :2, 3]
     found = []
     for point in points_m[:, :2]:
@@ -162,19 +165,22 @@ def _write_head(drive: Drive, label: str, category: str, box: int | None, window
 
 
 def _transform(drive: Drive, k: int, scale: float, rng: np.random.Generator | None) -> np.ndarray:
-    """(4, 4) world from the unit mesh; with a generator, now and then mirrored or sheared by less than a millimetre."""
+    """Return world_from_mesh (4, 4) of the unit mesh.
+
+    With a random generator, a few transforms are mirrored or sheared by less than 1 mm.
+    """
     matrix = np.eye(4)
     matrix[:3, :3] = drive.rotation[k] * drive.size_m[k] * scale
     matrix[:3, 3] = drive.center_m[k]
     if rng is not None and rng.random() < 0.05:
-        matrix[:3, int(rng.integers(1, 3))] *= -1  # not the first axis: it may be a heading
+        matrix[:3, int(rng.integers(1, 3))] *= -1  # The first axis may be a heading, so it is not mirrored.
     if rng is not None and rng.random() < 0.05:
         matrix[:3, :3] += rng.normal(0, 1e-4, (3, 3)) * drive.size_m[k].min() * scale
     return matrix
 
 
 def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Vertices (2 n, 3), n top ones first, and faces (4 n - 4, 3) of each slab."""
+    """Return vertices (2 n, 3), the n top vertices first, and faces (4 n - 4, 3) of each slab."""
     first = np.searchsorted(ground.vertex_slab, np.arange(len(ground.slab_class) + 1))
     owner = ground.vertex_slab[ground.triangles[:, 0]]
     at = np.searchsorted(owner, np.arange(len(ground.slab_class) + 1))
@@ -185,7 +191,7 @@ def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _write_slab(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
-    """A slab about its own centre, and its mid-plane: the true surface."""
+    """Write a slab relative to its centre, and its mid-plane, which is the real surface."""
     n = len(vertices) // 2
     matrix = np.eye(4)
     matrix[:3, 3] = vertices.mean(axis=0)
@@ -203,7 +209,7 @@ def _write_mesh(suffix: str, vertices: np.ndarray | None = None, faces: np.ndarr
 
 
 def _write_matrix(values: np.ndarray | None, kind: str = "f") -> str:
-    """The inside of an OpenCV matrix element; None is an empty one."""
+    """Return the content of an OpenCV matrix element; None gives an empty matrix."""
     rows, cols = (0, 0) if values is None else values.shape
     flat = [] if values is None else values.ravel().tolist()
     data = " ".join([f"{v:d}" if kind == "u" else f"{v:.8e}" for v in flat])

@@ -1,8 +1,8 @@
-"""What a town stands on and is collected in: the bend of its streets, its hills, its slabs and boxes.
+"""The terrain of a town and the container of its content: bends of streets, hills, slabs and boxes.
 
-A town is designed on a drawing board, where every street is straight: board coordinates (u, v) in metres. `Land`
-bends the board into the world by two shears, x = u + a(v), y = v + b(x): areas keep their size, what abuts on the
-board abuts in the world, streets curve and junctions are not all square.
+A town is designed in board coordinates (u, v) in metres, where every street is straight. `Land` maps the board to the
+world frame by two shears, x = u + a(v) and y = v + b(x). Shears keep areas, and adjacent shapes remain adjacent.
+Streets become curved, and not all junctions are rectangular.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SLAB_THICKNESS_M = 0.6  # KITTI-360's ground slabs; their mid-plane is the surface things stand on
-EDGE_STEP_M = 10.0  # longest slab edge: bends and hills are followed this closely
-MAX_CORNERS = 40  # of a slab, as in KITTI-360
+SLAB_THICKNESS_M = 0.6  # Thickness of KITTI-360's ground slabs; their mid-plane is the surface that objects stand on.
+EDGE_STEP_M = 10.0  # Maximum length of a slab edge, which limits the error at bends and hills.
+MAX_CORNERS = 40  # Maximum number of corners of a slab, as in KITTI-360.
 
 
 @dataclass(frozen=True, eq=False)
 class Land:
-    """The map from board to world, and the height of the true surface."""
+    """Map from board to world coordinates, and height of the real surface."""
 
-    bend_u: np.ndarray  # (k, 3): amplitude in metres, radians per metre, phase of a(v)
-    bend_v: np.ndarray  # (k, 3): the same of b(x)
-    hills: np.ndarray  # (k, 4): amplitude in metres, wave vector (2,) in radians per metre, phase
+    bend_u: np.ndarray  # (k, 3): amplitude (m), wave number (rad/m) and phase (rad) of a(v).
+    bend_v: np.ndarray  # (k, 3): amplitude (m), wave number (rad/m) and phase (rad) of b(x).
+    hills: np.ndarray  # (k, 4): amplitude (m), wave vector (2,) in rad/m, phase (rad).
     yaw_rad: float
-    origin_m: np.ndarray  # (3,) world position of board (0, 0), float64
+    origin_m: np.ndarray  # (3,) float64 world position of board point (0, 0).
 
     def _turn(self) -> np.ndarray:
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
@@ -36,11 +36,11 @@ class Land:
         return np.stack([x, uv[..., 1] + _draw_waves(self.bend_v, x)], axis=-1)
 
     def xy(self, uv: np.ndarray) -> np.ndarray:
-        """(..., 2) world x, y of board points (..., 2)."""
+        """Return the world x and y of board points (..., 2)."""
         return self._bend(np.asarray(uv, np.float64)) @ self._turn().T + self.origin_m[:2]
 
     def direction(self, uv: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """(..., 2) unit world direction of the board direction `along` (..., 2) at `uv`."""
+        """Return the unit world direction (..., 2) of the board direction `along` (..., 2) at `uv`."""
         bent = self._bend(uv)
         dx = along[..., 0] + _compute_slopes(self.bend_u, uv[..., 1]) * along[..., 1]
         dy = along[..., 1] + _compute_slopes(self.bend_v, bent[..., 0]) * dx
@@ -48,12 +48,12 @@ class Land:
         return world / np.linalg.norm(world, axis=-1, keepdims=True)
 
     def surface_m(self, xy: np.ndarray) -> np.ndarray:
-        """(...,) world z of the true surface at world points (..., 2)."""
+        """Return the world z of the real surface (...,) at world points (..., 2)."""
         phase = (np.asarray(xy) - self.origin_m[:2]) @ self.hills[:, 1:3].T + self.hills[:, 3]
         return self.origin_m[2] + (self.hills[:, 0] * np.sin(phase)).sum(axis=-1)
 
     def grade(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 2) slope of the surface along world x and y."""
+        """Return the slope of the surface along world x and y (..., 2)."""
         phase = (np.asarray(xy) - self.origin_m[:2]) @ self.hills[:, 1:3].T + self.hills[:, 3]
         return (self.hills[:, 0] * np.cos(phase)) @ self.hills[:, 1:3]
 
@@ -67,14 +67,17 @@ def _compute_slopes(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def draw_land(rng: np.random.Generator) -> Land:
-    """Gentle bends (up to about 15 degrees each way) and hills (grade at most 3 %) somewhere in the world."""
+    """Sample the terrain of a town and its position in the world frame.
+
+    Bends are at most about 15 degrees in each direction, and the slope of hills is at most 3 %.
+    """
 
     def bends() -> np.ndarray:
         wave = 2 * np.pi / rng.uniform(170, 480, 2)
         slope = rng.uniform(0.0, 0.27) * rng.dirichlet([1.5, 1.5])
         return np.stack([slope / wave, wave, rng.uniform(0, 2 * np.pi, 2)], axis=1)
 
-    # Two crossing swells: their grades are perpendicular and never exceed 3 % together.
+    # The slopes of the two waves are perpendicular and never exceed 3 % together.
     wave, direction = 2 * np.pi / rng.uniform(320, 760, 2), rng.uniform(0, 2 * np.pi) + np.array([0.0, np.pi / 2])
     steepest, share = rng.uniform(0.026, 0.03), rng.uniform(0.3, 1.27)
     grade = steepest * np.array([np.cos(share), np.sin(share)])
@@ -86,35 +89,35 @@ def draw_land(rng: np.random.Generator) -> Land:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """A place on the board to draw from: s runs along a street, t away from it; axes are unit board directions."""
+    """Local frame on the board: s runs along a street, and t points away from it; axes are unit board directions."""
 
     origin: tuple[float, float]
     along: tuple[float, float]
     inward: tuple[float, float]
 
     def uv(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """(..., 2) board points of (s, t)."""
+        """Return the board points (..., 2) of (s, t)."""
         (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
         return np.stack([ou + s * au + t * iu, ov + s * av + t * iv], axis=-1)
 
     def at(self, s: float, t: float) -> LocalFrame:
-        """The same axes with the origin moved to (s, t)."""
+        """Return the frame with its origin at (s, t) and the same axes."""
         (ou, ov), (au, av), (iu, iv) = self.origin, self.along, self.inward
         return LocalFrame((ou + s * au + t * iu, ov + s * av + t * iv), self.along, self.inward)
 
 
 class Sheet:
-    """Collects what a town consists of, in board coordinates, until `Land` takes it into the world."""
+    """Slabs and boxes of a town in board coordinates, before `Land` maps them to the world frame."""
 
     def __init__(self) -> None:
-        self.slabs: list[tuple[str, np.ndarray]] = []  # ground class, outline (n, 2), any turning sense
+        self.slabs: list[tuple[str, np.ndarray]] = []  # ground class and outline (n, 2) in either direction of rotation
         self.box_label: list[str] = []
         self.box_rows: list[
             np.ndarray
-        ] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, ellipsoid, timestamp, track
+        ] = []  # (n, 11): u, v, along u, along v, l, w, h, bottom, ellipsoid, timestamp, track.
 
     def slab(self, frame: LocalFrame, ground_class: str, outline_st: list[tuple[float, float]]) -> None:
-        """A slab by its outline in (s, t)."""
+        """Add a slab with an outline in (s, t)."""
         st = np.asarray(outline_st, np.float64)
         self.slabs.append((ground_class, frame.uv(st[:, 0], st[:, 1])))
 
@@ -135,15 +138,15 @@ class Sheet:
 
         Args:
             frame: Frame of (s, t).
-            label: Their label.
-            s: (n,) or one position along the frame, in metres.
-            t: (n,) or one position inward.
+            label: Label of the boxes.
+            s: (n,) or one position along the street (m).
+            t: (n,) or one position away from the street (m).
             size_m: (n, 3) or (3,) length, width and height.
             yaw_rad: Direction of the length axis, from s to t.
             bottom_m: Height of the lower side above the surface.
-            ellipsoid: Whether they are ellipsoids.
-            timestamp: Frame of a moving box; -1 for static ones.
-            track: Number of a moving object; -1 for static ones.
+            ellipsoid: Whether the primitives are ellipsoids.
+            timestamp: Frame of a moving box; -1 for static boxes.
+            track: Number of a moving object; -1 for static objects.
         """
         s, t, size_m = np.atleast_1d(s), np.atleast_1d(t), np.atleast_2d(size_m)
         rows = np.empty((len(s), 11))
@@ -158,10 +161,17 @@ class Sheet:
 
 
 def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
-    """Outlines of the 4-connected patches of equal value >= 0 in a grid of cells, for slabs that are not rectangles.
+    """Return the outlines of the 4-connected patches of equal value >= 0 in a grid of cells.
 
-    cells (len(s) - 1, len(t) - 1) int; s, t: ascending grid lines. Returns (value, outline) per patch; patches must
-    have no holes.
+    The outlines form slabs that are not rectangles. Patches must have no holes.
+
+    Args:
+        cells: (len(s) - 1, len(t) - 1) int; value of each cell.
+        s: Grid lines along the first axis, ascending.
+        t: Grid lines along the second axis, ascending.
+
+    Returns:
+        (value, outline) per patch.
     """
     columns, rows = cells.shape
     patch = -np.ones((columns, rows), int)
@@ -185,7 +195,7 @@ def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tu
 
 
 def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Corners of the outer outline of a set of unit cells, counter-clockwise, straight runs merged."""
+    """Return the corners of the outer outline of a set of unit cells, counter-clockwise, with straight runs merged."""
     ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in members:
         sides = (((0, -1), (i, j), (i + 1, j)), ((1, 0), (i + 1, j), (i + 1, j + 1)))
@@ -196,7 +206,7 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
     start = min(ahead)
     outline, here, step = [start], start, (0, -1)
     while True:
-        # At a corner where two cells touch, keep left: stay on the same cell's side.
+        # At a corner where two cells touch, turn left to follow the same cell.
         options = ahead[here]
         there = max(options, key=lambda p: step[0] * (p[1] - here[1]) - step[1] * (p[0] - here[0]))
         options.remove(there)
@@ -211,10 +221,10 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def subdivide_outline(outline: np.ndarray) -> np.ndarray:
-    """The outline (m, 2) with long edges cut at multiples of EDGE_STEP_M, so that neighbours share the cuts.
+    """Split long edges of an outline (m, 2) at multiples of EDGE_STEP_M, so that neighbours share the new corners.
 
-    Edges parallel to a board axis are cut on the lattice, slanted ones are left alone. Counter-clockwise. Should
-    that give more than MAX_CORNERS corners, only every second cut is made, or every fourth.
+    Only edges parallel to a board axis are split. The result is counter-clockwise. If it has more than MAX_CORNERS
+    corners, the step is doubled or quadrupled.
     """
     for step in (EDGE_STEP_M, 2 * EDGE_STEP_M, 4 * EDGE_STEP_M, 1e6):
         cut = _cut(outline, step)
@@ -243,7 +253,7 @@ def _cut(outline: np.ndarray, step: float) -> np.ndarray:
 
 
 def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
-    """n - 2 triangles (indices) of a simple counter-clockwise outline (n, 2), convex or not."""
+    """Triangulate a simple counter-clockwise outline (n, 2), convex or not, to n - 2 triangles (indices)."""
     points = outline.tolist()
 
     def turn(a: int, b: int, c: int) -> float:
@@ -261,18 +271,18 @@ def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
             for k in range(n):
                 p = left[k]
                 if p in (a, b, c) or turn(left[k - 1], p, left[(k + 1) % n]) > 0:
-                    continue  # only a reflex corner can lie in an ear
+                    continue  # Only a reflex corner can lie in an ear.
                 if turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0:
                     ear = False
                     break
         if ear:
             triangles.append((a, b, c))
             left.pop(at % n)
-            at, refused = (at + 1) % (n - 1), 0  # skip one: fans of slivers are avoided
+            at, refused = (at + 1) % (n - 1), 0  # Skip one corner to avoid fans of thin triangles.
         else:
             at, refused = (at + 1) % n, refused + 1
-            if refused > n:  # collinear corners only: flat ears are taken then
-                assert slack == 0.0, "outline is not simple"
+            if refused > n:  # All remaining corners are collinear, so accept flat ears.
+                assert slack == 0.0, "the outline must not cross itself"
                 slack, refused = 1e-6, 0
     triangles.append(tuple(left))
     return triangles

@@ -11,7 +11,7 @@ from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
 
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
-SQUEEZE = 0.4  # share of the last plot of a row that its neighbours make room for
+SQUEEZE = 0.4  # The last plot may exceed the row by this share of its width; all plots then shrink to fit.
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class House:
 
 
 def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) -> None:
-    """Build houses side by side along a street, each on its plot; plots are resized slightly to fill the row."""
+    """Build houses side by side along a street, each on its plot; plot widths are scaled to fill the row."""
     planned, used = [], 0.0
     scale = np.array(site.district.house_scale) * [site.mood.room, site.mood.room**0.5, 1.0]
     while True:
@@ -54,7 +54,9 @@ def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) 
 
 
 def build_plot(site: Site, frame: LocalFrame, width: float, depth: float, house: House) -> None:
-    """Build one plot: house, garage and driveway, path, terrace, garden, borders, bins, bicycles; or an orchard."""
+    """Build one plot: house, garage, driveway, path, terrace, garden, borders and small objects; or a garden without
+    house.
+    """
     if site.rng.random() < site.mood.vacant:
         lawn = TERRAIN if site.rng.random() < site.district.terrain_front else NOTHING
         paint_plots(site, frame, width, depth, lawn, lawn, depth, [])
@@ -108,9 +110,9 @@ def _build_house(site: Site, frame: LocalFrame, walls: Rect, house: House) -> No
 def _build_garage(
     site: Site, frame: LocalFrame, width: float, depth: float, walls: Rect, room: float, left: bool
 ) -> list[tuple[int, Rect]]:
-    """Build a garage next to the house if there is room, else behind it, and a driveway, perhaps with a car.
+    """Build a garage next to the house if there is room, otherwise behind it, and a driveway with an optional car.
 
-    Returns the rectangles to paint, the driveway first; none if the plot is too shallow.
+    The function returns the rectangles to paint, the driveway first, or none if the plot is too shallow.
     """
     size = draw_sizes(site.rng, "garage", 1)[0]
     beside = max(2.8, min(room, size[1]))
@@ -135,7 +137,7 @@ def _compute_overlap(a: Rect, b: Rect) -> bool:
 def _plant_borders(
     site: Site, frame: LocalFrame, width: float, depth: float, setback: float, gate: tuple[float, float], court: bool
 ) -> None:
-    """Plant hedges and walls around a plot, open at the gate (s0, s1) and at a court; add steps and low walls."""
+    """Build hedges and walls around a plot, with gaps at the gate (s0, s1) and at a court; add steps and low walls."""
     g0, g1 = gate
     lines: list[tuple[float, float, float, float]] = []
     if not court and setback > 1.2:
@@ -155,7 +157,7 @@ def _plant_borders(
             plant_border(site, frame, *line, "hedge", float(site.rng.uniform(0.5, 1.0)))
         elif pick < hedges + walls:
             plant_border(site, frame, *line, "wall", float(site.rng.uniform(0.5, 1.0)))
-    n = site.rng.poisson(site.district.walls * site.mood.walls)  # steps, retaining walls, porches
+    n = site.rng.poisson(site.district.walls * site.mood.walls)  # Steps, retaining walls and porches.
     if n:
         s, t = site.rng.uniform(0.5, width - 0.5, n), site.rng.uniform(0.4, max(0.8, setback + 2), n)
         site.sheet.boxes(frame, "wall", s, t, draw_sizes(site.rng, "wall", n), np.pi / 2 * site.rng.integers(0, 2, n))
@@ -187,7 +189,10 @@ def paint_plots(
     split: float,
     rects: list[tuple[int, Rect]],
 ) -> None:
-    """Paint a plot's slabs: `front` before t = split, `back` after it, `rects` (class, (s0, s1, t0, t1)) on top."""
+    """Paint the slabs of a plot: `front` before t = split, `back` after it, and `rects` on top.
+
+    Each entry of `rects` is (class, (s0, s1, t0, t1)).
+    """
     for low, high, base in ((0.0, split, front), (split, depth, back)):
         if high - low < 0.3:
             continue
@@ -207,7 +212,7 @@ def paint_plots(
 
 
 def _list_lines(values: list[float]) -> list[float]:
-    """Sorted distinct grid lines, at least a centimetre apart."""
+    """Return sorted distinct grid lines with a spacing of at least 1 cm."""
     out: list[float] = []
     for value in sorted(values):
         if not out or value - out[-1] > 0.01:

@@ -1,4 +1,4 @@
-"""What a 64 x 64 m scene of KITTI-360 looks like in numbers, and how scenes of ours compare."""
+"""Statistics of 64 x 64 m scenes of KITTI-360, and a comparison with scenes of the town."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from models.scene import CATEGORIES, DENSITIES, VEGETATION, Scene
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 
-COUNT_TOLERANCE = 0.20  # relative; absolute COUNT_TOLERANCE_SMALL where the target is under 3
+COUNT_TOLERANCE = 0.20  # Relative tolerance. COUNT_TOLERANCE_SMALL is absolute and applies to targets below 3.
 COUNT_TOLERANCE_SMALL = 0.5
 AREA_TOLERANCE = 0.05
 SIZE_TOLERANCE = 0.15
 
-# Mean count per scene of low / medium / high vegetation density.
+# Mean number of primitives per scene with low, medium and high vegetation density.
 COUNTS = {
     "vegetation_cuboid": (14, 72, 114),
     "vegetation_ellipsoid": (12, 71, 109),
@@ -30,7 +30,7 @@ COUNTS = {
     "traffic_control": (4, 8, 8),
     "object": (2, 5, 6),
 }
-# Share of the scene's 4096 m2, of low / medium / high.
+# Share of the scene's 4096 m2 with low, medium and high vegetation density.
 AREAS = {
     "road": (0.19, 0.19, 0.14),
     "sidewalk": (0.12, 0.11, 0.11),
@@ -39,7 +39,7 @@ AREAS = {
     "ground": (0.06, 0.06, 0.03),
     "none": (0.48, 0.27, 0.24),
 }
-# Median length, width, height over all scenes, metres; buildings and garages apart.
+# Median length, width and height over all scenes (m); buildings and garages are separate.
 SIZES_M = {
     "vegetation_cuboid": (5, 2.2, 2.0),
     "vegetation_ellipsoid": (5.5, 4.8, 6),
@@ -58,7 +58,15 @@ TARGETS = {"counts": COUNTS, "areas": AREAS, "sizes_m": SIZES_M}
 
 
 class Row(NamedTuple):
-    """One line of the comparison: `label` is a vegetation density or "all"."""
+    """One line of the comparison.
+
+    Attributes:
+        what: Name of the quantity.
+        label: Vegetation density label, or "all".
+        target: Value of KITTI-360.
+        measured: Value of the town.
+        ok: Whether the difference lies within the tolerance.
+    """
 
     what: str
     label: str
@@ -69,25 +77,33 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What `measure_town` needs to know of n scenes; `size_m[name]` holds the sizes of all boxes of a SIZES_M name."""
+    """Statistics of n scenes for `measure_town`.
 
-    counts: np.ndarray  # (n, 11) per category
+    Attributes:
+        counts: Number of primitives per category.
+        vegetation_volume_m3: Total volume of vegetation (m3).
+        areas: Area shares, in the order of AREAS.
+        size_m: Sizes (k, 3) of all boxes, by name in SIZES_M (m).
+    """
+
+    counts: np.ndarray  # (n, 11)
     vegetation_volume_m3: np.ndarray  # (n,)
-    areas: np.ndarray  # (n, 6) shares, in the order of AREAS
+    areas: np.ndarray  # (n, 6)
     size_m: dict[str, np.ndarray]  # (k, 3)
 
     @property
     def vegetation_count(self) -> np.ndarray:
+        """(n,) number of vegetation primitives per scene."""
         return self.counts[:, list(VEGETATION)].sum(axis=1)
 
     def labels(self) -> np.ndarray:
-        """(n,) vegetation density of each scene by the sample's own percentiles."""
+        """Return the vegetation density label of each scene (n,), from the percentiles of this sample."""
         thresholds = compute_density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
         return classify_density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
 
 
 def make_sample(scenes: Iterable[Scene]) -> Sample:
-    """The numbers of a stream of scenes; no scene is kept."""
+    """Compute the statistics of a stream of scenes without keeping the scenes in memory."""
     counts, volumes, areas, size_of = [], [], [], {name: [np.zeros((0, 3))] for name in SIZES_M}
     for scene in scenes:
         counts.append(scene.counts())
@@ -104,9 +120,9 @@ def make_sample(scenes: Iterable[Scene]) -> Sample:
 
 
 def measure_town(scenes: Iterable[Scene] | Sample) -> list[Row]:
-    """Compare measured and target values of all TARGETS; labels come from the percentiles of these scenes.
+    """Compare measured and target values of all TARGETS; density labels come from the percentiles of these scenes.
 
-    A category or label that never occurs gives nan and is not ok.
+    A category or label that never occurs gives NaN and fails the comparison.
     """
     sample = scenes if isinstance(scenes, Sample) else make_sample(scenes)
     label = sample.labels()

@@ -1,6 +1,7 @@
-"""The street grid of a town: streets, junctions, blocks between them, and the route of the car.
+"""The street grid of a town: streets, junctions, the blocks between them, and the route of the car.
 
-All on the drawing board (see town_land): u-streets run along v at a constant u, v-streets along u at a constant v.
+All coordinates are board coordinates (land.py). A u-street runs along v at a constant u. A v-street runs along u at a
+constant v.
 """
 
 from __future__ import annotations
@@ -14,44 +15,62 @@ import numpy as np
 
 from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
-ROAD_SLAB_M = 30.0  # about 200 m2 of a street
+ROAD_SLAB_M = 30.0  # Length of a road slab, which covers about 200 m2.
 BOARD = LocalFrame((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
-ARMS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # east, north, west, south
+ARMS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # east, north, west, south.
 
 Node = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Streets:
-    """u_m, v_m: the streets' positions; half_u_m, half_v_m: half their widths; edges: pairs of neighbouring nodes."""
+    """Streets and junctions of a town in board coordinates.
+
+    Attributes:
+        u_m: Positions of the u-streets (m).
+        v_m: Positions of the v-streets (m).
+        half_u_m: Half widths of the u-streets (m).
+        half_v_m: Half widths of the v-streets (m).
+        edges: Pairs of neighbouring nodes with a street between them, the lower node first.
+        corner_m: Radius of the kerb at each junction (m).
+    """
 
     u_m: np.ndarray
     v_m: np.ndarray
     half_u_m: np.ndarray
     half_v_m: np.ndarray
-    edges: frozenset[tuple[Node, Node]]  # first node is the lower one
-    corner_m: dict[Node, float]  # radius of the kerb at a junction
+    edges: frozenset[tuple[Node, Node]]
+    corner_m: dict[Node, float]
 
     def has(self, a: Node, b: Node) -> bool:
+        """Return whether a street connects two neighbouring nodes."""
         return (min(a, b), max(a, b)) in self.edges
 
     def arms(self, node: Node) -> list[bool]:
-        """[east, north, west, south]: is there a street from the node that way?"""
+        """Return whether a street leaves the node to the east, north, west and south."""
         return [self.has(node, (node[0] + di, node[1] + dj)) for di, dj in ARMS]
 
     def at(self, node: Node) -> np.ndarray:
+        """Return the board position (2,) of a node."""
         return np.array([self.u_m[node[0]], self.v_m[node[1]]])
 
     def reach(self, node: Node, axis: int) -> float:
-        """How far the junction reaches from its centre along u (axis 0) or v (axis 1)."""
+        """Return the extent of a junction from its centre along u (axis 0) or v (axis 1), in metres."""
         return (self.half_u_m[node[0]] if axis == 0 else self.half_v_m[node[1]]) + self.corner_m[node]
 
 
 @dataclass(frozen=True)
 class CityBlock:
-    """A rectangle of the board between road edges, and which of its sides face a street.
+    """A rectangle of the board between road edges.
 
-    `streets` are (south, east, north, west); `corners` kerb radii (SW, SE, NE, NW), 0 where no kerb turns.
+    Attributes:
+        u0: Lower bound along u (m).
+        u1: Upper bound along u (m).
+        v0: Lower bound along v (m).
+        v1: Upper bound along v (m).
+        streets: Whether the south, east, north and west side faces a street.
+        corners: Kerb radii at the corners SW, SE, NE and NW (m); 0 without a kerb.
+        kind: Name of the district.
     """
 
     u0: float
@@ -63,7 +82,11 @@ class CityBlock:
     kind: str
 
     def side(self, index: int) -> tuple[LocalFrame, float, float, float]:
-        """Frame of a side (origin at its left end seen from the street's middle, t inward), length, corner radii."""
+        """Return the frame of a side, its length and the radii of its two corners.
+
+        The origin of the frame is the left end of the side, seen from the middle of the street. t points into the
+        block.
+        """
         u0, u1, v0, v1 = self.u0, self.u1, self.v0, self.v1
         origin, along, inward, length = (
             ((u0, v0), (1.0, 0.0), (0.0, 1.0), u1 - u0),
@@ -77,10 +100,10 @@ class CityBlock:
 def lay_streets(
     rng: np.random.Generator, spacing_u_m: list[float], spacing_v_m: list[float], missing: float
 ) -> tuple[Streets, list[tuple[int, int, int, int]]]:
-    """Streets at the given spacings, and blocks as node ranges (i0, i1, j0, j1).
+    """Return streets with the given spacings, and blocks as node ranges (i0, i1, j0, j1).
 
-    A share `missing` of the streets between two blocks is left out: the blocks become one and the junctions at its
-    ends T-shaped.
+    A share `missing` of the streets between two blocks is omitted. The two blocks then become one, and the junctions at
+    the ends of the street become T-junctions.
     """
     u = np.concatenate([[0.0], np.cumsum(spacing_u_m)])
     v = np.concatenate([[0.0], np.cumsum(spacing_v_m)])
@@ -114,9 +137,9 @@ def list_blocks(
     kind_at: Callable[[float, float], str],
     outskirts_m: float,
 ) -> list[CityBlock]:
-    """The blocks between the streets, and a ring of blocks of depth outskirts_m outside the outermost ones.
+    """Return the blocks between the streets, and a ring of blocks of depth outskirts_m around the town.
 
-    kind_at(u, v) names the district of a board point.
+    kind_at(u, v) returns the district of a board point.
     """
     u, v, hu, hv = streets.u_m, streets.v_m, streets.half_u_m, streets.half_v_m
     blocks = []
@@ -149,7 +172,7 @@ def list_blocks(
 
 
 def pave_streets(streets: Streets, sheet: Sheet) -> None:
-    """Road slabs of all streets and junctions; their edges abut exactly."""
+    """Add the road slabs of all streets and junctions, without gaps or overlaps."""
     for a, b in sorted(streets.edges):
         axis = 0 if a[1] == b[1] else 1
         start = streets.at(a)[axis] + streets.reach(a, axis)
@@ -165,7 +188,7 @@ def pave_streets(streets: Streets, sheet: Sheet) -> None:
 
 
 def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
-    """Counter-clockwise outline of a junction: kerbs turn on aside circles between neighbouring arms."""
+    """Return the counter-clockwise outline of a junction; kerbs between neighbouring arms are quarter circles."""
     (u, v), arms, r = streets.at(node), streets.arms(node), streets.corner_m[node]
     hu, hv = streets.half_u_m[node[0]], streets.half_v_m[node[1]]
     points: list[tuple[float, float]] = []
@@ -183,22 +206,28 @@ def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
 
 
 def trace_kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
-    """A quarter circle of radius r round a block's corner, as seen from a junction with half-widths hu and hv."""
-    angle = np.linspace(1.5 * np.pi, np.pi, 5)  # from the arm along u to the arm along v
+    """Return a quarter circle of radius r around a block's corner, seen from a junction with half widths hu and hv."""
+    angle = np.linspace(1.5 * np.pi, np.pi, 5)  # Angles from the arm along u to the arm along v.
     return list(zip((hu + r + r * np.cos(angle)).tolist(), (hv + r + r * np.sin(angle)).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A drive through all streets, sampled about every metre: board position and heading of the lane, half-lane."""
+    """A drive through all streets, sampled about every metre, in board coordinates.
+
+    Attributes:
+        uv: Position on the lane (m).
+        heading: Unit direction of travel.
+        lane_m: Distance from the middle of the lane to the middle of the street (m).
+    """
 
     uv: np.ndarray  # (k, 2)
-    heading: np.ndarray  # (k, 2) unit board direction
-    lane_m: np.ndarray  # (k,) distance from the lane's middle to the street's
+    heading: np.ndarray  # (k, 2)
+    lane_m: np.ndarray  # (k,)
 
 
 def plan_route(rng: np.random.Generator, streets: Streets) -> Route:
-    """A route on the right-hand lanes that passes every street at least once."""
+    """Plan a route on the right-hand lanes that uses every street at least once."""
     nodes = _walk(rng, streets)
     uv, lane = [], []
     for k, (a, b) in enumerate(pairwise(nodes)):
@@ -228,7 +257,7 @@ def _compute_lane(streets: Streets, a: Node, b: Node) -> tuple[np.ndarray, np.nd
 
 
 def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """(k, 2) a parabola from one lane to the next; U-turns become a straight jump."""
+    """Return a parabola (k, 2) from one lane to the next; a U-turn is a straight line."""
     knee = start + heading * ((end - start) @ heading) if abs(heading @ out) < 0.5 else (start + end) / 2
     steps = max(3, int(np.linalg.norm(end - start)))
     w = np.linspace(0, 1, steps)[1:-1, None]
@@ -236,7 +265,11 @@ def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: 
 
 
 def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
-    """Nodes of a walk over all edges: new streets first, straight on rather than turning, else the nearest new one."""
+    """Return the nodes of a walk over all edges.
+
+    The walk prefers unused streets and prefers straight continuation to turns. At a node without unused streets, it
+    goes to the nearest one.
+    """
     near: dict[Node, list[Node]] = {}
     for a, b in sorted(streets.edges):
         near.setdefault(a, []).append(b)
@@ -261,7 +294,7 @@ def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
 
 
 def _find_shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], behind: Node | None) -> list[Node]:
-    """The shortest path from start to the nearest goal, not beginning with a U-turn; excludes start."""
+    """Return the shortest path from start to the nearest goal, without start and without a U-turn at the beginning."""
     came: dict[Node, Node] = {n: start for n in near[start] if n != behind}
     queue = deque(came)
     while queue:
@@ -275,4 +308,4 @@ def _find_shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], 
             if there not in came and there != start:
                 came[there] = here
                 queue.append(there)
-    raise AssertionError("the streets are connected, so some street still to be driven can be reached")
+    raise AssertionError("the streets are connected, so an unused street must be reachable")
