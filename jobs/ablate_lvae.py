@@ -8,8 +8,8 @@
     jobs/ablate_lvae.py augmentation        mirrored scenes and moved vehicles
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --num-seeds 5
 
-Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML); scores also go to MLflow. Run the
-same command again to resume: finished trials are kept.
+Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML), and logs its scores to MLflow. Run the
+same command again to resume; finished trials are kept.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Encoding:
     """Measure how well a small object autoencoder reconstructs boxes in each encoding."""
 
     train_sizes: tuple[int, ...] = (1200, 2500, 5000, 10_000)
-    """Training set sizes with the paper's boxes, vehicles; the sets of a seed are nested."""
+    """Training set sizes for vehicle boxes, as in the paper; with the same seed, larger sets contain smaller ones."""
     any_footprint_train_sizes: tuple[int, ...] = (5000,)
-    """Training set sizes with boxes of any footprint, including square ones, whose scatter matrix has no yaw."""
+    """Training set sizes for boxes of any footprint; for square ones, the scatter matrix does not determine the yaw."""
     yaw_only_train_sizes: tuple[int, ...] = (1200, 2500)
-    """Training set sizes with vehicles of which only the numbers that depend on yaw are regressed."""
+    """Training set sizes for vehicle boxes if the network regresses only those code entries that depend on yaw."""
     num_seeds: int = 5
     """Number of seeds."""
     epochs: int = 20
@@ -41,7 +41,7 @@ class Encoding:
     learning_rate: float = 5e-4
     """Learning rate."""
     num_test_boxes: int = 2000
-    """Number of boxes of the shared test set."""
+    """Number of test boxes; all trials use the same ones."""
     num_noisy_boxes: int = 1000
     """Number of boxes per footprint and noise level in the table of yaw errors."""
     max_concurrent_trials: int | None = None
@@ -52,16 +52,16 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Branches:
-    """Train the layout VAE whole, without latent split, without objects and without ground, for equally many steps."""
+    """Compare the layout VAE with variants without latent split, object branch or ground branch, at equal steps."""
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
-    """Training time in minutes, converted to steps by one measurement (one per variant in equal-time studies)."""
+    """Training time in minutes. A speed measurement converts it to steps (one per variant in equal-time studies)."""
     steps: int | None = None
-    """Training steps; replaces --minutes (default: from --minutes)."""
+    """Training steps; this option replaces --minutes (default: computed from --minutes)."""
     num_seeds: int = 3
     """Number of seeds; every variant is trained with seed 0, then every variant with seed 1, and so on."""
     only_variants: tuple[str, ...] = ()
@@ -73,7 +73,7 @@ class Branches:
     max_scenes: int | None = None
     """Maximum number of held-out scenes to evaluate, evenly over the split (default: all)."""
     num_checkpoints: int = 4
-    """Number of checkpoints and validations per training, the points of the curves."""
+    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
     name: str = "branches"
     """Name of the study and of its runs."""
     output: str = ""
@@ -87,24 +87,24 @@ class Decoders(Branches):
     preset: tyro.conf.Positional[str] = "demo"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     num_checkpoints: int = 12
-    """Number of checkpoints and validations per training, the points of the curves."""
+    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
     name: str = "decoders"
     """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
 class Ground(Branches):
-    """Train the ground branch alone, from the paper's networks down to a hundredth of them, at equal time."""
+    """Compare sizes of the ground branch, from the paper's down to a hundredth of it, at equal time."""
 
     num_checkpoints: int = 8
-    """Number of checkpoints and validations per training, the points of the curves."""
+    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
     name: str = "ground"
     """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
 class Augmentation(Branches):
-    """Train with mirrored scenes, moved vehicles, or both, for equally many steps; matters most for few scenes."""
+    """Compare training with mirrored scenes, moved vehicles, both and neither, at equal steps."""
 
     name: str = "augmentation"
     """Name of the study and of its runs."""

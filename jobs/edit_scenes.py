@@ -10,9 +10,9 @@
     jobs/edit_scenes.py repair                                         overlapping, floating and sunken objects
     jobs/edit_scenes.py replay edits.json --input DIR                  a list of edits, one after another
 
-An edit applies to the primitives that match all selection options; --where "true" selects every primitive. Writes the
-same tables with source=edited-<run>, edits/ with the changes of each step, edited-<run>.json with the list for
-`replay`, and <run>.html with pictures.
+An edit applies to the primitives that match all selection options; --where "true" selects every primitive. The job
+writes scene tables with source=edited-<run> and the changes of each step to edits/. It also writes the list of edits
+for `replay` to edited-<run>.json, and pictures to <run>.html.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SelectOptions(EditOptions):
     category: tuple[str, ...] = ()
     """Select primitives of these categories (default: all)."""
     primitives: tuple[int, ...] = ()
-    """Select primitives by number in the scene's rows of the primitives table, from 0 (default: all)."""
+    """Select primitives by index, from 0: the order of the scene's rows in the primitives table (default: all)."""
     instances: tuple[int, ...] = ()
     """Select primitives by instance_id (default: all)."""
     polygon_m: tuple[float, ...] = ()
@@ -77,7 +77,7 @@ class Translate(SelectOptions):
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Offset in metres: x (ahead), y (left), z (up), or along each primitive's own axes with --frame object."""
     frame: Literal["scene", "object"] = "scene"
-    """Axes of the offset: those of the scene, or of each primitive."""
+    """Axes of the offset: those of the scene frame, or those of each primitive."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,9 @@ class Repair(SelectOptions):
     max_push_m: float = 0.25
     """Maximum distance in metres by which an overlapping object is pushed."""
     min_shrink: float = 0.95
-    """Smallest factor by which an object may be scaled where pushing is not enough."""
+    """Smallest factor by which an object may be scaled if pushing is not enough."""
     drop: bool = True
-    """Remove the lower-confidence object of two that still overlap."""
+    """If two objects still overlap, remove the one with the lower existence probability."""
 
 
 @dataclass(frozen=True)

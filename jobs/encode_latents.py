@@ -4,8 +4,8 @@
     jobs/encode_latents.py                                     the town dataset with the town layout VAE
     jobs/encode_latents.py --dataset DIR --lvae MODEL --num-actors 8
 
-Writes latents/, aligned with the scenes/ table, and latents.json. Run the same command again to resume after an
-interruption.
+The job writes latents.json and the table latents/, whose rows have the order of the table scenes/. Run the same command
+again to resume after an interruption.
 """
 
 from __future__ import annotations

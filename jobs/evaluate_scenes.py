@@ -7,15 +7,16 @@
     jobs/evaluate_scenes.py --real DIR --generated samples.npz --inception FILE
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
-Reads the scene tables only; with --lvae and without --generated, --run and --generated-source, only reconstruction is
-evaluated. Of an .npz file, the first --max-scenes pictures count. The defaults are those of the paper: at most 1,000
-training scenes chosen by farthest point sampling of their poses, equally many generated scenes with labels in equal
-parts, k = 3. Every score has a 95 % confidence interval over scenes.
+The job reads only the scene tables. If --lvae is given without --generated, --run and --generated-source, the job
+evaluates only reconstruction. From an .npz file, it uses the first --max-scenes pictures. The defaults are the paper's:
+at most 1,000 training scenes, selected by farthest point sampling of their poses, and k = 3. The job compares them with
+equally many generated scenes, with labels in equal parts. Every score has a 95 % confidence interval over scenes.
 
-Writes metrics.json, metrics.parquet and evaluation.html; with --lvae also reconstruction.html, with the best and
-worst scenes, and reconstruction.parquet, a row per scene. All results also go to MLflow. FID, sFID, KID, IS,
-precision and recall need local Inception weights; without them the job reports distances of layout statistics and of
-a fixed random network under separate names. Run the same command again to resume after an interruption.
+The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, it also
+writes reconstruction.html with the best and worst scenes, and reconstruction.parquet with one row per scene. FID, sFID,
+KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
+distances of layout statistics and of features of a fixed random network, under separate names. Run the same command
+again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -41,17 +42,17 @@ class Config:
     generated_source: str = ""
     """Read only generated scenes of this source, such as edited-<run> or imported-<name> (default: all sources)."""
     max_scenes: int = 1000
-    """Maximum number of scenes on each side; both sides get equally many. The paper uses 1000, 5000 and 10000."""
+    """Maximum number of real and of generated scenes; both numbers are equal. The paper uses 1000, 5000 and 10000."""
     reference: Literal["farthest-point", "min-distance", "uniform"] = "farthest-point"
-    """Choice of real scenes: farthest point sampling of poses, poses at least --min-distance-m apart, or evenly."""
+    """Selection of real scenes: farthest point sampling of poses, poses --min-distance-m apart, or uniform."""
     min_distance_m: float = 10.0
     """Minimum distance of poses in metres for --reference min-distance."""
     balance_labels: bool = True
-    """Take equally many generated scenes of each label, as far as there are enough."""
+    """Use equally many generated scenes of each label, if there are enough."""
     k: tuple[int, ...] = (3,)
     """Numbers of nearest neighbours for precision, recall, density and coverage."""
     supersample: int = 1
-    """Draw each pixel of a picture as the mean of N x N samples."""
+    """Number N: each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights for FID, sFID, KID, IS, precision and recall (default: none)."""
     lvae: str = ""
@@ -59,11 +60,11 @@ class Config:
     lvae_split: str = "test"
     """Split of the real scenes to reconstruct."""
     max_reconstructed_scenes: int | None = None
-    """Maximum number of scenes to reconstruct, evenly over the split (default: all)."""
+    """Maximum number of scenes to reconstruct, selected evenly from the split (default: all)."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
     """Lowest and highest z in metres of the 256 x 256 x 32 voxels."""
     num_examples: int = 3
-    """Number of best and of worst reconstructed scenes to show."""
+    """Number of scenes to show with the best reconstruction, and with the worst."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/<run>, or evaluations/latest without --run)."""
     num_actors: int = 2

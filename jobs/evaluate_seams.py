@@ -5,12 +5,13 @@
     jobs/evaluate_seams.py --generated DIR --rows-m 32 96 --cols-m 32 96
     jobs/evaluate_seams.py --generated DIR --real DIR --real-rows-m 16 32 48
 
-Each score is a ratio between the seam and parallel lines 4 to 16 m away: changes of class, steps of height, cut
-objects and duplicate objects. A ratio of 1 means that the seam does not show. Lines across the street in real scenes
-give the level to compare with. Lines along the street are not comparable: the borders of a street run along it.
+The job counts changes of class, height steps, cut objects and duplicate objects at each seam. Each score is the ratio
+of the count at the seam to the count at parallel lines 4 to 16 m away. A ratio of 1 means that the seam is invisible.
+For comparison, the job also scores lines across the street in real scenes. Lines along the street are not comparable,
+because the borders of a street are parallel to them.
 
-Writes metrics.json, metrics.parquet, seams.parquet (a row per scene) and seams.html; the scores also go to MLflow. A
-result needs at least 200 seams.
+The job writes metrics.json, metrics.parquet, seams.parquet (one row per scene) and seams.html, and logs the scores to
+MLflow. A reliable result needs at least 200 seams.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ class Config:
     run: str = ""
     """Read only outpainted scenes of source generated-<run> (default: all sources)."""
     rows_m: tuple[float, ...] = ()
-    """Seams across the street: metres from a scene's far edge (default: the borders of its middle 64 m)."""
+    """Seams across the street: distances in metres from a scene's far edge (default: borders of the middle 64 m)."""
     cols_m: tuple[float, ...] = ()
-    """Seams along the street: metres from a scene's left edge (default: the borders of its middle 64 m)."""
+    """Seams along the street: distances in metres from a scene's left edge (default: borders of the middle 64 m)."""
     real: str = ""
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"
@@ -37,7 +38,7 @@ class Config:
     real_rows_m: tuple[float, ...] = (16.0, 32.0, 48.0)
     """Lines across the street in real scenes: distances in metres from a scene's far edge."""
     max_scenes: int | None = None
-    """Maximum number of scenes on each side, evenly over each (default: all)."""
+    """Maximum number of generated and of real scenes, selected evenly (default: all)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/seams)."""
     num_actors: int = 2

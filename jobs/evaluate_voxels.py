@@ -5,9 +5,9 @@
     jobs/evaluate_voxels.py --ground-truth DATASET --split test --reconstructed DIR    files named by scene_id
     jobs/evaluate_voxels.py --ground-truth DATASET --reconstructed DIR --compressed 'LATENTS/*.npy' --allow-missing
 
-Files hold 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 class ids; coarse grids are upsampled by repetition
-(docs/imports.md). Every voxel of the full grid counts, in one confusion matrix over all scenes. Writes metrics.json,
-metrics.parquet and voxels.parquet, a row per scene; the scores also go to MLflow.
+A file holds 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 class ids. Coarse grids are upsampled by repetition
+(docs/how_to/import_scenes.md). The scores come from one confusion matrix of all voxels of all scenes. The job writes
+metrics.json, metrics.parquet and voxels.parquet (one row per scene), and logs the scores to MLflow.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from jobs.support.cli import run
 @dataclass(frozen=True)
 class Config:
     ground_truth: str
-    """Directory of ground-truth voxels, .npz, or a dataset directory, whose scenes are voxelised."""
+    """Directory of ground-truth voxels (.npz), or a dataset directory; its scenes are then voxelised."""
     reconstructed: str
-    """Directory or quoted pattern of the reconstructed voxels, .npz."""
+    """Directory or quoted pattern of the reconstructed voxels (.npz)."""
     compressed: str = ""
-    """Directory or pattern of the method's compressed scenes, any files, whose size is reported (default: none)."""
+    """Directory or pattern of the method's compressed scenes; the job reports their file sizes (default: none)."""
     split: str = ""
     """Read only scenes of this split of the dataset (default: all splits)."""
     axes: tuple[str, str, str] | None = None
@@ -34,7 +34,7 @@ class Config:
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
     """Lowest and highest z in metres of a dataset's voxels; the reconstructions must have the same."""
     allow_missing: bool = False
-    """Evaluate the scenes that all sides have instead of stopping at a missing counterpart."""
+    """Evaluate only the scenes for which all files exist, instead of stopping at a missing file."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/voxels)."""
 

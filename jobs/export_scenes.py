@@ -4,10 +4,10 @@
     jobs/export_scenes.py --input DIR --formats glb xodr
     jobs/export_scenes.py --max-scenes 10 --formats ply npz --output DIR
 
-glb: glTF 2.0, a named node per primitive with class, instance and exact parameters in its extras. ply: one mesh with
-colours, class ids and primitive numbers per vertex. npz: 256 x 256 x 32 voxels of class ids, which import_scenes and
-evaluate_voxels read. xodr: the roads as OpenDRIVE 1.7 with lanes, elevation and junctions, for simulators. Files are
-written to OUTPUT/<format>/<scene_id>.<format>; existing files are kept.
+glb is glTF 2.0 with one named node per primitive; class, instance and exact parameters are in the extras of the node.
+ply is one mesh with a colour, class id and primitive number per vertex. npz contains 256 x 256 x 32 voxels of class
+ids, which import_scenes and evaluate_voxels read. xodr contains the roads as OpenDRIVE 1.7 with lanes, elevation and
+junctions, for simulators. The job writes OUTPUT/<format>/<scene_id>.<format> and keeps existing files.
 """
 
 from __future__ import annotations

@@ -4,11 +4,11 @@
     jobs/inpaint_scenes.py --polygon-m 10 -20 50 -20 50 5 10 5           a rectangle: corners x y, x ahead, y left
     jobs/inpaint_scenes.py --half-plane 1 0 32 --num-variants 4          everything at least 32 m ahead, four variants
     jobs/inpaint_scenes.py --primitives 3 17 --contents objects          objects around primitives 3 and 17, same ground
-    jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects       new objects on the given ground
+    jobs/inpaint_scenes.py --half-plane 1 0 -99 --contents objects       new objects on the same ground
     jobs/inpaint_scenes.py --polygon-m ... --guided                      fast, with smoother seams
 
-Regions are enlarged to whole latent cells. Writes the same tables with source=generated-<run>, a GLB file per scene,
-and <run>.html.
+Regions are enlarged to whole latent cells. The job writes scene tables with source=generated-<run>, one GLB file per
+scene, and <run>.html.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Config(RePaintOptions):
     polygon_m: tuple[float, ...] = ()
     """Corners of the region, x y x y ..., in metres of the scene: x ahead, y left (default: none)."""
     half_plane: tuple[float, ...] = ()
-    """Direction x y, and the distance in metres along it at which the region begins (default: none)."""
+    """Region beyond a line: its direction x y, and the distance in metres at which it begins (default: none)."""
     primitives: tuple[int, ...] = ()
-    """Regenerate the surroundings of these primitives, by row in the primitives table, from 0 (default: none)."""
+    """Regenerate the surroundings of these primitives, given by their index in the scene, from 0 (default: none)."""
     margin_m: float = 1.0
     """Margin around --primitives in metres."""
     invert_region: bool = False
@@ -35,7 +35,7 @@ class Config(RePaintOptions):
     contents: Literal["both", "ground", "objects"] = "both"
     """What to regenerate in the region."""
     num_variants: int = 1
-    """Number of results per scene."""
+    """Number of different results per scene."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/inpainted)."""
     run: str = "inpainted"

@@ -8,7 +8,7 @@
     jobs/inspect_scenes.py report --dataset DIR                            one self-contained HTML page
     jobs/inspect_scenes.py gallery --dataset DIR --max-scenes 200          an HTML page with filters and scenes in 3D
 
-Works for real and generated scenes and reads the tables only. Files are written to $PRITTI_HOME/inspect/<dataset>
+The job works for real and generated scenes and reads only the tables. It writes to $PRITTI_HOME/inspect/<dataset>
 unless --output is given.
 """
 
@@ -57,9 +57,9 @@ class Sheet(DatasetOptions):
     max_scenes: int = 64
     """Maximum number of scenes."""
     sort: str = "drive"
-    """drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table, such as num_pole."""
+    """Order: drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table (num_pole)."""
     pick: Literal["uniform", "lowest", "highest"] = "uniform"
-    """Which of the sorted scenes: evenly over all, the first or the last."""
+    """Which of the sorted scenes to draw: evenly from all, those with the lowest values, or with the highest."""
     view: Literal["bev", "3d"] = "bev"
     """View: bird's-eye or oblique."""
     size_px: int = 256
@@ -77,17 +77,17 @@ class Report(DatasetOptions):
     """Write one HTML page: totals, splits, counts, sizes, ground, labels, rejects, example scenes."""
 
     num_examples: int = 8
-    """Number of scenes shown, from least to most vegetation; with 0 the job runs without Ray."""
+    """Number of scenes shown, ordered by increasing vegetation; with 0, the job does not start Ray."""
     output: str = ""
     """HTML file to write (default: $PRITTI_HOME/inspect/<dataset>/report.html)."""
 
 
 @dataclass(frozen=True)
 class Gallery(DatasetOptions):
-    """Write one HTML page to publish: scenes in 3D with filters by label and statistics; about 35 kB per scene."""
+    """Write one HTML page for publication: scenes in 3D with filters by label and statistics, 35 kB per scene."""
 
     max_scenes: int = 100
-    """Maximum number of scenes, evenly over the dataset."""
+    """Maximum number of scenes, selected evenly from the dataset."""
     title: str = "Scenes"
     """Title of the page."""
     output: str = ""

@@ -7,10 +7,10 @@
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
 
-By default one block on each side, as in the paper: four sides in one batch, then four corners. Writes the same tables
-with source=generated-<run>, one scene and one GLB file per input scene, and block_tables/ with the known share of
-each block. A block is generated as soon as the blocks that it depends on are complete; the result does not depend on
-the number of actors.
+By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. It
+writes scene tables with source=generated-<run>, one GLB file per scene, and block_tables/ with the share of known
+ground in each block. A block is generated as soon as the blocks that it depends on are complete. The result does not
+depend on the number of actors.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Config(RePaintOptions):
     overlap: float = 0.5
     """Overlap of neighbouring blocks, as a share of a block."""
     order: Literal["outward", "colours"] = "outward"
-    """Order of blocks: from the scene outward (the paper), or concurrently by a four-colouring (--overlap < 0.5)."""
+    """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (--overlap < 0.5)."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Known latents of a block: its neighbours re-encoded in its frame, or their shifted latents (the paper)."""
+    """Known latents of a block: encode the neighbours again in its frame, or copy their shifted latents (the paper)."""
     batch_size: int = 4
-    """Blocks of a scene per batch; changes blocks only by rounding."""
+    """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 
     def output_directory(self) -> str:
         return resolve_path(self.output, "outpainted")

@@ -5,10 +5,10 @@
     jobs/preprocess_scenes.py town --num-train 500 --num-test 100
     jobs/preprocess_scenes.py kitti360 --input KITTI-360 --output DIR
     jobs/preprocess_scenes.py av2 --input AV2 --output DIR
-    jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/own_drives.md
+    jobs/preprocess_scenes.py own --input DRIVES --output DIR             your own drives: docs/how_to/own_drives.md
 
-Writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to resume
-after an interruption.
+The job writes the tables scenes, primitives, rasters and rejects, and dataset.json. Run the same command again to
+resume after an interruption.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Av2:
 
 @dataclass(frozen=True)
 class Own:
-    """Read your own drives: boxes, polygons and poses as Parquet or JSON under --input/DRIVE (docs/own_drives.md)."""
+    """Read your own drives from Parquet or JSON files under --input/DRIVE (docs/how_to/own_drives.md)."""
 
     input: str
     """Directory that contains one directory per drive."""
@@ -87,7 +87,7 @@ Config = (
     | Annotated[Av2, tyro.conf.subcommand("av2")]
     | Annotated[Own, tyro.conf.subcommand("own")]
 )
-DEFAULT = Town()  # without a subcommand
+DEFAULT = Town()  # source if the command line names none
 
 
 if __name__ == "__main__":

@@ -5,11 +5,11 @@
     jobs/evaluate_scenes.py --real-split test --run judged --lvae DIR/lvae
     jobs/publish_model.py --name town --evaluation $PRITTI_HOME/evaluations/judged
 
-Writes weights, configuration and a model card, and registers a version in MLflow. The card describes the MLflow runs
-that trained these weights and the evaluation of scenes that they generated; for published weights that a training
-started from, it quotes their entry. If a run or the evaluation is missing or belongs to other weights, nothing is
-published. Other jobs then take the pipeline as --model NAME, its directory, models:/NAME/VERSION, or the id of its
-MLflow run.
+The job writes weights, configuration and a model card, and registers a version in MLflow. The card describes the MLflow
+runs that trained these weights, and the evaluation of scenes that were generated with them. If a training started from
+published weights, the card quotes their entry. If a run or the evaluation is missing or belongs to other weights, the
+job publishes nothing. Other jobs accept a published pipeline as --model NAME, as its directory, as
+models:/NAME/VERSION, or as the id of its MLflow run.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Config:
     evaluation: str = ""
     """Directory that jobs/evaluate_scenes.py --lvae wrote (default: $PRITTI_HOME/evaluations/latest)."""
     name: str = "town"
-    """Name of the entry and of the registered model."""
+    """Name of the entry in the model zoo and of the registered model."""
     output: str = ""
-    """Directory to write the entry to (default: $PRITTI_HOME/zoo/<name>)."""
+    """Directory to write weights and model card to (default: $PRITTI_HOME/zoo/<name>)."""
     register: bool = True
-    """Also register the entry as a model version in MLflow."""
+    """Also register the pipeline as a model version in MLflow."""
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@
     jobs/run_demo.py                        15 minutes on two cores, all files under runs/demo
     jobs/run_demo.py --lvae-steps 20000 --dit-steps 50000 --output DIR       longer training, better scenes
 
-Generates scenes with the released model, then preprocesses the town, trains the layout VAE, encodes latents, trains
-the diffusion transformer, samples, outpaints a scene and evaluates. It needs no data, no GPU and no network. Run the
-same command again to resume after an interruption.
+The demo first generates scenes with the released model. It then preprocesses the town, trains the layout VAE, encodes
+latents, trains the diffusion transformer, samples scenes, outpaints a scene and evaluates the results. The demo needs
+no data, no GPU and no network. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from jobs.support.cli import run
 @dataclass(frozen=True)
 class Config:
     output: str = "runs/demo"
-    """Directory of all files: data, runs, models, MLflow, report.html."""
+    """Directory to write all files to: data, runs, models, MLflow, report.html."""
     preset: str = "demo"
-    """Model preset; smoke runs through in two minutes."""
+    """Model preset; with smoke, the demo takes two minutes."""
     num_train: int = 1200
     """Number of training scenes of the town."""
     num_test: int = 200
@@ -33,7 +33,7 @@ class Config:
     dit_steps: int = 1700
     """Training steps of the diffusion transformer."""
     dit_batch_size: int = 8
-    """Batch size of the diffusion transformer; many small steps give recognisable scenes sooner than few large ones."""
+    """Batch size of the diffusion transformer; small batches with many steps give recognisable scenes sooner."""
     num_released_scenes: int = 12
     """Number of scenes to generate with the released model before training."""
     num_scenes: int = 48

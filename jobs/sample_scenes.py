@@ -6,8 +6,8 @@
     jobs/sample_scenes.py --num-scenes 4 --num-glb 4                with GLB files of the first four
     jobs/sample_scenes.py --sampler dpm++ --num-inference-steps 20  eleven times as fast
 
-Writes the same Parquet tables as preprocessing, with source=generated-<run>. Scene i depends only on --seed, i and
-its label, regardless of the number of actors and the batch size. Run the same command again to resume after an
+The job writes the same Parquet tables as preprocessing, with source=generated-<run>. Scene i depends only on --seed, i
+and its label, regardless of the number of actors and the batch size. Run the same command again to resume after an
 interruption.
 """
 
@@ -34,21 +34,21 @@ class Config:
     seed: int = 0
     """Random seed."""
     sampler: Literal["ddpm", "ddim", "dpm++", "sde-dpm++"] = "ddpm"
-    """DDPM as in the paper, DDIM, DPM-Solver++, which needs the fewest steps, or its SDE variant with noise."""
+    """Sampler: DDPM (the paper), DDIM, DPM-Solver++ (fewest steps), or the SDE variant of DPM-Solver++."""
     num_inference_steps: int = 250
-    """Denoising steps, as in the paper."""
+    """Number of denoising steps (paper: 250)."""
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off. Paper: 1 for the metrics, 4 for the pictures."""
     noise_scaling: float | None = None
-    """Divisor of the predicted noise; above 1, small objects are kept (default: published value; 1 with ddpm)."""
+    """Divisor of the predicted noise; values above 1 preserve small objects (default: published value; 1 with ddpm)."""
     existence_threshold: float | None = None
-    """Probability above which a primitive exists (default: published value; paper: 0.3)."""
+    """Keep primitives with a higher existence probability (default: published value; paper: 0.3)."""
     repair: bool = False
-    """Repair floating, sunken and overlapping objects as jobs/edit_scenes.py repair --no-drop does."""
+    """Repair floating, sunken and overlapping objects, as with jobs/edit_scenes.py repair --no-drop."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
     batch_size: int = 8
-    """Scenes per batch and pipeline; changes scenes only by rounding."""
+    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     num_glb: int = 0
     """Number of scenes, from the first, to export as GLB to <output>/glb/<run>."""
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Sweep samplers and numbers of denoising steps, scored against the same real scenes.
+"""Compare samplers and numbers of denoising steps against the same real scenes.
 
     jobs/sweep_samplers.py                                             256 town scenes each, 10 to 250 steps
     jobs/sweep_samplers.py --samplers ddpm dpm++ --num-inference-steps 10 250 --num-scenes 64
     jobs/sweep_samplers.py --samplers dpm++ --num-inference-steps 20 --noise-scalings 1 1.005 1.01      for a new model
 
-Writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and
+The job writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and
 samplers.html. Run the same command again to resume after an interruption.
 """
 
@@ -37,7 +37,7 @@ class Config:
     guidance_scale: float = 1.0
     """Classifier-free guidance scale; 1 switches guidance off."""
     batch_size: int = 8
-    """Scenes per batch and pipeline; changes scenes only by rounding."""
+    """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     num_examples: int = 4
     """Number of scenes of each setting shown on the page."""
     output: str = ""

@@ -2,11 +2,11 @@
 """Train the diffusion transformer (stage 2) on latents.
 
     jobs/train_dit.py                       the town preset on $PRITTI_HOME/datasets/town
-    jobs/train_dit.py smoke                 seconds; makes its own data, layout VAE and latents
+    jobs/train_dit.py smoke                 seconds; generates its own data, layout VAE and latents
     jobs/train_dit.py kitti360-xl --dataset DIR --label-kind joint --num-workers 8
-    jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      more steps for released weights
+    jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      continue with the released weights
 
-Writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. Losses and sampled scenes go to MLflow
+The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. It logs losses and sampled scenes to MLflow
 ($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
@@ -22,7 +22,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; missing values come from the preset (models/presets.py)."""
+    """Options of a training run; the preset provides the values of options that are not given (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
@@ -39,7 +39,7 @@ class Config:
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     start_from: str = ""
-    """Initialise with the weights of this pipeline, named as --model of other jobs (default: random weights)."""
+    """Initialise with the weights of this pipeline, given like --model of other jobs (default: random weights)."""
     steps: int | None = None
     """Training steps (default: as in the preset)."""
     batch_size: int | None = None
@@ -55,7 +55,7 @@ class Config:
     normalise_latents: bool | None = None
     """Normalise each latent channel to mean 0 and standard deviation 1 (default: as in the preset; paper: False)."""
     timestep_sampling: Literal["uniform", "logit-normal"] = "uniform"
-    """Distribution of training timesteps: uniform (the paper), or logit-normal, which favours the middle ones."""
+    """Distribution of training timesteps: uniform (the paper), or logit-normal, which prefers middle timesteps."""
     gradient_accumulation_steps: int = 1
     """Number of parts, processed in sequence, into which each worker's batch is divided to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"

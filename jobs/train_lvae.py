@@ -2,15 +2,16 @@
 """Train the layout VAE (stage 1) on scene tables.
 
     jobs/train_lvae.py                      the town preset on $PRITTI_HOME/datasets/town
-    jobs/train_lvae.py smoke                seconds; makes its own data
+    jobs/train_lvae.py smoke                seconds; generates its own data
     jobs/train_lvae.py kitti360 --dataset DIR --num-workers 4
     jobs/train_lvae.py demo --train-object-decoder-of town --name lvae-decoder     a new object decoder for a pipeline
 
---train-object-decoder-of keeps the encoders and the ground decoder of a pipeline. Its transformer stays valid,
-because the latents do not change; the pipeline with the new decoder is written to $PRITTI_HOME/models/pritti-<name>.
+--train-object-decoder-of keeps the encoders and the ground decoder of a pipeline. The latents do not change, so the
+transformer of the pipeline remains valid. The job writes the pipeline with the new decoder to
+$PRITTI_HOME/models/pritti-<name>.
 
-Writes the model to $PRITTI_HOME/models/lvae-<preset>. Losses and pictures go to MLflow ($MLFLOW_TRACKING_URI, default
-an sqlite file under $PRITTI_HOME). Run the same command again to resume.
+The job writes the model to $PRITTI_HOME/models/lvae-<preset>. It logs losses and pictures to MLflow
+($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; missing values come from the preset (models/presets.py)."""
+    """Options of a training run; the preset provides the values of options that are not given (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
@@ -36,7 +37,7 @@ class Config:
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
     train_object_decoder_of: str = ""
-    """Train only a new object decoder for this pipeline, named as --model of other jobs (default: train all)."""
+    """Train only a new object decoder for this pipeline, given like --model of other jobs (default: train all)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     steps: int | None = None

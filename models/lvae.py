@@ -93,7 +93,7 @@ class LayoutVAE(ConfiguredModel):
             latent_channels * (2 if branches == "both" else 1),
             size,
             size,
-        )  # shape of the joint latent
+        )
         seen = latent_channels if split_latent else self.latent_shape[0]  # number of channels that a decoder reads
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":

@@ -42,7 +42,8 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.training.latents import load_lvae
 
 TIMING_STEPS = 60
-NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output")  # may change between runs of a study
+# Options that may change between runs of a study.
+NOT_RECORDED = ("num_seeds", "only_variants", "num_workers", "output")
 RECORDED_AS = {"max_scenes": "limit", "num_checkpoints": "checks"}  # keys in study.json
 
 
@@ -67,7 +68,7 @@ def compare_encodings(config: Encoding) -> str:
             config.max_concurrent_trials,
             lambda: bar.advance(shown),
         )
-        bar.add_task("disturb numbers", total=None)
+        bar.add_task("measure yaw errors", total=None)
         losses = ablation.compute_yaw_losses(config.num_noisy_boxes)
     rows = ablation.average_by_size(scores)
     for row in rows:
@@ -85,7 +86,7 @@ def compare_encodings(config: Encoding) -> str:
 
 
 def plan_trials(config: Encoding) -> list:
-    """Return the trials of all three sets of boxes."""
+    """Return the trials of all three kinds of boxes."""
     trials = ablation.list_trials("vehicle", config.train_sizes, config.num_seeds)
     if config.yaw_only_train_sizes:
         trials += ablation.list_trials("vehicle", config.yaw_only_train_sizes, config.num_seeds, "moving")
@@ -113,7 +114,7 @@ def write_encoding_report(
     write_tables(output, "encodings", rows, tables[:-1], figure)
     write_tables(output, "yaw_loss", losses, [angles], cost)
     html = ablation.render_page(
-        "Encodings of a box", "Cholesky, quaternion and octahedral, rebuilt", tables, charts, notes
+        "Encodings of a box", "Reconstruction with Cholesky, quaternion and octahedral encodings", tables, charts, notes
     )
     write_page(output, html, tables, tracker)
 
@@ -144,7 +145,7 @@ def compare_variants(config: Branches) -> str:
     table = ablation.build_variant_table(rows)
     write_tables(output, config.name, rows, [table], curves)
     equal = "equal time" if is_at_equal_time(config) and not config.steps else "equally many steps"
-    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all.", describe_machine()]
+    how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all variants.", describe_machine()]
     html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
     write_page(output, html, [table], tracker)
     return output
@@ -228,7 +229,10 @@ def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
 
 
 def measure_steps(config: Branches, variant: str, output: str) -> int:
-    """Return the steps of a variant in --minutes, measured once and then read from timing-<variant>.json."""
+    """Return the number of steps that a variant completes in --minutes.
+
+    The speed is measured once and then read from timing-<variant>.json.
+    """
     record = storage.join_uri(output, f"timing-{make_slug(variant)}.json")
     if not storage.exists(record):
         name = f"timing-{make_slug(variant)}"
@@ -236,7 +240,8 @@ def measure_steps(config: Branches, variant: str, output: str) -> int:
         training = replace(training, validate=None, log_every=1)
         fit(training, config.num_workers, storage.join_uri(output, "models", name))
         rates = [value for _, value in training.tracker.history("scenes_per_second")]
-        per_second = median(rates[len(rates) // 2 :]) / training.stream.batch_size  # the first steps are slow
+        # The first half is skipped, because the first steps are slow.
+        per_second = median(rates[len(rates) // 2 :]) / training.stream.batch_size
         storage.write_json(
             {"steps_per_second": per_second, "steps": max(1, int(60 * config.minutes * per_second))}, record
         )
@@ -250,7 +255,7 @@ def guard_study(output: str, options: dict) -> None:
     """Bind a directory to one set of options.
 
     Raises:
-        ValueError: It holds trials of other options.
+        ValueError: The directory holds trials with other options.
     """
     records = ("/study.json", "/mlflow.json")
     guard_options(
@@ -268,7 +273,7 @@ def guard_study(output: str, options: dict) -> None:
 def write_tables(
     output: str, name: str, rows: list[dict], tables: Sequence[Table], figure: Chart | None = None
 ) -> None:
-    """Write NAME.json and NAME.parquet with all rows, NAME.txt with the tables, NAME.svg with the figure."""
+    """Write all rows to NAME.json and NAME.parquet, the tables to NAME.txt, and the figure to NAME.svg."""
     storage.write_json({"machine": describe_machine(), "rows": rows}, storage.join_uri(output, f"{name}.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, f"{name}.parquet"))
     text = io.StringIO()
@@ -291,7 +296,7 @@ def write_page(output: str, html: str, tables: Sequence[Table], tracker: Tracker
 
 
 def describe_machine() -> str:
-    """Return machine and versions in one line."""
+    """Return a description of machine and versions in one line."""
     return f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, torch {torch.__version__}"
 
 

@@ -1,6 +1,7 @@
-"""Checks of options that need neither torch nor Ray: `run` reports mistakes before it imports a job's implementation.
+"""Checks of options that need neither torch nor Ray.
 
-A function check_<job>(config) raises ValueError for a mistake. The implementations call it too.
+`run` reports invalid options before it imports a job's implementation. A function check_<job>(config) raises ValueError
+for an invalid option. The implementations also call these functions.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pipelines.schema.dataset import Dataset
 
 
 def find_training_dataset(config: LVAEConfig | DiTConfig, source: str) -> str:
-    """Return --dataset, or the directory of the preset's dataset."""
+    """Return the directory of --dataset, or of the preset's dataset if the option is empty."""
     if config.dataset:
         return make_absolute(config.dataset)
     return home_path("datasets", "smoke" if config.preset == "smoke" else source)
@@ -73,7 +74,7 @@ def check_encode_latents(config: EncodeConfig) -> None:
 
 def check_preprocess_scenes(config: Town | Kitti360 | Av2 | Own) -> None:
     if not isinstance(config, Town) and "://" not in config.input and not os.path.isdir(make_absolute(config.input)):
-        raise ValueError(f"--input {config.input}: no such directory; give the dataset's root")
+        raise ValueError(f"--input {config.input}: no such directory; specify the root directory of the dataset")
 
 
 def check_sample_scenes(config: SampleConfig) -> None:
@@ -87,7 +88,7 @@ def check_publish_model(config: PublishConfig) -> None:
 
 def check_inpaint_scenes(config: InpaintConfig) -> None:
     if not (config.polygon_m or config.half_plane or config.primitives):
-        raise ValueError("no region: give --polygon-m, --half-plane or --primitives")
+        raise ValueError("no region; specify --polygon-m, --half-plane or --primitives")
     require_positive(config, "num_variants", "num_actors")
     if config.num_examples < 0:
         raise ValueError(f"--num-examples is {config.num_examples}, expected 0 or more")
@@ -108,6 +109,8 @@ def check_evaluate_scenes(config: EvaluateConfig) -> None:
     if config.max_reconstructed_scenes is not None and not config.lvae:
         raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
     if config.inception and not storage.exists(make_absolute(config.inception)):
-        raise ValueError(f"--inception {config.inception}: no such file; docs/evaluation.md says where to get it")
+        raise ValueError(
+            f"--inception {config.inception}: no such file; docs/concepts/evaluation.md describes how to obtain it"
+        )
     if config.lvae and not storage.exists(storage.join_uri(make_absolute(config.lvae), "config.json")):
         raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")

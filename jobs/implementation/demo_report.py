@@ -30,7 +30,7 @@ MEANINGS = {
 
 
 def draw_scene_pair(scene: Scene, caption: str, tag: str) -> tuple[Picture, Picture]:
-    """Return a scene in 3D and from above."""
+    """Return pictures of a scene in 3D and from above."""
     return (
         Picture(caption, render_3d(scene, 640, 480), tag),
         Picture("", render_bev(scene, 384, supersample=2), tag),
@@ -46,7 +46,7 @@ def draw_scene_pictures(title: str, note: str, scenes: list[Scene], tag: str) ->
 
 
 def select_one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
-    """Return `count` scenes with low, medium and high vegetation in turn, as far as there are enough."""
+    """Return up to `count` scenes, with low, medium and high vegetation in turn."""
     groups = {name: iter([s for s in scenes if s.vegetation_density == name]) for name in ("low", "medium", "high")}
     chosen: list[Scene] = []
     while len(chosen) < count and groups:
@@ -96,20 +96,20 @@ def write_demo_report(path: str, config: Config, scores: dict, seconds: dict[str
 def make_introduction_sections(
     config: Config, reconstruction: dict, num_real: int, num_generated: int, total_seconds: float
 ) -> list[Section]:
-    """What the page shows, and its key figures."""
+    """Return an introduction of the page and its key figures."""
     minutes = total_seconds / 60
     return [
         Text(
-            "What this is",
+            "About this page",
             [
-                "A layout VAE and a diffusion transformer were trained from random weights on a procedural "
-                f"town, on this machine, in {minutes:.1f} minutes. The scenes below the real ones are generated. "
-                "The method is the paper's; the models are small and the training is short. Longer runs of the "
-                "same command give better scenes.",
+                "This demo trained a layout VAE and a diffusion transformer from random weights on a procedural "
+                f"town. The whole run took {minutes:.1f} minutes on this machine. The page shows real scenes, and "
+                "generated scenes below them. The method is the paper's, but the models are small and the training is "
+                "short. Longer training gives better scenes.",
             ],
         ),
         KeyFigures(
-            "In short",
+            "Key figures",
             [
                 Figure(
                     f"{minutes:.1f} min",
@@ -126,13 +126,14 @@ def make_introduction_sections(
 
 
 def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene]) -> list[Section]:
-    """Pictures of released, real, generated and outpainted scenes."""
+    """Return pictures of released, real, generated and outpainted scenes."""
     released = []
     if config.num_released_scenes:
         released = [
             draw_scene_pictures(
                 "Scenes of the released model",
-                "The weights come with the package and were trained for longer than a demo (models/weights/town).",
+                "These weights are included in the package (models/weights/town). "
+                "Their training was longer than the demo's.",
                 select_one_per_label(list(read_scenes(home_path("released"), "generated-samples")), SHOWN),
                 "generated",
             )
@@ -141,7 +142,8 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
         *released,
         draw_scene_pictures(
             "Real scenes",
-            "Held-out scenes of the town, 64 x 64 m, in 3D and from above. The car is at the bottom edge, facing up.",
+            "Held-out scenes of the town, 64 m x 64 m, in 3D and from above. "
+            "The ego vehicle is at the bottom and faces up.",
             select_one_per_label(real, SHOWN),
             "real",
         ),
@@ -156,25 +158,25 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
 
 
 def draw_outpainting_pictures(scene: Scene) -> Pictures:
-    """One outpainted scene from the side and from above."""
+    """Return pictures of an outpainted scene in 3D and from above."""
     return Pictures(
         "An outpainted scene",
         [
             Picture("128 x 128 m", render_3d(scene, 960, 720), "generated"),
             Picture(
-                "the middle quarter is the given scene; four sides and four corners were added",
+                "the middle quarter is the input scene; four sides and four corners are generated",
                 render_bev(scene, 720, supersample=2),
                 "generated",
             ),
         ],
         columns=2,
-        note="One generated scene, extended in two passes: four sides, then four corners. Each block overlaps the "
+        note="A generated scene is extended in two passes: four sides, then four corners. Each block overlaps the  "
         "known region by half.",
     )
 
 
 def draw_training_charts() -> Charts:
-    """Loss and validation curves of both stages."""
+    """Return the loss and validation curves of both stages."""
     losses = {"loss": "training", "validation_loss": "held out"}
     return Charts(
         "Training",
@@ -198,7 +200,7 @@ def draw_training_charts() -> Charts:
 
 
 def score_sections(scores: dict, data: str) -> list[Section]:
-    """Tables of reconstruction, generation and validity scores, and of the town's statistics."""
+    """Return tables of reconstruction, generation and validity scores, and of the town's statistics."""
     reconstruction, generation = scores["reconstruction"], scores["generation"]
     return [
         Table(
@@ -213,19 +215,22 @@ def score_sections(scores: dict, data: str) -> list[Section]:
             "The town against KITTI-360",
             ("what", "vegetation", "target", "measured", "within tolerance"),
             [tuple(row) for row in measure_town(islice(read_scenes(data, "town", "train"), 1000))],
-            note="The targets are published statistics of KITTI-360. A test checks them on 1,000 scenes; here they are "
-            "measured on the demo's scenes.",
+            note="The targets are published statistics of KITTI-360. A test checks the town on 1,000 scenes. "
+            "This table uses the scenes of the demo.",
         ),
     ]
 
 
 def make_closing_sections(config: Config, seconds: dict[str, float]) -> list[Section]:
-    """Duration of the stages, and the options of the run."""
+    """Return the durations of the stages and the options of the run."""
     return [
         Table(
             "Duration of the stages",
             ("stage", "seconds"),
             [(name, round(value, 1)) for name, value in seconds.items()],
         ),
-        Text("How to repeat it", ["make demo", ", ".join(f"{name}={value}" for name, value in asdict(config).items())]),
+        Text(
+            "How to repeat the demo",
+            ["make demo", ", ".join(f"{name}={value}" for name, value in asdict(config).items())],
+        ),
     ]

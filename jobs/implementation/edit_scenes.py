@@ -30,11 +30,11 @@ def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
     """Return the edits of the command line or of a file.
 
     Raises:
-        ValueError: The file is missing or holds no list of edits.
+        ValueError: The file is missing or contains no list of edits.
     """
     if isinstance(config, Replay):
         if not config.edits:
-            raise ValueError("replay needs a file: give the JSON file with the list of edits")
+            raise ValueError("replay needs a JSON file with the list of edits")
         content = storage.read_json(make_absolute(config.edits))
         content = content.get("edits") if isinstance(content, dict) else content
         try:
@@ -68,8 +68,8 @@ def edit_scenes(config: SelectOptions | Replay) -> batch_edit.EditResult:
     """Edit scenes, write them, and return the changes."""
     if config.num_examples < 0 or not config.run or set(config.run) & set("/=\\"):
         raise ValueError(
-            f"--num-examples is {config.num_examples}, --run {config.run!r}: expected 0 or more, and a word without "
-            "/ = and \\"
+            f"--num-examples is {config.num_examples}, --run {config.run!r}: expected a number of 0 or more, and a "
+            "name without / = and \\"
         )
     edits = read_edits(config)
     for step in edits:

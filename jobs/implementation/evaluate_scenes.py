@@ -57,7 +57,10 @@ def evaluate(config: Config) -> dict:
 
 
 def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, SceneSet]) -> dict:
-    """Return what was evaluated: sides, sampling options if one run generated all scenes, weights of the LVAE."""
+    """Return a description of the evaluated scenes and of the weights of the layout VAE.
+
+    It includes the sampling options if one run generated all scenes.
+    """
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
     about["lvae_weights"] = digest_weights(load_lvae(make_absolute(config.lvae))) if config.lvae else None
     made = sides.get("generated")
@@ -73,7 +76,7 @@ def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, Sc
 def evaluate_generation(
     config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
 ) -> dict:
-    """Score generated scenes; write evaluation.html, and the features of each scene to described/."""
+    """Score generated scenes, write evaluation.html, and write the features of each scene to described/."""
     looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))
     described = {}
     for name, side in sides.items():
@@ -101,10 +104,10 @@ def evaluate_generation(
 
 
 def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
-    """Return both sides with equally many scenes.
+    """Return equally many real and generated scenes.
 
     Raises:
-        ValueError: The pictures of the sides differ in size.
+        ValueError: Real and generated pictures differ in size.
     """
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = resolve_path(config.generated, "generated")
@@ -136,7 +139,7 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
 
 
 def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: FeatureConfig) -> list[str]:
-    """Return sentences about how the sides were chosen and drawn."""
+    """Return sentences that describe how the scenes were selected and drawn."""
     how = {
         "farthest-point": "farthest point sampling of poses",
         "min-distance": f"poses at least {config.min_distance_m:g} m apart",
@@ -144,20 +147,25 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     }[config.reference]
     chosen = {
         "real": f"split {config.real_split}, {how}",
-        "generated": "labels in equal parts as far as they go" if config.balance_labels else "evenly spread",
+        "generated": "labels in equal parts if there are enough" if config.balance_labels else "evenly spread",
     }
     words = [
         f"{name.capitalize()}: {side.limit} of {side.root}, "
         f"{'the first' if isinstance(side, ImageFile) else chosen[name]}."
         for name, side in sides.items()
     ]
-    drawn = "" if config.supersample == 1 else f", each pixel the mean of {config.supersample**2}"
-    words.append(f"Pictures of scenes: 256 x 256 pixels from above in class colours, unlit, on white{drawn}.")
+    drawn = "" if config.supersample == 1 else f"; each pixel is the mean of {config.supersample**2} samples"
+    words.append(
+        f"Scenes are drawn from above with 256 x 256 pixels, in class colours without shading, on white{drawn}."
+    )
     return [*words, describe_weights(looks.inception)] if looks.inception else words
 
 
 def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
-    """Score reconstructions; write reconstruction.parquet and reconstruction.html with the best and worst scenes."""
+    """Score reconstructions and write reconstruction.parquet and reconstruction.html.
+
+    The page shows the scenes with the best and the worst reconstruction.
+    """
     real = SceneSubset(dataset.root, dataset.source, config.lvae_split, config.max_reconstructed_scenes)
     lvae = make_absolute(config.lvae)
     shown = bar.add_task("reconstruct", total=sum(len(rows) for _, rows in real.shards()))

@@ -51,7 +51,7 @@ def evaluate_seams(config: Config) -> dict:
         ),
     }
     for selection, _ in sides.values():
-        selection.shards()  # raises for missing scenes before Ray starts
+        selection.shards()  # raise an error for missing scenes before Ray starts
     start_ray()
     with Progress() as bar:
         measured = {}
@@ -73,4 +73,4 @@ def main(config: Config) -> None:
         lines.add_row(*row)
     Console().print(lines)
     if (count := scores["seams"]["generated"]) < ENOUGH_SEAMS:
-        print(f"only {count} seams: a result needs at least {ENOUGH_SEAMS}; outpaint more scenes")
+        print(f"only {count} seams: a reliable result needs at least {ENOUGH_SEAMS}; outpaint more scenes")

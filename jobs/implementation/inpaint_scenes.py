@@ -13,7 +13,7 @@ from pipelines.generation.inpaint import InpaintRequest, RegionConfig, inpaint_s
 
 
 def inpaint(config: Config) -> dict[str, float | None]:
-    """Regenerate the region, write the scenes, and return how far raw decodes drift outside the region."""
+    """Regenerate the region, write the scenes, and return the drift of the decoded scenes outside the region."""
     check_inpaint_scenes(config)
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())

@@ -26,7 +26,7 @@ from pipelines.runtime import storage
 
 
 def find_dataset_directory(config: DatasetOptions) -> str:
-    """Return --dataset or its default."""
+    """Return the directory of --dataset, or the default."""
     return resolve_path(config.dataset, "datasets", "town")
 
 

@@ -21,7 +21,7 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
     """Return the numbers of blocks ahead, behind, left and right of the scene.
 
     Raises:
-        ValueError: A number is negative, or all are 0.
+        ValueError: A number is negative, or all numbers are 0.
     """
     if config.extent_m is None:
         counts = config.blocks_ahead, config.blocks_behind, config.blocks_left, config.blocks_right
@@ -42,7 +42,7 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
 
 
 def outpaint(config: Config) -> pa.Table:
-    """Extend scenes, write them, and return the block table with the known share of each block."""
+    """Extend scenes, write them, and return the block table with the share of known ground in each block."""
     counts = count_blocks(config)
     check_outpaint_scenes(config)
     selection = select_scenes(config)
@@ -73,6 +73,6 @@ def main(config: Config) -> None:
     print(f"outpainted scenes, source generated-{config.run}, and GLB files in {output}")
     if bare := int((blocks["known_ground"].to_numpy() < HARDLY_KNOWN).sum()):
         print(
-            f"{bare} of {len(blocks)} blocks had almost no known ground, where outpainting fails (as in the paper): "
-            f"known_ground below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
+            f"{bare} of {len(blocks)} blocks had almost no known ground, so their outpainting failed, as in the paper; "
+            f"their known_ground is below {HARDLY_KNOWN} in {output}/block_tables/{config.run}/*.parquet"
         )

@@ -15,11 +15,11 @@ def paint(config: Config) -> tuple[str, int]:
     """Paint frames; return the directory of street views and the number of frames."""
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
         if not value:
-            raise ValueError(f"{name} is missing: give a local directory in diffusers' layout")
+            raise ValueError(f"{name} is missing; specify a local directory in diffusers' layout")
     require_positive(config, "num_inference_steps", "num_actors")
     for name, value in (("--diffusion", config.diffusion), ("--controlnet", config.controlnet)):
         if not storage.list_files(make_absolute(value), ".json"):
-            raise ValueError(f"{name} {value}: no model here; give a local directory in diffusers' layout")
+            raise ValueError(f"{name} {value}: no model here; specify a local directory in diffusers' layout")
     streets = resolve_path(config.streets, "generated", "streets", "drive")
     directories = list_drives(streets)
     request = PhotoRequest(

@@ -31,16 +31,17 @@ from pipelines.schema.tables import read_scenes
 from pipelines.training.latents import digest_weights
 
 SHOWN = 32  # number of scenes on the card, from the first
-JUDGED = 256  # number of scenes among which those with most faults are shown
+JUDGED = 256  # number of scenes from which the scenes with most faults are selected
 FAILURES = 8
 CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
 
 
 def publish(config: Config) -> list[str]:
-    """Write the entry and register it.
+    """Write the entry of the model zoo and register it in MLflow.
 
     Returns:
-        Values of --model for it: its directory and, if registered, models:/NAME/VERSION and the id of the run.
+        Values of --model that select the entry: its directory and, if it is registered, models:/NAME/VERSION and the
+        run's id.
     """
     pipeline = load_pipeline(find_pipeline_directory(config.model))
     weights = [digest_weights(pipeline.lvae), digest_weights(pipeline.dit)]
@@ -104,7 +105,9 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
     Raises:
         ValueError: There is no complete evaluation, or it belongs to other weights.
     """
-    advice = "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and name its --output"
+    advice = (
+        "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and specify their --output"
+    )
     if not storage.exists(storage.join_uri(directory, "evaluation.json")):
         raise ValueError(f"--evaluation {directory}: no evaluation here; {advice}")
     about, scores = (
@@ -112,27 +115,31 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
     )
     for part in ("generation", "reconstruction"):
         if part not in scores:
-            raise ValueError(f"--evaluation {directory} holds no scores of {part}; {advice}")
+            raise ValueError(f"--evaluation {directory} contains no {part} scores; {advice}")
     judged = (about["sampling"] or {}).get("weights"), about["lvae_weights"]
     if judged != ("-".join(weights), weights[0]):
-        raise ValueError(f"--evaluation {directory} is of other weights ({judged[0]}); {advice}")
+        raise ValueError(f"--evaluation {directory} belongs to other weights ({judged[0]}); {advice}")
     if "num_inference_steps" not in (about["sampling"] or {}):
-        raise ValueError(f"--evaluation {directory} is not of scenes that jobs/sample_scenes.py made; {advice}")
+        raise ValueError(f"--evaluation {directory} does not evaluate scenes of jobs/sample_scenes.py; {advice}")
     if about["sampling"].get("repair"):
-        raise ValueError(f"--evaluation {directory} is of repaired scenes; sample without --repair to judge a model")
+        raise ValueError(
+            f"--evaluation {directory} evaluates repaired scenes; evaluate scenes that were sampled without --repair"
+        )
     return about, scores
 
 
 def read_history(experiment: str, stage: str, model: torch.nn.Module) -> list[TrainingRecord]:
-    """Return the runs that trained a model's weights, oldest first: a run may start from the weights of an earlier one.
+    """Return the runs that trained a model's weights, oldest first.
+
+        A run may start from the weights of an earlier run.
 
     Raises:
-        ValueError: Neither MLflow nor a published entry has a record of one of them.
+        ValueError: Neither MLflow nor a published entry has a record of one of the runs.
     """
     parameters = sum(value.numel() for value in model.parameters())
     runs = [find_training(experiment, stage, digest_weights(model), parameters)]
     while start := runs[0].options.get("start_from"):
-        runs.insert(0, find_training(experiment, stage, start, None))  # its network may differ
+        runs.insert(0, find_training(experiment, stage, start, None))  # the network of the earlier run may differ
     name = experiment.removeprefix("pritti-")
     later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
     return [replace(runs[0], name=name), *later]
@@ -142,7 +149,7 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
     """Return the run that trained the weights with a digest.
 
     Raises:
-        ValueError: Neither MLflow nor a published entry has a record of it.
+        ValueError: Neither MLflow nor a published entry has a record of this run.
     """
     uri = find_tracking_uri()
     api = make_client(uri)
@@ -152,7 +159,7 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
         if record := read_published_training(digest):
             return TrainingRecord(**{**record, "stage": stage})
         raise ValueError(
-            f"no MLflow run of {experiment} in {hide_credentials(uri)} made these weights ({digest}); "
+            f"no MLflow run of {experiment} in {hide_credentials(uri)} trained these weights ({digest});  "
             "set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)
@@ -183,13 +190,13 @@ def require_data(training: TrainingRecord, real: str, facts: Mapping, evaluation
     """Check that an evaluation used the data of a training run.
 
     Raises:
-        ValueError: It used other data.
+        ValueError: The evaluation used other data.
     """
     same = training.data == facts["options"] if training.data else training.options["dataset"] == real
     if not same:
         raise ValueError(
-            f"--evaluation {evaluation} is against {real}, but the {training.stage} was trained on "
-            f"{training.data or training.options['dataset']}; run jobs/evaluate_scenes.py with that as --real"
+            f"--evaluation {evaluation} uses the real scenes of {real}, but the {training.stage} was trained on "
+            f"{training.data or training.options['dataset']}; run jobs/evaluate_scenes.py with this dataset as --real"
         )
 
 
@@ -207,7 +214,7 @@ def compute_hours(tracker, batch_size: int) -> float:
 
 
 def draw_examples(about: Mapping) -> dict[str, bytes]:
-    """Return PNGs of the first evaluated scenes, and of those with most faults among the first JUDGED."""
+    """Return PNGs of the first evaluated scenes, and of the scenes with most faults among the first JUDGED."""
     offset_m = find_slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
     faults = np.array([compute_scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])

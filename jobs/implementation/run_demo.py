@@ -28,11 +28,11 @@ from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
 
 RELEASED = "town"
-CHECKPOINTS = 8  # per training run, each with a validation and pictures
+CHECKPOINTS = 8  # number of checkpoints per training run; each one has a validation with pictures
 
 
 class Stages:
-    """Runs stages in sequence, prints their names, and records their durations across interruptions."""
+    """Run stages in sequence, print their names, and record their durations across interruptions."""
 
     def __init__(self, path: str, total: int) -> None:
         self.path, self.total, self.started = path, total, time.perf_counter()
@@ -44,14 +44,14 @@ class Stages:
         print(f"\n[{self.done}/{self.total}] {name}", flush=True)
         started = time.perf_counter()
         result = work()
-        # A stage that is already complete returns at once: keep the duration of its actual work.
+        # A completed stage returns immediately, so the longest duration is kept.
         self.seconds[name] = max(self.seconds.get(name, 0.0), time.perf_counter() - started)
         storage.write_json(self.seconds, self.path)
         return result
 
 
 def show_released(config: Config) -> None:
-    """Generate scenes with the released weights, and a picture to look at during training."""
+    """Generate scenes with the released weights and draw them."""
     sample(
         SampleConfig(
             model=RELEASED,
@@ -67,7 +67,7 @@ def show_released(config: Config) -> None:
     sheet = arrange_contact_sheet([render_3d(scene, 480, 360) for scene in scenes], columns=4)
     path = home_path("released.png")
     storage.write_whole(path, lambda stream: stream.write(encode_png(sheet)))
-    print(f"pictures: {os.path.relpath(path)}; the next stages train such a model")
+    print(f"pictures: {os.path.relpath(path)}; the next stages train a model of this kind")
 
 
 def main(config: Config) -> None:
@@ -112,7 +112,7 @@ def run_training_stages(config: Config, stages: Stages) -> None:
 
 
 def run_generation_stages(config: Config, stages: Stages) -> dict:
-    """Sample scenes, outpaint one, evaluate; return the scores."""
+    """Sample scenes, outpaint one scene, evaluate, and return the scores."""
     model = home_path("models", f"pritti-{config.preset}")
     sampling = SampleConfig(
         model=model,

@@ -45,7 +45,7 @@ def serve_studio(config: Config) -> str:
 
 
 def require_free_port(host: str, port: int) -> None:
-    """Check that a port is free, because Ray Serve would retry without end.
+    """Check that a port is free, because Ray Serve would retry forever.
 
     Raises:
         ValueError: The port or the address cannot be used.

@@ -1,4 +1,4 @@
-"""The dataset of the smoke presets: a small town, generated when it is missing."""
+"""The dataset of the smoke presets: a small town, which is generated if it is missing."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ NUM_TRAIN, NUM_TEST = 32, 16
 
 
 def make_smoke_dataset(root: str) -> None:
-    """Generate a town of 32 + 16 scenes, unless it exists."""
+    """Generate a town of 32 training and 16 test scenes if it does not exist."""
     if storage.exists(storage.join_uri(root, "dataset.json")):
         return
-    start_ray(training=True)  # before preprocessing starts Ray without the dashboard that training needs
+    start_ray(training=True)  # preprocessing would start Ray without the dashboard, which training needs
     main(Town(output=root, num_train=NUM_TRAIN, num_test=NUM_TEST))

@@ -24,7 +24,7 @@ from pipelines.schema.scene_subset import SceneSubset, list_label_pairs, read_de
 
 
 def run_sweep(config: Config) -> list[dict]:
-    """Score all reference sets, write all files, and return a row per reference set and k."""
+    """Score all reference sets, write all files, and return one row per reference set and k."""
     dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
     output = resolve_path(config.output, "evaluations", "sweep")
     source = f"generated-{config.run}" if config.run else None
@@ -57,8 +57,10 @@ def run_sweep(config: Config) -> list[dict]:
     how = [
         f"Real: {dataset.root}, split {config.real_split}. "
         f"Generated: {sides['generated'].root}, labels in equal parts.",
-        "Features: Inception pool3." if config.inception else "Features: a fixed untrained network's; no Inception.",
-        "In brackets: 95 % intervals over the judged scenes, neighbourhoods held fixed.",
+        "Features: Inception pool3."
+        if config.inception
+        else "Features: a fixed untrained network, without Inception weights.",
+        "Brackets contain 95 % confidence intervals over scenes, with fixed neighbourhoods.",
     ]
     texts = {"sweep.html": render_sweep_html(rows, how)}
     for name, chart in zip(("apart", "farthest"), draw_sweep_charts(rows), strict=True):

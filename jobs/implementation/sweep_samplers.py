@@ -48,7 +48,7 @@ def sweep_samplers(config: Config) -> list[dict]:
 
     if unknown := set(config.samplers) - set(SAMPLERS):
         raise ValueError(f"--samplers {' '.join(sorted(unknown))}: expected some of {', '.join(SAMPLERS)}")
-    for steps in config.num_inference_steps:  # raises for an invalid number before hours of valid ones
+    for steps in config.num_inference_steps:  # raise an error for an invalid number before hours of sampling
         Diffusion().select_timesteps(steps)
     for scaling in config.noise_scalings:
         check_noise_scaling(scaling)
@@ -83,9 +83,8 @@ def sweep_samplers(config: Config) -> list[dict]:
                 guidance_scale=config.guidance_scale,
                 sampler=sampler,
                 noise_scaling=scaling,
-                shard_scenes=max(
-                    1, config.num_scenes // 8
-                ),  # regardless of the number of actors, so that a run resumes with another number
+                # Independent of the number of actors, so that a run can be resumed with another number of actors.
+                shard_scenes=max(1, config.num_scenes // 8),
             )
             seconds_per_scene = sample_and_time(config, request, bar)
             made = described(SceneSubset(output, request.source, None, count, "spread"), request.run)
@@ -95,7 +94,7 @@ def sweep_samplers(config: Config) -> list[dict]:
             scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
             pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
     how = [
-        f"Real: {count} scenes of {dataset.root}, split {config.real_split}, evenly spread. Model: {model}.",
+        f"Real: {count} scenes of {dataset.root}, split {config.real_split}, selected evenly. Model: {model}.",
         f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
     ]
     write_report(output, rows, pictures, max(1, config.num_examples), how)
@@ -103,14 +102,14 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 
 def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
-    """Generate missing scenes; return seconds per scene and actor over the timed shards, or None without any."""
+    """Generate missing scenes and return seconds per scene and actor, or None if no shard was timed."""
     record = storage.join_uri(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}
     shown = bar.add_task(request.run, total=request.num_scenes)
 
     def advance(row: dict) -> None:
         bar.advance(shown, row["scenes"])
-        if row["seconds"]:  # 0 for a shard that an interrupted run wrote
+        if row["seconds"]:  # 0 if an interrupted run wrote the shard
             times[str(row["id"])] = [row["seconds"], row["scenes"]]
             storage.write_json(times, record)
 

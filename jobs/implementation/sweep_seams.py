@@ -36,7 +36,7 @@ def sweep_seams(config: Config) -> list[dict]:
         raise ValueError("--settings is empty: expected five numbers per setting")
 
     for setting in config.settings:
-        RePaintConfig(*setting).transitions()  # raises for an invalid setting before hours of valid ones
+        RePaintConfig(*setting).transitions()  # raise an error for an invalid setting before hours of outpainting
         Diffusion().select_timesteps(setting[0])
     output = resolve_path(config.output, "evaluations", "sweep-seams")
     selection = select_scenes(config)

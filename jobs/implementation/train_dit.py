@@ -40,10 +40,10 @@ from pipelines.training.latents import digest_weights, load_lvae
 
 
 def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
-    """Prepare training; make the smoke preset's inputs if they are missing.
+    """Prepare training; generate the inputs of the smoke preset if they are missing.
 
     Returns:
-        The training run, and a function that completes its output directory to a pipeline.
+        The training run, and a function that adds the other components of a pipeline to its output directory.
     """
     row = resolve_preset(config)
     root = find_training_dataset(config, LVAE_PRESETS[row.lvae].source)
@@ -112,12 +112,12 @@ def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
     """Return the layout VAE that encoded the latents.
 
     Raises:
-        ValueError: Its weights have changed since.
+        ValueError: The weights of the layout VAE have changed since the encoding.
     """
     lvae = load_lvae(latents["lvae"])
     if digest_weights(lvae) != latents["lvae_digest"]:
         raise ValueError(
-            f"{latents['lvae']} has changed since {latents_root} was encoded with it; encode again to another --output"
+            f"{latents['lvae']} has changed since it encoded {latents_root}; encode again to another --output"
         )
     return lvae
 
@@ -142,7 +142,7 @@ def make_optimizer_config(config: Config, row: DiTPreset) -> OptimizerConfig:
 
 
 def make_dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: LayoutVAE) -> dict:
-    """Return the keyword arguments of DiT: the preset's, and those that follow from latents and labels."""
+    """Return the keyword arguments of DiT from the preset, the latents and the labels."""
     channels, size, _ = latents["shape"]
     return row.architecture() | {
         "channels": channels,
@@ -172,7 +172,7 @@ def make_run_identity(
     )
     if start:
         identity |= {"start_from": start.digest}
-    if (sampling := parse_timestep_sampling(config)) != "uniform":  # absent in records of earlier versions
+    if (sampling := parse_timestep_sampling(config)) != "uniform":  # earlier versions did not record this option
         identity |= {"timesteps": RECORDED_TIMESTEPS[sampling]}
     return identity
 
@@ -199,20 +199,21 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
     """Return the transformer of a trained pipeline.
 
     Raises:
-        ValueError: It was trained on latents of another layout VAE, or its architecture differs.
+        ValueError: The transformer was trained on latents of another layout VAE, or its architecture differs.
     """
     directory = find_pipeline_directory(model)
     pipeline = load_pipeline(directory)
     if digest_weights(pipeline.lvae) != lvae_digest:
         raise ValueError(
             f"--start-from {model}: its transformer was trained on latents of another layout VAE; "
-            f"encode with that one first: jobs/encode_latents.py --lvae {directory}/lvae"
+            f"encode latents with that layout VAE first: jobs/encode_latents.py --lvae {directory}/lvae"
         )
     built = pipeline.dit.config
     for key in ("patch", "depth", "width", "heads", "prediction", "label"):
         if built[key] != architecture[key]:
             raise ValueError(
-                f"--start-from {model}: its {key} is {built[key]}, this run's {architecture[key]}; choose the same"
+                f"--start-from {model}: its {key} is {built[key]}, but that of this run is {architecture[key]}; "
+                "use equal values"
             )
     normalisation = {"shift": built["shift"], "scale": built["scale"]}
     sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold")}
@@ -242,8 +243,8 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: `noise_scaling` and `existence_threshold`, where they differ from the paper's.
-        output: Directory that contains dit/; returned.
+        sampling: `noise_scaling` and `existence_threshold`, if they differ from the paper's.
+        output: Directory that contains dit/. It is also the return value.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))
     pipeline = PrITTIPipeline(load_lvae(lvae), dit, **sampling)

@@ -34,8 +34,9 @@ from pipelines.schema.tables import find_shards
 from pipelines.training.data_loader import LayoutReader, Stream
 from pipelines.training.latents import digest_weights, load_lvae
 
-OF_OBJECT_DECODER = ("decoder", "head_hidden", "min_proposals_per_cell")  # options of the object branch
-START_SCENES, START_SHARDS = 96, 16  # training scenes from which the model is initialised
+# Options of the object branch that concern the decoder.
+OF_OBJECT_DECODER = ("decoder", "head_hidden", "min_proposals_per_cell")
+START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards from which the model is initialised
 
 
 def prepare(config: Config) -> TrainingRun:
@@ -133,13 +134,13 @@ def make_run_identity(
     )
     if config.flip or config.jitter:
         identity |= {"augmentation": asdict(augment)}
-    if (least := row.model.objects.min_proposals_per_cell) != 1:  # absent in records of earlier versions
+    if (least := row.model.objects.min_proposals_per_cell) != 1:  # earlier versions did not record this option
         identity |= {"least_per_cell": least}
     return identity
 
 
 def train(config: Config) -> str:
-    """Train; return the directory of the model, or of the pipeline with --train-object-decoder-of."""
+    """Train, and return the directory of the model, or of the pipeline with --train-object-decoder-of."""
     training = prepare(config)
     output = resolve_path(config.output, "models", training.name)
     trainer.fit(training, config.num_workers, output)
@@ -150,7 +151,7 @@ def train(config: Config) -> str:
 
 @dataclass(frozen=True)
 class Kept:
-    """Weights of a trained layout VAE whose latents are kept, and the digest of the transformer trained on them."""
+    """Weights of a trained layout VAE whose encoders are kept, and the digest of the transformer of its pipeline."""
 
     digest: str
     transformer: str
@@ -161,25 +162,26 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     """Return the layout VAE of a trained pipeline.
 
     Raises:
-        ValueError: Its encoders or its layout differ from this run's.
+        ValueError: The encoders or the layout of the pipeline differ from those of this run.
     """
     pipeline = load_pipeline(find_pipeline_directory(model))
     lvae = pipeline.lvae
     for (key, built), (_, wanted) in zip(list_kept_options(lvae.config), list_kept_options(architecture), strict=True):
         if built != wanted:
             raise ValueError(
-                f"--train-object-decoder-of {model}: its {key} is {built}, this preset's {wanted}; "
-                "choose its own preset"
+                f"--train-object-decoder-of {model}: its {key} is {built}, but that of this preset is {wanted};  "
+                "use the preset of this pipeline"
             )
     if lvae.spec.fingerprint() != spec.fingerprint():
         raise ValueError(
-            f"--train-object-decoder-of {model}: its layout differs from this dataset's; choose its own dataset"
+            f"--train-object-decoder-of {model}: its layout differs from that of this dataset; "
+            "use the dataset of this pipeline"
         )
     return Kept(digest_weights(lvae), digest_weights(pipeline.dit), lvae.state_dict())
 
 
 def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """List the options of a LayoutVAE by name, without the layout and those of the object decoder."""
+    """List the options of a LayoutVAE by name, without the layout and the options of the object decoder."""
     found: list[tuple[str, Any]] = []
     for name, option in options.items():
         value = asdict(option) if is_dataclass(option) and not isinstance(option, type) else option
@@ -189,10 +191,10 @@ def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def require_replaceable(name: str, kept: Kept) -> None:
-    """Check that writing the updated pipeline replaces neither another pipeline nor the one it starts from.
+    """Check that the updated pipeline replaces neither another pipeline nor the pipeline that it starts from.
 
     Raises:
-        ValueError: It would.
+        ValueError: A pipeline would be replaced.
     """
     place = home_path("models", f"pritti-{name}")
     if not storage.exists(storage.join_uri(place, "model_index.json")):
@@ -203,7 +205,7 @@ def require_replaceable(name: str, kept: Kept) -> None:
 
 
 def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
-    """Write a trained pipeline with another layout VAE of the same latents; return its directory.
+    """Write a trained pipeline with another layout VAE that has the same latents, and return the directory.
 
     Raises:
         ValueError: The pipeline has changed since the training started.
@@ -223,7 +225,10 @@ def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
 
 
 def sample_layouts(shards: list, counts: list[int], spec) -> dict:
-    """Return compact layouts of up to START_SCENES training scenes, evenly over the dataset, for `init_from_data`."""
+    """Return compact layouts of up to START_SCENES training scenes for `init_from_data`.
+
+    The scenes are selected evenly from the dataset.
+    """
 
     read, parts = LayoutReader(spec), []
     for k in np.unique(np.linspace(0, len(shards) - 1, START_SHARDS).round().astype(int)):

@@ -1,4 +1,4 @@
-"""Validation on rank 0 during training: losses on held-out scenes, and pictures of the same few scenes each time."""
+"""Validation on rank 0 during training: losses and pictures of the same held-out scenes each time."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class ReconstructionCheck:
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return metrics and pictures.
 
-        Losses are those of a sampled latent, as in training. Ground IoU, height error and AP3D are those of the mean
-        latent, as in the evaluation. The pictures show ground truth above reconstruction.
+        Losses are computed from a sampled latent, as in training. Ground IoU, height error and AP3D are computed from
+        the mean latent, as in the evaluation. The pictures show ground truth above reconstruction.
         """
         model, scenes = (
             cast(LayoutVAE, trainer.ema_model().eval()),
@@ -92,7 +92,7 @@ class ReconstructionCheck:
 
 @dataclass(frozen=True)
 class SamplingCheck:
-    """Validation of stage 2: loss on held-out latents, and samples from the same noise each time."""
+    """Validation of stage 2: loss on held-out latents, and samples from the same noise at each validation."""
 
     root: str
     source: str
@@ -104,7 +104,7 @@ class SamplingCheck:
 
     @torch.no_grad()
     def __call__(self, trainer: Trainer) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Return the validation loss, with the same noise each time, and pictures of SHOWN generated scenes."""
+        """Return the validation loss and pictures of SHOWN generated scenes, with the same noise at each validation."""
         dit, device = cast(DiT, trainer.ema_model().eval()), trainer.device
         arrays = load_held_out_latents(self.root, self.source, self.latents, self.label, self.count)
         arrays = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}

@@ -1,4 +1,4 @@
-"""Paths, command line and error messages: all that an executable needs before heavy packages are imported."""
+"""Paths, command line and error messages, which an executable needs before it imports heavy packages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 
 from jobs.support.renames import find_renamed
 
-# What Ray reads when it is imported and when it starts, unless the user has set it.
+# Environment variables that Ray reads when it is imported and when it starts. Values of the user are kept.
 RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -19,12 +19,12 @@ RAY_ENVIRONMENT = {
     "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
     "RAY_TRAIN_ENABLE_PREEMPTION_WATCHER": "0",
     "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # importing torch takes a minute on a busy machine or slow disk
-    # With few CPUs there are few idle processes: without this a reader is killed after every read, and the next one
-    # spends 10 s on imports.
+    # Without this value, Ray kills the reader process after every read if there are few CPUs. The next reader
+    # process then needs 10 s for imports.
     "RAY_idle_worker_killing_time_threshold_ms": "300000",
-    "OMP_WAIT_POLICY": "PASSIVE",  # spinning threads slow torch fivefold when another process is busy
-    # By default glibc returns every large tensor to the kernel and faults it in again, which costs 10 to 20 % of a
-    # step on the CPU.
+    "OMP_WAIT_POLICY": "PASSIVE",  # if another process is busy, spinning threads make torch five times slower
+    # By default, glibc returns the memory of every large tensor to the kernel. The resulting page faults take 10 to
+    # 20 % of a training step on the CPU.
     "MALLOC_MMAP_MAX_": "0",
     "MALLOC_TRIM_THRESHOLD_": "-1",
 }
@@ -68,10 +68,11 @@ def require_positive(config: object, *names: str) -> None:
 
 
 def find_root_cause(error: BaseException) -> BaseException:
-    """Return the exception that the user should read: Ray wraps a worker's error several times.
+    """Return the exception that the user should read, because Ray wraps a worker's error several times.
 
-    The outermost ValueError or OSError that is not a wrapper comes from this package and names the file and the remedy;
-    its own cause says less.
+    The outermost ValueError or OSError that is not a wrapper comes from this package. Its message names the file and
+    the
+    remedy, which the messages of deeper causes do not.
     """
     seen: set[int] = set()
     while id(error) not in seen:
@@ -86,8 +87,8 @@ def find_root_cause(error: BaseException) -> BaseException:
 def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) -> None:
     """Parse the command line of a job, check its options, then import and run its implementation.
 
-    The option classes are those of the module jobs.<job>, even where that file runs as __main__: there is one class of
-    each name. A ValueError or OSError becomes one line on stderr and exit code 2.
+    The option classes come from the module jobs.<job>, even if that file runs as __main__, so each class exists only
+    once. A ValueError or OSError is reported as one line on stderr with exit code 2.
 
     Args:
         job: Module name, such as "sample_scenes".
@@ -110,12 +111,12 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
     except Exception as error:
         cause = find_root_cause(error)
         if isinstance(cause, (ValueError, OSError)):
-            exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # Ray's remark on how to retry
+            exit_with_error(str(cause).split("\nFailed to apply UDF transform", 1)[0])  # without Ray's advice
         raise
 
 
 def import_check(job: str) -> Callable[[object], object] | None:
-    """Return the function of jobs.implementation.checks for a job, if there is one; it needs neither torch nor Ray."""
+    """Return the check function of a job, or None; check functions need neither torch nor Ray."""
     return getattr(importlib.import_module("jobs.implementation.checks"), f"check_{job}", None)
 
 

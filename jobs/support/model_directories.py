@@ -28,10 +28,11 @@ def read_label_kind(model: str) -> str:
 def find_pipeline_directory(model: str) -> str:
     """Return the directory that --model names; pipelines in MLflow are downloaded first.
 
-    Without a name: $PRITTI_HOME/models/pritti-town, or the only pipeline trained there, or the released weights.
+    If --model is empty, the directory is $PRITTI_HOME/models/pritti-town, the only pipeline under $PRITTI_HOME/models,
+    or the released weights, in this order.
 
     Raises:
-        ValueError: There is no such pipeline, or no name and several trained pipelines.
+        ValueError: There is no such pipeline, or --model is empty and there are several trained pipelines.
     """
     if not model:
         found = [path.removesuffix(f"/{INDEX_NAME}") for path in storage.list_files(home_path("models"), INDEX_NAME)]
@@ -39,14 +40,15 @@ def find_pipeline_directory(model: str) -> str:
             return town
         if len(found) > 1:
             raise ValueError(
-                f"--model is missing and several were trained here; name one of: {', '.join(sorted(found))}"
+                "--model is missing and several pipelines were trained here; "
+                f"specify one of: {', '.join(sorted(found))}"
             )
         return found[0] if found else find_pipeline_path("town")
     for directory in (make_absolute(model), home_path("zoo", model)):
         if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
     if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):
-        from jobs.support.registry import download_pipeline  # imports MLflow, which no other --model needs
+        from jobs.support.registry import download_pipeline  # this module imports MLflow
 
         return download_pipeline(model)
     return find_pipeline_path(model)

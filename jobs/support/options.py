@@ -1,4 +1,4 @@
-"""Option classes that several jobs share. Importing this module is cheap."""
+"""Option classes that several jobs share. This module imports no heavy packages."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import tyro
 ModelOption = Annotated[
     str,
     tyro.conf.arg(
-        help="Pipeline: a directory, a name (town comes with the package), models:/NAME/VERSION or the id of an MLflow "
-        "run of jobs/publish_model.py (default: the pipeline trained under $PRITTI_HOME, or town)."
+        help="Pipeline: a directory, a name (town is included in the package), models:/NAME/VERSION, or the id of an "
+        "MLflow run of jobs/publish_model.py (default: the pipeline trained under $PRITTI_HOME, or town)."
     ),
 ]
 
@@ -51,13 +51,14 @@ class GenerationOptions(SceneOptions):
 class RePaintOptions(GenerationOptions):
     """Which scenes to change, with which pipeline and RePaint settings (paper, Sec. 3.3 and supplement B.3).
 
-    With --guided seams show less, more objects are kept, and the work is 24 times less than with the paper's settings.
+    With --guided, seams are less visible, more objects are kept, and the job is 24 times as fast as with the paper's
+    settings.
     """
 
     guided: bool = False
-    """Use 50 steps with pseudoinverse guidance, eta 0.3 and no resampling; the options below override it."""
+    """Use 50 steps with pseudoinverse guidance, eta 0.3 and no resampling; the next options override these values."""
     num_inference_steps: int | None = None
-    """Denoising steps, not counting the steps that RePaint repeats (default: 250 as in the paper; 50 with --guided)."""
+    """Number of denoising steps without RePaint's repetitions (default: 250 as in the paper; 50 with --guided)."""
     jump_length: int | None = None
     """Number of steps that RePaint goes back at a time, J in the paper (default: 10)."""
     num_resamplings: int | None = None

@@ -12,11 +12,11 @@ from jobs.support.cli import set_ray_environment
 
 
 def start_ray(training: bool = False) -> None:
-    """Join the cluster that RAY_ADDRESS names, or start Ray on this machine; do nothing if Ray runs already.
+    """Join the cluster at RAY_ADDRESS, or start Ray on this machine; do nothing if Ray already runs.
 
     Args:
-        training: Also start the dashboard. Ray Train asks it once per second which workers are alive and logs a warning
-            if there is none; other jobs do without, because a local Ray ends with the command.
+        training: Also start the dashboard. Ray Train asks the dashboard once per second which workers are alive, and
+            logs a warning if there is no dashboard. Other jobs do not need it.
     """
     set_ray_environment()
     if ray.is_initialized():
@@ -27,14 +27,14 @@ def start_ray(training: bool = False) -> None:
     context.print_on_execution_start = False
     context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `find_root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # Ray's bars are off, the jobs' are on
-    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # these errors are raised here as well
+    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # jobs show their own progress bars
+    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # these errors are also raised
         logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
 
 def run_packed(config: dict[str, bytes]) -> None:
     """Unpickle and call a function in a Ray Train worker.
 
-    Ray Train's controller unpickles this function too; packing keeps it from importing the models.
+    Ray Train's controller also unpickles the training function. The packed form avoids that it imports the models.
     """
     cloudpickle.loads(config["packed"])()

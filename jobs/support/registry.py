@@ -30,7 +30,7 @@ def register_version(name: str, run_id: str) -> str:
 
 
 def download_pipeline(reference: str) -> str:
-    """Copy a published pipeline to $PRITTI_HOME/registry, unless it is there, and return its directory.
+    """Copy a published pipeline to $PRITTI_HOME/registry if it is not there, and return its directory.
 
     Args:
         reference: models:/NAME/VERSION or the id of a publishing run.
@@ -51,7 +51,7 @@ def download_pipeline(reference: str) -> str:
         with tempfile.TemporaryDirectory(dir=home_path("registry")) as staging:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             if compute_checksums(whole) != json.loads(Path(whole, CHECKSUMS_NAME).read_text()):
-                raise ValueError(f"{reference}: its files are not those of its {CHECKSUMS_NAME}; publish it again")
+                raise ValueError(f"{reference}: its files do not match its {CHECKSUMS_NAME}; publish it again")
             if not os.path.exists(directory):  # another process may have finished first
                 os.rename(whole, directory)
     except (MlflowException, OSError) as error:

@@ -1,10 +1,10 @@
-"""Earlier names of options and option values. They are errors that name the present ones."""
+"""Earlier names of options and option values. Their use is an error, whose message contains the current name."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-# Renamed in every job.
+# Options that were renamed in every job: earlier name -> current name.
 OPTIONS = {
     "accumulate": "gradient-accumulation-steps",
     "actors": "num-actors",
@@ -15,7 +15,7 @@ OPTIONS = {
     "workers": "num-workers",
 }
 
-# Renamed in one job.
+# Options that were renamed in one job.
 JOB_OPTIONS = {
     "ablate_lvae": {
         "any-sizes": "any-footprint-train-sizes",
@@ -98,7 +98,7 @@ JOB_OPTIONS = {
     "train_lvae": {"keep-latents-of": "train-object-decoder-of"},
 }
 
-# (job, present option) -> earlier values and the present ones.
+# (job, current option) -> earlier values and current values.
 VALUES = {
     ("edit_scenes", "frame"): {"own": "object"},
     ("evaluate_scenes", "reference"): {"farthest": "farthest-point", "apart": "min-distance", "spread": "uniform"},
@@ -109,7 +109,7 @@ VALUES = {
 
 
 def find_renamed(job: str, words: Sequence[str]) -> str | None:
-    """Return a message about the first earlier option name or value on a command line.
+    """Return a message about the first earlier option name or value on a command line, or None.
 
     Args:
         job: Module name, such as "sample_scenes".
@@ -122,9 +122,9 @@ def find_renamed(job: str, words: Sequence[str]) -> str | None:
         name, equals, value = word[2:].partition("=")
         name = name.replace("_", "-")
         if name in options:
-            return f"--{name} is now --{options[name]}"
+            return f"--{name} was renamed to --{options[name]}"
         if not equals:
             value = words[k + 1] if k + 1 < len(words) else ""
         if present := VALUES.get((job, name), {}).get(value):
-            return f"--{name} {value} is now --{name} {present}"
+            return f"--{name} {value} was renamed to --{name} {present}"
     return None

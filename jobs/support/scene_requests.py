@@ -1,4 +1,4 @@
-"""From shared options to what pipelines/ takes: the scenes to read and the RePaint settings."""
+"""Convert shared options to arguments of pipelines/: the scenes to read and the RePaint settings."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pipelines.schema.scene_subset import SceneSubset
 
 
 def select_scenes(options: SceneOptions) -> SceneSubset:
-    """Return the first scenes that the options name."""
+    """Return the subset of scenes that the options select."""
     directory = resolve_path(options.input, "generated")
     return SceneSubset(directory, options.source or None, options.split or None, options.max_scenes, "first")
 
 
 def make_repaint_config(options: RePaintOptions) -> RePaintConfig:
-    """Return the paper's or the guided settings, with every setting that an option overrides."""
+    """Return the paper's or the guided settings; options that are given override single values."""
     given = {
         "num_inference_steps": options.num_inference_steps,
         "jump_length": options.jump_length,

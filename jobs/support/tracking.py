@@ -1,4 +1,4 @@
-"""MLflow tracking from the driver and from rank 0: one MLflow run per training run, reused when it resumes."""
+"""MLflow tracking from the driver and from rank 0. A training run has one MLflow run, which is reused on resumption."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def make_client(uri: str):
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     from mlflow import MlflowClient  # reads the variables above when it is imported
 
-    for name in ("alembic", "mlflow"):  # importing mlflow sets their levels
+    for name in ("alembic", "mlflow"):  # the import of mlflow sets their levels
         logging.getLogger(name).setLevel(logging.WARNING)
     return MlflowClient(tracking_uri=uri)
 
 
 class Tracker:
-    """Writes to one MLflow run. It can be pickled: each worker opens its own client."""
+    """Write to one MLflow run. A tracker can be pickled, because each process opens its own client."""
 
     def __init__(self, uri: str, run_id: str) -> None:
         self.uri, self.run_id = uri, run_id
@@ -47,14 +47,15 @@ class Tracker:
 
     @property
     def client(self):
+        """MLflow client of this process."""
         self._client = self._client or make_client(self.uri)
         return self._client
 
     @classmethod
     def start(cls, experiment: str, name: str, parameters: dict, record: str | None = None) -> Tracker:
-        """Return the MLflow run that the file `record` names, for a resumed run, or a new one.
+        """Return a tracker of the MLflow run that the file `record` names, or of a new MLflow run.
 
-        Call this once, in the driver: two processes that create the database concurrently break it.
+        Call this method only in the driver, because two processes that create the database concurrently damage it.
         """
         uri = find_tracking_uri()
         if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:
@@ -85,12 +86,14 @@ class Tracker:
         return cls(uri, run_id)
 
     def metrics(self, values: dict[str, float], step: int) -> None:
-        from mlflow.entities import Metric  # after `client` has set MLflow's variables
+        """Log values by name for a training step."""
+        from mlflow.entities import Metric  # imported after `client` has set MLflow's environment variables
 
         now = int(time.time() * 1000)
         self.client.log_batch(self.run_id, metrics=[Metric(k, float(v), now, step) for k, v in values.items()])
 
     def tag(self, key: str, value: str) -> None:
+        """Set a tag of the run."""
         self.client.set_tag(self.run_id, key, value)
 
     def picture(self, image, path: str) -> None:
@@ -98,10 +101,14 @@ class Tracker:
         self.client.log_image(self.run_id, Image.fromarray(image), artifact_file=path)
 
     def artifacts(self, directory: str, path: str) -> None:
+        """Log the files of a directory as artifacts under `path`."""
         self.client.log_artifacts(self.run_id, directory, path)
 
     def history(self, name: str) -> list[tuple[int, float]]:
-        """Return (step, value) of a metric in order; of steps that a resumed run repeats, the last value."""
+        """Return (step, value) of a metric, ordered by step.
+
+        If a resumed run repeats a step, the last value of this step is returned.
+        """
         values = {m.step: m.value for m in self.client.get_metric_history(self.run_id, name)}
         return sorted(values.items())
 

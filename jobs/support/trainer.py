@@ -1,6 +1,6 @@
 """Train with Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
 
-The same command resumes a run: Ray Train finds the run of the same name and returns its last checkpoint.
+The same command resumes a run, because Ray Train finds the run of the same name and returns its last checkpoint.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class TrainingRun:
 
 def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     return {
-        name: torch.from_numpy(np.array(value))  # a copy: Ray's are read-only
+        name: torch.from_numpy(np.array(value))  # copy, because Ray's arrays are read-only
         for name, value in batch.items()
     }
 
@@ -114,7 +114,7 @@ def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
         stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
     ]
     return (
-        f"{error}. Scenes: {', '.join(ids)}; look at them with jobs/inspect_scenes.py scene ID" if ids else str(error)
+        f"{error}. Scenes: {', '.join(ids)}; inspect them with jobs/inspect_scenes.py scene ID" if ids else str(error)
     )
 
 
@@ -150,7 +150,7 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
 
 
 def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
-    """Tag an MLflow run with its current weights, by which jobs/publish_model.py finds it."""
+    """Tag an MLflow run with the digest of its weights, with which jobs/publish_model.py finds the run."""
     tracker.tag("weights", digest_weights(model))
     tracker.tag("steps", str(steps))
 
@@ -159,7 +159,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
     """Train to the end and write the model (EMA weights, if enabled) to `output`, which is returned.
 
     Raises:
-        ValueError: The cluster cannot hold that many workers, or a loss is not finite.
+        ValueError: The cluster is too small for this number of workers, or a loss is not finite.
     """
     start_ray(training=True)
     scaling = make_scaling_config(num_workers, run.stream.batch_size)
@@ -201,15 +201,16 @@ def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
     """Return the scaling of workers that fit the cluster and leave CPUs for reading.
 
     Raises:
-        ValueError: There are too many workers, which would wait without end.
+        ValueError: There are too many workers for the cluster, so they would wait forever; or the batch size is not a
+            multiple of their number.
     """
     cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
     per_worker = 1.0 if cpus > 2 * num_workers else 0.5
     most = int((cpus - READER_CPUS) // per_worker)
     if not 1 <= num_workers <= most:
-        raise ValueError(f"--num-workers is {num_workers}, this cluster of {cpus:.0f} CPUs has room for 1 to {most}")
+        raise ValueError(f"--num-workers is {num_workers}, this cluster of {cpus:.0f} CPUs can run 1 to {most}")
     if batch_size < 1 or batch_size % num_workers:
-        raise ValueError(f"--batch-size {batch_size} does not divide by --num-workers {num_workers}")
+        raise ValueError(f"--batch-size {batch_size} is not a multiple of --num-workers {num_workers}")
     return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
 
 
@@ -242,7 +243,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
 
 
 def publish_directory(directory: str, output: str) -> None:
-    """Copy a saved model or pipeline file by file; the files that mark it as complete come last."""
+    """Copy a saved model or pipeline file by file; the files that mark it as complete are copied last."""
     paths = [
         os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
     ]

@@ -1,4 +1,4 @@
-"""Option values in the field's standard terms -> the values that pipelines/ takes, or that records of runs contain."""
+"""Map option values to the values that pipelines/ and the records of runs use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from pipelines.schema.scene_subset import Pick
 
-# Records of training runs keep the names of version 0.1, so that runs of that version resume.
+# Records of training runs use the names of version 0.1, so that runs of that version can be resumed.
 RECORDED_PREDICTIONS = {"epsilon": "noise", "v_prediction": "velocity"}
 RECORDED_TIMESTEPS = {"uniform": "even", "logit_normal": "middle"}
 REFERENCES: dict[str, Pick] = {"farthest-point": "farthest", "min-distance": "apart", "uniform": "spread"}

@@ -190,9 +190,7 @@ def compute_signed_distance_px(
     Returns:
         Signed distances in pixels.
     """
-    squared = (
-        torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2
-    )  # squared distance to the nearest pixel outside, inside
+    squared = torch.stack([inside, ~inside]).float() * (most + 0.5) ** 2  # squared distances
     for axis in (-1, -2):
         padded = F.pad(squared, (most, most, 0, 0) if axis == -1 else (0, 0, most, most), value=(most + 0.5) ** 2)
         nearest = squared

@@ -25,7 +25,7 @@ MISTAKES = {
     ("publish_model.py", "--model", "nowhere"): "nowhere: no PrITTI pipeline here",
     ("sample_scenes.py", "--num-scenes", "0"): "--num-scenes is 0",
     ("outpaint_scenes.py", "--num-actors", "0"): "--num-actors is 0, expected at least 1",
-    ("inpaint_scenes.py",): "no region: give --polygon-m, --half-plane or --primitives",
+    ("inpaint_scenes.py",): "no region; specify --polygon-m, --half-plane or --primitives",
     ("preprocess_scenes.py", "kitti360", "--input", "nowhere"): "--input nowhere: no such directory",
     ("preprocess_scenes.py", "av2", "--input", "tests"): "tests",
 }

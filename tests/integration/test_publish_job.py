@@ -65,7 +65,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
     assert second[1] == "models:/tiny/2"
     (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
     damaged.write_text(damaged.read_text() + " ")
-    with pytest.raises(ValueError, match=r"models:/tiny/2: its files are not those of its checksums.json"):
+    with pytest.raises(ValueError, match=r"models:/tiny/2: its files do not match its checksums.json"):
         find_pipeline_directory(second[1])
     assert not (smoke / "registry" / second[2]).exists()
     assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
@@ -116,7 +116,7 @@ def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatc
         output=str(tmp_path / "second"),
         register=False,
     )  # fmt: skip
-    with pytest.raises(ValueError, match="made these weights"):
+    with pytest.raises(ValueError, match="trained these weights"):
         publish(config)
     (tmp_path / "zoo").mkdir()
     first.rename(tmp_path / "zoo/first")  # without access to MLflow, training.json of the entry is used

@@ -126,7 +126,7 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
     assert not list((home / "runs").rglob("*.pkl"))
     with pytest.raises(ValueError, match=r"--num-workers is 4, this cluster of 2 CPUs has room for 1 to 3"):
         train(Config(preset="smoke", name="dit-four", num_workers=4))
-    with pytest.raises(ValueError, match="--batch-size 7 does not divide by --num-workers 2"):
+    with pytest.raises(ValueError, match="--batch-size 7 is not a multiple of --num-workers 2"):
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=7))
 
 
@@ -152,7 +152,9 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
     assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
     with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
         train(Config(preset="smoke", name="smoke", train_object_decoder_of=str(kept)))
-    with pytest.raises(ValueError, match="its latent_channels is 4, this preset's 16; choose its own preset"):
+    with pytest.raises(
+        ValueError, match="its latent_channels is 4, but that of this preset is 16; use the preset of this pipeline"
+    ):
         train(
             Config(
                 preset="demo",

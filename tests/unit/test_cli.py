@@ -53,15 +53,19 @@ def test_renames_name_existing_values(job, option):
 @pytest.mark.parametrize(
     ("job", "words", "message"),
     [
-        ("sample_scenes", ["--guidance", "4"], "--guidance is now --guidance-scale"),
-        ("sample_scenes", ["--num-scenes", "2", "--steps=20"], "--steps is now --num-inference-steps"),
-        ("evaluate_scenes", ["--limit", "20"], "--limit is now --max-reconstructed-scenes"),
-        ("evaluate_scenes", ["--no-balance"], "--no-balance is now --no-balance-labels"),
-        ("evaluate_scenes", ["--reference", "apart"], "--reference apart is now --reference min-distance"),
-        ("train_dit", ["demo", "--prediction=velocity"], "--prediction is now --prediction-type"),
-        ("train_dit", ["--prediction_type", "noise"], "--prediction-type noise is now --prediction-type epsilon"),
+        ("sample_scenes", ["--guidance", "4"], "--guidance was renamed to --guidance-scale"),
+        ("sample_scenes", ["--num-scenes", "2", "--steps=20"], "--steps was renamed to --num-inference-steps"),
+        ("evaluate_scenes", ["--limit", "20"], "--limit was renamed to --max-reconstructed-scenes"),
+        ("evaluate_scenes", ["--no-balance"], "--no-balance was renamed to --no-balance-labels"),
+        ("evaluate_scenes", ["--reference", "apart"], "--reference apart was renamed to --reference min-distance"),
+        ("train_dit", ["demo", "--prediction=velocity"], "--prediction was renamed to --prediction-type"),
+        (
+            "train_dit",
+            ["--prediction_type", "noise"],
+            "--prediction-type noise was renamed to --prediction-type epsilon",
+        ),
         ("train_dit", ["demo", "--steps", "20"], None),
-        ("export_scenes", ["--limit", "20"], "--limit is now --max-scenes"),
+        ("export_scenes", ["--limit", "20"], "--limit was renamed to --max-scenes"),
     ],
 )
 def test_find_renamed_names_present_option_or_value(job, words, message):
@@ -70,7 +74,7 @@ def test_find_renamed_names_present_option_or_value(job, words, message):
 
 def test_job_exits_with_code_2_for_renamed_option():
     done = run_python("jobs/sample_scenes.py", "--guidance", "4")
-    assert (done.returncode, done.stderr) == (2, "error: --guidance is now --guidance-scale\n")
+    assert (done.returncode, done.stderr) == (2, "error: --guidance was renamed to --guidance-scale\n")
 
 
 def test_option_modules_import_nothing_heavy():

@@ -26,7 +26,9 @@ def test_pipeline_directory_default_is_only_trained_or_released(tmp_path, monkey
         if expected:
             assert find_pipeline_directory("") == str(tmp_path / "models" / expected)
             continue
-        with pytest.raises(ValueError, match=r"several were trained here; name one of: .*pritti-demo, .*pritti-smoke"):
+        with pytest.raises(
+            ValueError, match=r"several pipelines were trained here; specify one of: .*pritti-demo, .*pritti-smoke"
+        ):
             find_pipeline_directory("")
 
 
