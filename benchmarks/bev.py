@@ -1,11 +1,11 @@
-"""Time pictures from above at 256 x 256: all primitives together against one primitive at a time.
+"""Compare two renderers of pictures from above at 256 x 256: all primitives together, and one primitive at a time.
 
 python benchmarks/bev.py                      dense towns
 python benchmarks/bev.py --dataset DIRECTORY  scenes selected evenly from a dataset
 
-The plain way is vectorised within a primitive, over the pixels of its bounds, without a tolerance at edges. Times are
-CPU seconds of one thread, without reading. Workers of the jobs keep freed memory, so set MALLOC_MMAP_MAX_=0 and
-MALLOC_TRIM_THRESHOLD_=-1 as jobs/support/cli.py does.
+The plain renderer is vectorised over the pixels inside the bounds of one primitive, without a tolerance at edges. Times
+are CPU seconds of one thread, without the time to read scenes. Workers of the jobs keep freed memory, so set
+MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1, as jobs/support/cli.py does.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from pipelines.schema.scene_subset import SceneSubset
 
 ROUNDS = 7
 SCENES = 32
-PICTURES, CORES = 50_000, 2  # pictures of an evaluation on the paper's scale
+PICTURES, CORES = 50_000, 2  # number of pictures in an evaluation at the paper's scale; number of cores
 
 
 def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
-    """`render_bev` at one pixel per raster pixel, written in the obvious way."""
+    """Draw a scene like `render_bev` at one pixel per raster pixel, one primitive at a time."""
     grid = scene.grid
     fine = Grid(
         grid.front_m, grid.left_m, grid.resolution_m / supersample, grid.rows * supersample, grid.cols * supersample
@@ -43,7 +43,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
     height, class_id = (
         np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id)
     )
-    # Boxes before ellipsoids, the last box first: what comes later must lie higher.
+    # Draw boxes before ellipsoids, the last box first, because a later primitive is drawn only where it is higher.
     for i in sorted(range(len(scene)), key=lambda i: (scene.category[i] == ELLIPSOID, -i)):
         center, rotation, half = (part[i].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m / 2))
         reach = np.abs(rotation) @ half
@@ -55,7 +55,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
             continue
         part = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
         dx, dy = (x[part[0]] - center[0])[:, None, None], (y[part[1]] - center[1])[:, None]
-        # A vertical line in units of the primitive's half axes: foot + z along.
+        # Vertical line through the pixel in units of the primitive's half axes: foot + z along.
         foot, along = (dx * rotation[0] + dy * rotation[1]) / half, rotation[2] / half
         with np.errstate(divide="ignore", invalid="ignore"):
             if scene.category[i] == ELLIPSOID:

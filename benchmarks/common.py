@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: a description of the machine, interleaved timing and raw data."""
+"""Functions that the benchmarks share: a description of the machine, interleaved timing and raw data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import provenance
 
-DENSE_SEEDS = (0, 2, 4, 6)  # towns as dense as KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop
+DENSE_SEEDS = (
+    0,
+    2,
+    4,
+    6,
+)  # seeds of towns as dense as KITTI-360, with 240 to 280 primitives and 57 to 69 slabs in a crop
 
 
 def describe_machine() -> str:
@@ -26,9 +31,10 @@ def describe_machine() -> str:
 def time_interleaved(
     ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, list[float]]:
-    """Time each way once per round, in turn, so that a busy machine slows all of them.
+    """Time each function once per round, in turn, so that a busy machine slows all of them.
 
-    Each way is called with the number of the round. Returns seconds by way, of the CPU or of `clock`.
+    Each function is called with the number of the round. The result is a list of seconds per function: CPU time, or the
+    time of `clock`.
     """
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for k in range(rounds):
@@ -46,12 +52,12 @@ def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
 
 
 def format_ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
-    """Format the ratios of `slow` to `fast`, round by round."""
+    """Format the ratios of `slow` to `fast` over the rounds."""
     return spread([a / b for a, b in zip(slow, fast, strict=True)], digits=digits) + " x"
 
 
 def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
-    """Return the drive with poses every `spacing_m` along its path, as KITTI-360 has them (0.3 to 1.1 m)."""
+    """Return the drive with a pose every `spacing_m` along its path; KITTI-360 has a pose every 0.3 to 1.1 m."""
     xyz = drive.world_from_imu[:, :, 3]
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(xyz, axis=0), axis=1).cumsum()])
     at = np.arange(0, along[-1], spacing_m)
@@ -62,7 +68,7 @@ def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
 
 
 def write_raw(root: Path, seeds: tuple[int, ...] = DENSE_SEEDS, spacing_m: float = 1.0) -> None:
-    """Write dense towns as KITTI-360's own files under `root`, one sequence each; existing ones are kept."""
+    """Write dense towns in KITTI-360's file format under `root`, one sequence per town; keep existing files."""
     for seed in seeds:
         if not (root / f"data_poses/2013_05_28_drive_{seed:04d}_sync/poses.txt").exists():
             write_kitti360(with_dense_poses(generate_town(seed), spacing_m), root)

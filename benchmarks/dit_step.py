@@ -1,12 +1,12 @@
 """Time a denoising step of the diffusion transformer on the CPU.
 
-Compares ours, the original's code with the same weights, and diffusers' class.
+The benchmark compares this project's DiT, the original code with the same weights, and the class of diffusers.
 
 python benchmarks/dit_step.py                      DiT-B, batch 1 and 8; some minutes
 python benchmarks/dit_step.py --preset kitti360-l --batches 1
 
-Times are wall-clock seconds, measured in turn. Also compares ours with its matrix products alone, which bound it from
-below, and guidance at scale 1 with a batch that is always doubled.
+Times are wall-clock seconds; the implementations are measured in turn. The benchmark also times the matrix products
+alone, which are a lower bound. It compares guidance at scale 1 with a batch that is always doubled, too.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Config:
 
 
 def make_matrix_products(dit: DiT, batch: int) -> Callable[[], None]:
-    """Return a function that runs only the matrix products of a step: a lower bound of its time on this machine."""
+    """Return a function that runs only the matrix products of a step, which give a lower bound of its time."""
     c, tokens = dit.config, (dit.config.size // dit.config.patch) ** 2
     wide, deep = torch.randn(batch * tokens, c.width), torch.randn(batch * tokens, 4 * c.width)
     q = torch.randn(batch, c.heads, tokens, c.width // c.heads)
@@ -56,7 +56,7 @@ def make_matrix_products(dit: DiT, batch: int) -> Callable[[], None]:
 
 @torch.inference_mode()
 def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel, batch: int, rounds: int) -> None:
-    """Print the time of a step for each way."""
+    """Print the time of a step for each implementation."""
     c, timesteps = ours.config, Diffusion().select_timesteps(250).tolist()
     latent, label = torch.randn(batch, c.channels, c.size, c.size), torch.arange(batch) % 3
     at = [torch.full((batch,), t) for t in timesteps]
@@ -88,7 +88,7 @@ def main(config: Config) -> None:
     print(describe_machine(), f"{config.threads} threads")
     torch.manual_seed(0)
     ours = DiT(**DIT_PRESETS[config.preset].architecture()).eval().requires_grad_(False)
-    for parameter in ours.parameters():  # with the initial zeros, most of the network would have no effect
+    for parameter in ours.parameters():  # the initial zeros would disable most of the network
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.02)
     c = ours.config

@@ -1,10 +1,11 @@
-"""Time precision, recall and FID of 2048-d features against ADM's formulas as written.
+"""Time precision, recall and FID of 2048-d features, and compare them with a direct implementation of ADM's formulas.
 
-python benchmarks/generation.py                      1,000 samples a side with both, 10,000 with ours
+python benchmarks/generation.py                      1,000 samples per side with both, 10,000 with ours
 python benchmarks/generation.py --samples 61913      ours only, on Ray: memory and time
 
-Two kinds of features: with a spectrum that falls as Inception's does (2,048 dimensions, most of the variance in a few
-dozen), and isotropic noise, the worst case, in which every distance is about the same. Wall-clock seconds, all cores.
+There are two kinds of features. The first has a falling spectrum like Inception's: most of the variance of 2,048
+dimensions lies in a few dozen. The second is isotropic noise, the worst case, in which all distances are similar. Times
+are wall-clock seconds on all cores.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ ROUNDS = 3
 
 
 def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
-    """(count, 2048) float32; `falling`: mean squares along a random basis fall as 1 / rank^2, and features are >= 0."""
+    """Return features (count, 2048) in float32.
+
+    With `falling`, features are not negative, and mean squares along a random basis fall as 1 / rank^2.
+    """
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((count, DIMENSIONS), dtype=np.float32)
     if not falling:
@@ -39,7 +43,7 @@ def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
 def compute_adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
     """Compute precision and recall as ADM's evaluator does.
 
-    Distances are |x|^2 - 2 x.y + |y|^2 in float16, and whole rows are sorted to find the radius.
+    Distances are |x|^2 - 2 x.y + |y|^2 in float16. Whole rows are sorted to find the radius.
     """
     sides = [torch.from_numpy(side).half() for side in (real, generated)]
 

@@ -1,8 +1,9 @@
-"""CPU seconds from the start of a process until it can work: the interpreter alone, a loaded pipeline, Ray workers.
+"""Measure the CPU time that a process needs to start: the interpreter alone, a loaded pipeline, Ray workers.
 
     python benchmarks/import_time.py                    a minute
 
-A Ray worker's seconds include Ray's own start. torch is listed as the unit: its import differs between machines too.
+The time of a Ray worker includes the start of Ray. The import of torch is listed as a reference, because its time also
+differs between machines.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ WORKERS = {
 @dataclass(frozen=True)
 class Config:
     rounds: int = 5
-    """Measurements of each; the median is printed."""
+    """Number of measurements of each value; the median is printed."""
 
 
 def measure_process(code: str) -> float:
-    """CPU seconds, user and system, of an interpreter that runs the code."""
+    """Return the CPU seconds (user and system) of an interpreter that runs the code."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", code], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -54,7 +55,7 @@ def measure_process(code: str) -> float:
 
 @ray.remote(max_calls=1)
 def measure_worker(modules: list[str]) -> float:
-    """CPU seconds of a new Ray worker from its start until the modules are imported."""
+    """Return the CPU seconds of a new Ray worker from its start until the modules are imported."""
     for name in modules:
         importlib.import_module(name)
     return time.process_time()
@@ -64,7 +65,7 @@ def main(config: Config) -> None:
     print(describe_machine())
     seconds: dict[str, list[float]] = {}
     ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
-    for _ in range(config.rounds):  # in turn, so that a busy machine slows all alike
+    for _ in range(config.rounds):  # in turn, so that a busy machine slows all equally
         for name, code in PROCESSES.items():
             seconds.setdefault(name, []).append(measure_process(code))
         for name, modules in WORKERS.items():

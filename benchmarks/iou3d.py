@@ -2,8 +2,8 @@
 
 python benchmarks/iou3d.py
 
-Cases and oracles are those of tests/unit/test_iou3d.py: manifold3d's polytopes, and half-space intersection in
-float64 where manifold3d disagrees. CPU seconds of one thread.
+Cases and reference values are those of tests/unit/test_iou3d.py. The reference is manifold3d, or a half-space
+intersection in float64 if manifold3d disagrees. Times are CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def time_overlapping_pairs() -> None:
-    """Time overlapping boxes of any rotation: ours against manifold3d, per pair."""
+    """Time overlapping boxes of any rotation per pair, for this project's code and for manifold3d."""
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
     kept = np.flatnonzero(compute_iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
@@ -66,14 +66,20 @@ def time_overlapping_pairs() -> None:
 
 
 def time_whole_scenes() -> None:
-    """Time all pairs of predicted and true boxes of a scene; bounds cull most of them, in AP3D also categories."""
+    """Time all pairs of predicted and true boxes of a scene.
+
+    Bounds exclude most pairs; in AP3D, categories exclude further pairs.
+    """
     rng = np.random.default_rng(1)
     scenes = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
     truths = [(extract_boxes(scene), scene.category) for scene in scenes]
     joined = make_boxes(*(np.concatenate(parts) for parts in zip(*(box for box, _ in truths), strict=True)))
     crowd = np.arange(PAPER_OBJECTS)
     crowded = (joined.take(crowd), np.concatenate([category for _, category in truths])[crowd])
-    for name, chosen in (("dense towns", truths), (f"{PAPER_OBJECTS} boxes, several towns in one place", [crowded])):
+    for name, chosen in (
+        ("dense towns", truths),
+        (f"{PAPER_OBJECTS} boxes, from several towns at the same position", [crowded]),
+    ):
         sides = [(disturbed(rng, box, 0.1), box, category[:, None] == category) for box, category in chosen]
         count = sum(len(a.size_m) * len(b.size_m) for a, b, _ in sides)
         for kind in ("all pairs", "pairs of one category"):
@@ -98,7 +104,7 @@ def time_whole_scenes() -> None:
 
 
 def print_errors() -> None:
-    """Print errors against manifold3d, or against half-space intersection where manifold3d is off the tolerance."""
+    """Print errors against manifold3d, or against half-space intersection if manifold3d exceeds the tolerance."""
     print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
     total = wrong = 0
     for name, (a, b) in pairs(np.random.default_rng(0)).items():
@@ -115,7 +121,10 @@ def print_errors() -> None:
 
 
 def print_ellipsoid_errors() -> None:
-    """Print errors against the closed form of spheres; stretching both makes ellipsoids and keeps the IoU."""
+    """Print errors against the closed form of spheres.
+
+    Stretching both spheres gives ellipsoids with the same IoU.
+    """
     rng, n = np.random.default_rng(2), 2_000
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
     lens = sphere_lens(*radius, distance)

@@ -1,8 +1,9 @@
-"""Evaluate how well a layout VAE decodes latents with small errors, as sampled latents have them.
+"""Evaluate how well a layout VAE decodes latents with small errors, which sampled latents have.
 
 python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
 
-Held-out scenes are encoded, given noise in units of each channel's deviation over the scene, decoded, and scored.
+Held-out scenes are encoded, and noise is added in units of each channel's standard deviation over the scene. The noisy
+latents are decoded and scored.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Config:
 
 
 def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
-    """Decode posterior means with noise of the given number of deviations; ids and labels are kept."""
+    """Decode posterior means with noise of the given number of standard deviations; keep ids and labels."""
     generator = torch.Generator().manual_seed(seed)
     made = []
     for scene in scenes:
@@ -71,7 +72,7 @@ def main(config: Config) -> None:
     selection = SceneSubset(dataset.root, dataset.source, config.split, config.limit, "spread")
     scenes = [scene for shard, rows in selection.shards() for scene in shard.scenes(rows)]
     if not scenes:
-        raise SystemExit(f"{config.dataset} holds no scenes of split {config.split!r}")
+        raise SystemExit(f"{config.dataset} contains no scenes of split {config.split!r}")
     print(describe_machine(), f"{len(scenes)} scenes")
     print("as they are:", format_counts(scenes, dataset))
     for directory in config.lvae:

@@ -1,6 +1,7 @@
-"""Time a training step of the layout VAE by part, and against the plain version of its objective.
+"""Time the parts of a training step of the layout VAE, and compare it with a plain version of its objective.
 
-The comparison uses the paper's DETR decoder: padding to the thousands of proposals of the cells would be unfair.
+The comparison uses the paper's DETR decoder, because the plain version would pad to the thousands of proposals of a
+cell decoder.
 
 python benchmarks/lvae_step.py                   town, batch 8, and kitti360, batch 2; several minutes
 python benchmarks/lvae_step.py --presets town
@@ -101,7 +102,7 @@ def main(config: Config) -> None:
                 f"{part} {spread([r[part] for r in found], 1e3, 0)}" for part in found[0] if part != "loss"
             )
             print(f"{name}, batch {batch_size}, {way}: step {spread(total[way], 1e3, 0)} ms: {parts}")
-        print(f"{name}: plain takes {format_ratios(total['plain'], total['ours'], 2)} the time of ours")
+        print(f"{name}: the plain version takes {format_ratios(total['plain'], total['ours'], 2)} the time of ours")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Time matching of real primitives only against padded square cost tensors, on the same inputs.
+"""Compare two versions of matching on the same inputs: real primitives only, and padded square cost tensors.
 
 python benchmarks/matching.py
 """
@@ -25,7 +25,7 @@ BATCH = 32
 
 
 def make_town_batch(spec: LayoutSpec, batch: int):
-    """Return layouts of `batch` town scenes from several districts."""
+    """Return layouts of `batch` scenes from several districts of the town."""
     scenes = []
     for seed in range(4):
         drive = generate_town(seed)

@@ -1,10 +1,10 @@
-"""Compare known latents of a block: shifted from its neighbour (`copy`, the paper) or re-encoded (`reencode`).
+"""Compare two kinds of known latents of a block: copied and shifted (`copy`, the paper), or re-encoded (`reencode`).
 
 python benchmarks/overlap.py --lvae DIRECTORY
 
 Both blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent comes
-from the first block, the new half from the true scene. It is decoded, and its known half is compared with the true
-scene. "own latent" is the upper bound: the second block encoded as a whole.
+from the first block, the new half from the true scene. The second latent is decoded, and its known half is compared
+with the true scene. The upper bound is "own latent", for which the second block is encoded as a whole.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def make_pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Sce
 
 @torch.inference_mode()
 def compare(lvae: LayoutVAE, first: Scene, second: Scene) -> dict[str, dict[str, float]]:
-    """Print the drift of the known half of the second block for each way."""
+    """Print the drift of the known half of the second block for each kind of latents."""
     spec = lvae.spec
 
     def encode(scenes: Sequence[Scene]) -> torch.Tensor:

@@ -1,7 +1,7 @@
-"""The layout VAE's objective written in the obvious way from the paper: the baseline of the other benchmarks.
+"""A direct implementation of the layout VAE's objective from the paper, as the baseline of other benchmarks.
 
 Matching pads the true primitives to the number of proposals and fills whole cost tensors. Losses loop over samples and
-categories. The object encoder computes padded slots, too. The values are the same at a higher cost.
+categories. The object encoder also computes padded slots. The values equal those of this project, at a higher cost.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from models.vae.objects import ObjectEncoder
 
 
 def compute_square_cost(features, logit, truth, real, weights) -> torch.Tensor:
-    """Compute the (n, n) costs of one sample and category, truth padded to n rows (supplement Eq. "match")."""
+    """Compute the (n, n) matching costs of one sample and category (supplement Eq. "match").
+
+    The true primitives are padded to n rows.
+    """
     n, missing = len(features), len(features) - len(truth)
     truth = F.pad(truth, (0, 0, 0, missing))
     real = F.pad(real, (0, missing))
@@ -80,7 +83,7 @@ def compute_object_losses(features, logit, truth, real, assignment, spec: Layout
 
 @contextlib.contextmanager
 def replace_ours():
-    """Context in which the objective and the object encoder are the plain ones."""
+    """Replace the objective and the object encoder by the plain versions within a context."""
     kept = losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding
     losses.match_primitives, losses.compute_object_losses = match_primitives, compute_object_losses
     ObjectEncoder.without_padding = lambda self, features, real: (
@@ -111,7 +114,9 @@ def sum_cost(features, logit, truth, real, assignment, slots, proposals, weights
             chosen = assignment[sample, mine].numpy()
             cols = np.flatnonzero(chosen >= 0)
             total += cost[chosen[cols] - slot, cols].sum()
-            padding = int(real[sample, theirs].sum())  # a padded row costs the same wherever the others are
+            padding = int(
+                real[sample, theirs].sum()
+            )  # the cost of a padded row does not depend on the assignment of other rows
             rest = np.flatnonzero(chosen < 0)
             total += cost[padding:, :][:1, rest].sum() if len(rest) else 0.0
             slot, proposal = theirs.stop, mine.stop

@@ -1,6 +1,6 @@
-"""The original Diffusion Transformer as in its paper's code: norms, attention, MLP and adaLN are separate modules.
+"""The original Diffusion Transformer as in the code of its paper, with separate modules for each operation.
 
-It loads the weights of `models.dit.DiT` by name. For comparison only.
+The network loads the weights of `models.dit.DiT` by name. For comparison only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Measure preprocessing on one core: speed by stage and against ray casting, agreement, size, memory, reading.
+"""Measure preprocessing on one core: speed per stage, comparison with ray casting, size, memory and reading.
 
 python benchmarks/preprocess.py                    about four minutes; raw data are written once
 python benchmarks/preprocess.py --raw KITTI-360    any directory in KITTI-360's layout
+
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
 pa.set_io_thread_count(1)
-BATCH = 32  # scenes in a row, as the job cuts them, per scene of rays
+BATCH = 32  # consecutive scenes that the job cuts, per scene that ray casting renders
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,13 @@ class Config:
     raw: str = ""
     """KITTI-360 root (default: dense towns, written once under the temporary directory)."""
     scenes: int = 512
-    """Scenes to cut for the speed."""
+    """Number of scenes to cut for the measurement of speed."""
     rays: int = 8
     """Scenes to cast rays for."""
 
 
 def measure_density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
-    """Return the mean numbers of primitives and slabs in a crop."""
+    """Return the mean numbers of primitives and of slabs in a crop."""
     primitives, slabs = [], []
     for k in poses:
         local = drive.pose(int(k)).to_ego(drive.ground.vertices_m)
@@ -59,7 +60,7 @@ def measure_density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float,
 
 
 def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
-    """(G, H, W) heights, -inf for none: one trimesh per class and pose, one vertical ray per pixel centre (embree)."""
+    """Return heights (G, H, W), -inf without ground, from one vertical ray per pixel centre (trimesh with embree)."""
     pose, ground = drive.pose(index), drive.ground
     local = pose.to_ego(ground.vertices_m)
     inside = np.zeros(len(ground.slab_class), bool)
@@ -79,7 +80,7 @@ def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
 
 
 def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
-    """Measure CPU milliseconds per scene by stage: shards of 256 as pass 1 writes them."""
+    """Measure the CPU time per scene in milliseconds for each stage, on shards of 256 scenes as in pass 1."""
     spent = dict.fromkeys(("cut and rasterise", "to tables", "write Parquet"), 0.0)
     for number, start in enumerate(range(0, len(poses), 256)):
         clock = time.process_time()
@@ -103,7 +104,10 @@ def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict
 
 
 def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
-    """Return shares: of pixel and class decisions that agree with rays, of common pixels within 1 cm; worst metres."""
+    """Return the share of pixel and class decisions that agree with rays, and height errors of common pixels.
+
+    The height errors are the share within 1 cm and the largest error in metres.
+    """
     same, within, worst = [], [], 0.0
     for index in indices:
         scene = drive.scene(int(index), "train", grid)
@@ -118,7 +122,7 @@ def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[fl
 
 
 def measure_storage_error(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
-    """Return whether tables hold all masks exactly, and the largest height error in metres."""
+    """Return whether the tables contain all masks exactly, and the largest height error in metres."""
     stored = Shard(out, "kitti360", "train", 0).scenes()[: len(poses)]
     masks, worst = True, 0.0
     for scene, index in zip(stored, poses, strict=False):
@@ -129,7 +133,10 @@ def measure_storage_error(drive: Drive, poses: np.ndarray, grid: Grid, out: str)
 
 
 def measure_peak_memory(spacing_m: float, results: multiprocessing.Queue) -> None:
-    """In a process of its own: poses of a sequence, and its peak resident megabytes for reading it and one shard."""
+    """Return the number of poses of a sequence, and the peak resident memory in megabytes.
+
+    A separate process reads the sequence and writes one shard.
+    """
     with tempfile.TemporaryDirectory() as folder:
         write_kitti360(with_dense_poses(generate_town(4), spacing_m), folder + "/raw")
         child = multiprocessing.get_context("spawn").Process(target=_write_one_shard, args=(folder, results))

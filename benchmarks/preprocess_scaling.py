@@ -1,10 +1,10 @@
-"""Measure preprocessing on Ray: one worker against two, and a simulated cluster of many nodes on one machine.
+"""Measure preprocessing on Ray with one and two workers, and on a simulated cluster of many nodes.
 
     python benchmarks/preprocess_scaling.py                 about six minutes
     python benchmarks/preprocess_scaling.py --nodes 16      many-node part with 16 simulated nodes of one CPU
 
-One machine shows the CPU time of the driver and its traffic per scene. Both must be small and must not grow with the
-number of nodes, because there is one driver.
+The simulated cluster runs on one machine. It shows the CPU time and the network traffic of the driver per scene. Both
+must be small and must not grow with the number of nodes, because there is only one driver.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ FULL_POSES, FULL_LOGS = 80_000, 1_000  # KITTI-360; Argoverse 2, two logs a shar
 @dataclass(frozen=True)
 class Config:
     spacing_m: float = 1.5
-    """Metres between poses: about 1,700 scenes a sequence at 1.5."""
+    """Distance between poses in metres; 1.5 m gives about 1,700 scenes per sequence."""
     rounds: int = 2
-    """How often one and two workers are compared, in turn."""
+    """Number of comparisons of one and two workers, in turn."""
     nodes: int = 8
-    """Simulated nodes of one CPU each."""
+    """Number of simulated nodes with one CPU each."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Run:
     shards: int
     seconds: float
     driver_seconds: float  # CPU of the driver process
-    manifest_bytes: int  # of manifests that return to the driver
+    manifest_bytes: int  # size of the manifests that the workers return to the driver
 
 
 def time_ingest(tasks: list[ShardTask]) -> Run:
@@ -68,7 +68,7 @@ def time_ingest(tasks: list[ShardTask]) -> Run:
 
 
 def warm_up_workers(tasks: list[ShardTask]) -> None:
-    """Make the workers import their modules before the clock starts."""
+    """Let the workers import their modules before the time measurement starts."""
     time_ingest(tasks[:2])
 
 
@@ -127,7 +127,7 @@ def main(config: Config) -> None:
     shards = FULL_POSES / (run.scenes / run.shards) + FULL_LOGS / 2
     print(
         f"extrapolated: all of KITTI-360 and 1,000 logs of Argoverse 2 are {shards:.0f} shards, "
-        f"{shards * per_shard_ms / 1e3:.0f} s of the driver's CPU however many nodes there are"
+        f"{shards * per_shard_ms / 1e3:.0f} s of the driver's CPU time for any number of nodes"
     )
 
 

@@ -1,9 +1,9 @@
-"""Measure errors of samplers with few steps on Gaussian data, for which the best noise prediction is known.
+"""Measure errors of samplers with few steps on Gaussian data, for which the optimal noise prediction is known.
 
 python benchmarks/samplers.py
 
-A sampler that adds no noise is linear on such data. The deviation of its samples over that of the data is 1 if it is
-exact. Float64; the same on every machine.
+A sampler that adds no noise is linear on such data. The ratio of the samples' standard deviation to that of the data is
+1 for an exact sampler. Computations use float64, so the results are the same on every machine.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
 from models.sampling.diffusion import Diffusion, sample_with_scheduler
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 
-DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # of the data; latents have parts of all of these
+DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # standard deviations of the data; latents have components of all these sizes
 STEPS = (10, 20, 25, 50)
 
 
 def measure_kept_deviation(solver: SchedulerMixin, steps: int, deviation: float) -> float:
-    """Return the deviation of the samples over that of the data."""
+    """Return the ratio of the samples' standard deviation to that of the data."""
     alpha_bar = Diffusion().alpha_bar
 
     def model(latent: torch.Tensor, timestep: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
@@ -47,7 +47,9 @@ def main() -> None:
     ways |= {
         "DPM-Solver++, even in time (trailing)": dpm.from_config(base, timestep_spacing="trailing"),
         "DPM-Solver++, Karras": dpm.from_config(base, use_karras_sigmas=True),
-        "DPM-Solver++ of third order, as dpm++": dpm.from_config(base, use_lu_lambdas=True, solver_order=3),
+        "third-order DPM-Solver++ with the options of dpm++": dpm.from_config(
+            base, use_lu_lambdas=True, solver_order=3
+        ),
     }
     print(f"{'steps':>5}  {'deviation of the data':40}", *(f"{deviation:6}" for deviation in DEVIATIONS))
     for steps in STEPS:

@@ -1,10 +1,10 @@
 """Measure the time of sampling, decoding and writing scenes, and the peak memory.
 
-python benchmarks/sampling.py                       the town presets, untrained: the work is the same
+python benchmarks/sampling.py                       the untrained town presets, which need the same time
 python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
 
-Times are CPU seconds of one thread. The target is that all work after sampling takes at most a tenth of its time at 50
-steps. Memory is the peak of the process, and the share of Python, torch and the weights.
+Times are CPU seconds of one thread. The target: all work after sampling takes at most a tenth of the time of sampling
+with 50 steps. The memory figures are the peak of the process, and the part for Python, torch and the weights.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def build_untrained_pipeline(preset: str) -> PrITTIPipeline:
 
 
 def read_peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts it in KiB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux reports this value in KiB
 
 
 def main(config: Config) -> None:

@@ -1,10 +1,11 @@
-"""Time street views of 704 x 188 pixels: ours against embree on the same triangles.
+"""Compare the time of street views of 704 x 188 pixels between this project's renderer and embree.
 
 python benchmarks/street.py
 
-Dense towns of about 250 primitives with cameras along their roads. Embree casts a ray per pixel at the whole mesh, with
-ellipsoids as facets: the obvious way. Its tree is built once per scene, like our triangles. Ours also returns normals
-and intersects ellipsoids exactly. Times are CPU seconds of one thread; the target is 250 ms per frame.
+The scenes are dense towns of about 250 primitives, with cameras along their roads. Embree casts one ray per pixel at
+the whole mesh, in which ellipsoids consist of facets. Its search tree is built once per scene, like the triangles of
+this project's renderer. This project's renderer also returns normals and intersects ellipsoids exactly. Times are CPU
+seconds of one thread; the target is 250 ms per frame.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ FRAMES = 8  # of a scene
 
 
 def cast(scene: Scene, cameras: list[StreetCamera]) -> list[np.ndarray]:
-    """Cast rays with embree; return class ids (h, w)."""
+    """Cast rays with embree and return class ids (h, w)."""
     soup = triangulate_scene(scene)
     mesh = trimesh.Trimesh(
         soup.corners_m.reshape(-1, 3), np.arange(3 * len(soup.corners_m)).reshape(-1, 3), process=False

@@ -1,1 +1,1 @@
-"""The executables, one file per job, with their implementations and shared support modules."""
+"""Executables, one file per job, with their implementations and shared modules."""

@@ -59,7 +59,7 @@ class Branches:
     dataset: str = ""
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     minutes: float = 10.0
-    """Training time in minutes. A speed measurement converts it to steps (one per variant in equal-time studies)."""
+    """Training time in minutes; a speed measurement converts it to steps (per variant in equal-time studies)."""
     steps: int | None = None
     """Training steps; this option replaces --minutes (default: computed from --minutes)."""
     num_seeds: int = 3

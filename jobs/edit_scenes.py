@@ -11,8 +11,8 @@
     jobs/edit_scenes.py replay edits.json --input DIR                  a list of edits, one after another
 
 An edit applies to the primitives that match all selection options; --where "true" selects every primitive. The job
-writes scene tables with source=edited-<run> and the changes of each step to edits/. It also writes the list of edits
-for `replay` to edited-<run>.json, and pictures to <run>.html.
+writes scene tables with source=edited-<run> and the changes of each step to edits/. The job also writes the list of
+edits for `replay` to edited-<run>.json, and pictures to <run>.html.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jobs.support.options import SceneOptions
 
 @dataclass(frozen=True)
 class EditOptions(SceneOptions):
-    """Which scenes to edit, and where to write the edited scenes."""
+    """Options for the scenes to edit and for the output."""
 
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/edited/<run>)."""
@@ -43,7 +43,7 @@ class EditOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class SelectOptions(EditOptions):
-    """Which primitives to edit: those that match all given options."""
+    """Options for the primitives to edit, which are those that match all given options."""
 
     category: tuple[str, ...] = ()
     """Select primitives of these categories (default: all)."""
@@ -107,7 +107,7 @@ class Relabel(SelectOptions):
     to: str = "object"
     """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids."""
     class_name: str | None = None
-    """The dataset's class name (default: the class name of the category)."""
+    """New class name of the source (default: the class name of the category)."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Repair(SelectOptions):
     slab_offset_m: float = 0.3
     """Offset in metres of the ground heights above the surface, as for snap."""
     ground: Literal["both", "floating", "sunken", "none"] = "both"
-    """Which objects to put on the ground."""
+    """Objects to put on the ground."""
     max_push_m: float = 0.25
     """Maximum distance in metres by which an overlapping object is pushed."""
     min_shrink: float = 0.95

@@ -8,13 +8,14 @@
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
 The job reads only the scene tables. If --lvae is given without --generated, --run and --generated-source, the job
-evaluates only reconstruction. From an .npz file, it uses the first --max-scenes pictures. The defaults are the paper's:
-at most 1,000 training scenes, selected by farthest point sampling of their poses, and k = 3. The job compares them with
-equally many generated scenes, with labels in equal parts. Every score has a 95 % confidence interval over scenes.
+evaluates only reconstruction. From an .npz file, the job uses the first --max-scenes pictures. The defaults are the
+paper's: at most 1,000 training scenes, selected by farthest point sampling of their poses, and k = 3. The job compares
+the real scenes with equally many generated scenes, with labels in equal parts. Every score has a 95 % confidence
+interval over scenes.
 
-The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, it also
-writes reconstruction.html with the best and worst scenes, and reconstruction.parquet with one row per scene. FID, sFID,
-KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
+The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
+also writes reconstruction.html with the best and worst scenes, and reconstruction.parquet with one row per scene. FID,
+sFID, KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
 distances of layout statistics and of features of a fixed random network, under separate names. Run the same command
 again to resume after an interruption.
 """
@@ -52,7 +53,7 @@ class Config:
     k: tuple[int, ...] = (3,)
     """Numbers of nearest neighbours for precision, recall, density and coverage."""
     supersample: int = 1
-    """Number N: each pixel of a picture is the mean of N x N samples."""
+    """Samples per pixel and axis: with N, each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights for FID, sFID, KID, IS, precision and recall (default: none)."""
     lvae: str = ""

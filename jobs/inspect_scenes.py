@@ -8,7 +8,7 @@
     jobs/inspect_scenes.py report --dataset DIR                            one self-contained HTML page
     jobs/inspect_scenes.py gallery --dataset DIR --max-scenes 200          an HTML page with filters and scenes in 3D
 
-The job works for real and generated scenes and reads only the tables. It writes to $PRITTI_HOME/inspect/<dataset>
+The job works for real and generated scenes and reads only the tables. The job writes to $PRITTI_HOME/inspect/<dataset>
 unless --output is given.
 """
 
@@ -24,7 +24,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """Which dataset to inspect."""
+    """Options for the dataset to inspect."""
 
     dataset: str = ""
     """Dataset directory or URI (default: $PRITTI_HOME/datasets/town)."""
@@ -36,7 +36,7 @@ class DatasetOptions:
 
 @dataclass(frozen=True)
 class OneScene(DatasetOptions):
-    """Draw scenes in every view: from above, in 3D, ground classes, ground height, primitives; one PNG each."""
+    """Draw one PNG per scene with every view: from above, in 3D, ground classes, ground height, primitives."""
 
     ids: tyro.conf.Positional[tuple[str, ...]] = ()
     """Scene ids (default: --max-scenes random scenes)."""
@@ -59,7 +59,7 @@ class Sheet(DatasetOptions):
     sort: str = "drive"
     """Order: drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table (num_pole)."""
     pick: Literal["uniform", "lowest", "highest"] = "uniform"
-    """Which of the sorted scenes to draw: evenly from all, those with the lowest values, or with the highest."""
+    """Selection from the sorted scenes: evenly from all, those with the lowest or those with the highest values."""
     view: Literal["bev", "3d"] = "bev"
     """View: bird's-eye or oblique."""
     size_px: int = 256

@@ -7,8 +7,8 @@
     jobs/outpaint_scenes.py --input DIR --source town --split test --max-scenes 8 --num-actors 2
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
 
-By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. It
-writes scene tables with source=generated-<run>, one GLB file per scene, and block_tables/ with the share of known
+By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
+job writes scene tables with source=generated-<run>, one GLB file per scene, and block_tables/ with the share of known
 ground in each block. A block is generated as soon as the blocks that it depends on are complete. The result does not
 depend on the number of actors.
 """

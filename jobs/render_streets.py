@@ -6,10 +6,13 @@
     jobs/render_streets.py --input OUTPAINTED --max-frames 200      a longer drive
     jobs/render_streets.py --width-px 1408 --height-px 376          KITTI-360's own size
 
-The camera drives on the right half of the road, parallel to the centreline of the road mask. It has the lens of
-KITTI-360's image_00. For each scene, the job writes to OUTPUT/streets/<run>/<scene_id>/: PNG files in semantic/,
-class_id/, instance/ (index of the primitive + 1), depth/ (16 bits, 256 per metre, 0 beyond the range) and shaded/;
-cameras.json (poses, intrinsics, class ids); sheet.png; drive.webp.
+The camera drives on the right half of the road, parallel to the centreline of the road mask. The camera has the lens of
+KITTI-360's image_00. For each scene, the job writes these files to OUTPUT/streets/<run>/<scene_id>/:
+
+* PNG files in semantic/, class_id/, instance/, depth/ and shaded/. An instance is the index of a primitive plus 1. A
+  depth has 16 bits, 256 per metre, and is 0 beyond the range.
+* cameras.json with poses, intrinsics and class ids.
+* sheet.png and drive.webp with previews.
 """
 
 from __future__ import annotations

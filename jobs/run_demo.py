@@ -4,9 +4,9 @@
     jobs/run_demo.py                        15 minutes on two cores, all files under runs/demo
     jobs/run_demo.py --lvae-steps 20000 --dit-steps 50000 --output DIR       longer training, better scenes
 
-The demo first generates scenes with the released model. It then preprocesses the town, trains the layout VAE, encodes
-latents, trains the diffusion transformer, samples scenes, outpaints a scene and evaluates the results. The demo needs
-no data, no GPU and no network. Run the same command again to resume after an interruption.
+The demo first generates scenes with the released model. Then it preprocesses the town, trains the layout VAE, encodes
+latents and trains the diffusion transformer. Finally, it samples scenes, outpaints a scene and evaluates the results.
+The demo needs no data, no GPU and no network. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
     jobs/sweep_references.py --real DIR --generated DIR --reference-sizes 1000 5000 --min-distances-m 1 2 5 10 --k 3 5
     jobs/sweep_references.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
 
-The job reproduces the paper's figure of precision and recall over reference sets. It extracts the features of all
-scenes once. It then compares each reference set with equally many generated scenes, with labels in equal parts.
+The job reproduces the paper's figure of precision and recall over reference sets. The job extracts the features of all
+scenes once. Then it compares each reference set with equally many generated scenes, with labels in equal parts.
 Reference sets with more scenes than there are generated scenes are omitted. The job writes sweep.json, sweep.parquet,
 two figures (SVG) and sweep.html. Run the same command again to resume after an interruption.
 """
@@ -35,7 +35,7 @@ class Config:
     k: tuple[int, ...] = (3, 5)
     """Numbers of nearest neighbours, as in the paper."""
     supersample: int = 1
-    """Number N: each pixel of a picture is the mean of N x N samples."""
+    """Samples per pixel and axis: with N, each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights; without this file, features come from an untrained network (default: none)."""
     output: str = ""

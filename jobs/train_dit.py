@@ -6,8 +6,8 @@
     jobs/train_dit.py kitti360-xl --dataset DIR --label-kind joint --num-workers 8
     jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      continue with the released weights
 
-The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. It logs losses and sampled scenes to MLflow
-($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
+The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. The job logs losses and sampled scenes to
+MLflow ($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
 from __future__ import annotations

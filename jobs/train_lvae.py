@@ -10,7 +10,7 @@
 transformer of the pipeline remains valid. The job writes the pipeline with the new decoder to
 $PRITTI_HOME/models/pritti-<name>.
 
-The job writes the model to $PRITTI_HOME/models/lvae-<preset>. It logs losses and pictures to MLflow
+The job writes the trained model to $PRITTI_HOME/models/lvae-<preset>. The job logs losses and pictures to MLflow
 ($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 

@@ -1,4 +1,6 @@
-"""Generate, edit and evaluate 3D semantic urban scenes: the public names, imported when they are used.
+"""Generate, edit and evaluate 3D semantic urban scenes.
+
+This package contains the public names. Each one is imported on first use:
 
 from pritti import PrITTIPipeline, Scene
 

@@ -1,6 +1,6 @@
-"""The console script: `pritti <job>` runs an executable of jobs/, `pritti --help` lists them.
+"""Console script: `pritti JOB` runs an executable of jobs/, and `pritti --help` lists all jobs.
 
-The list comes from the docstrings in the files: importing the job modules would take longer.
+The list is read from the docstrings in the files, because the import of the job modules would take longer.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def describe_usage() -> str:
 
 
 def main() -> None:
-    """Run the job that the first word names with the other words as its command line."""
+    """Run the job that the first argument names, with the other arguments as its command line."""
     name, *args = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print(describe_usage())
@@ -64,7 +64,7 @@ def main() -> None:
         hint = f"did you mean {' or '.join(near)}?" if near else "pritti --help lists the jobs"
         print(f"error: unknown job {name!r}; {hint}", file=sys.stderr)
         sys.exit(2)
-    from jobs.support.cli import run  # imports tyro, which the list of jobs does not need
+    from jobs.support.cli import run  # imported here because it imports tyro, which the list of jobs does not need
 
     sys.argv[0] = "pritti"  # the recorded command of a run should not contain a directory of this machine
     run(path.stem, args, prog=f"pritti {name}")

@@ -1,1 +1,1 @@
-"""Implementations of the executables in jobs/, imported after the command line has been parsed."""
+"""Implementations of the executables in jobs/; they are imported after the command line is parsed."""

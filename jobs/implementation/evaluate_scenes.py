@@ -59,7 +59,7 @@ def evaluate(config: Config) -> dict:
 def describe_inputs(config: Config, dataset: Dataset | None, sides: dict[str, SceneSet]) -> dict:
     """Return a description of the evaluated scenes and of the weights of the layout VAE.
 
-    It includes the sampling options if one run generated all scenes.
+    The description includes the sampling options if one run generated all scenes.
     """
     about = {"real": dataset and dataset.root, "real_split": config.real_split, "source": None, "sampling": None}
     about["lvae_weights"] = digest_weights(load_lvae(make_absolute(config.lvae))) if config.lvae else None

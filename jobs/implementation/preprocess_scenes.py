@@ -16,7 +16,7 @@ from pipelines.preprocess.ingest import ingest_drives
 from pipelines.preprocess.sources.town.generator import TOWN_VERSION
 
 NOT_RECORDED = ("output", "skip_unreadable")
-RECORDED_AS = {"make_split": "split"}  # the key in dataset.json
+RECORDED_AS = {"make_split": "split"}  # keys in dataset.json
 
 
 def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
@@ -31,7 +31,7 @@ def plan_shards(config: Town | Kitti360 | Av2 | Own) -> list:
 
 
 def make_recorded_options(config: Town | Kitti360 | Av2 | Own) -> dict:
-    """Return the options that dataset.json records: a run with other options does not resume."""
+    """Return the options that dataset.json records; a run with other options cannot resume."""
     options = {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED}
     options["source"] = type(config).__name__.lower()
     if isinstance(config, Town):

@@ -30,7 +30,7 @@ from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import read_scenes
 from pipelines.training.latents import digest_weights
 
-SHOWN = 32  # number of scenes on the card, from the first
+SHOWN = 32  # number of scenes on the card, taken from the first
 JUDGED = 256  # number of scenes from which the scenes with most faults are selected
 FAILURES = 8
 CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
@@ -103,7 +103,7 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
     """Return the evaluated inputs and the scores.
 
     Raises:
-        ValueError: There is no complete evaluation, or it belongs to other weights.
+        ValueError: There is no complete evaluation, or the evaluation belongs to other weights.
     """
     advice = (
         "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and specify their --output"
@@ -146,7 +146,7 @@ def read_history(experiment: str, stage: str, model: torch.nn.Module) -> list[Tr
 
 
 def find_training(experiment: str, stage: str, digest: str, parameters: int | None) -> TrainingRecord:
-    """Return the run that trained the weights with a digest.
+    """Return the run that trained the weights with the given digest.
 
     Raises:
         ValueError: Neither MLflow nor a published entry has a record of this run.

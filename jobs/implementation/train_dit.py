@@ -244,7 +244,7 @@ def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
     Args:
         lvae: Directory of the layout VAE.
         sampling: `noise_scaling` and `existence_threshold`, if they differ from the paper's.
-        output: Directory that contains dit/. It is also the return value.
+        output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))
     pipeline = PrITTIPipeline(load_lvae(lvae), dit, **sampling)

@@ -1,1 +1,1 @@
-"""What the jobs share: command line, options, Ray session, training, tracking."""
+"""Modules that several jobs use: command line, options, Ray session, training and tracking."""

@@ -56,7 +56,8 @@ class ReconstructionCheck:
         """Return metrics and pictures.
 
         Losses are computed from a sampled latent, as in training. Ground IoU, height error and AP3D are computed from
-        the mean latent, as in the evaluation. The pictures show ground truth above reconstruction.
+        the mean latent, as in the evaluation. The pictures show the ground truth in the upper row and the
+        reconstruction in the lower row.
         """
         model, scenes = (
             cast(LayoutVAE, trainer.ema_model().eval()),

@@ -70,9 +70,8 @@ def require_positive(config: object, *names: str) -> None:
 def find_root_cause(error: BaseException) -> BaseException:
     """Return the exception that the user should read, because Ray wraps a worker's error several times.
 
-    The outermost ValueError or OSError that is not a wrapper comes from this package. Its message names the file and
-    the
-    remedy, which the messages of deeper causes do not.
+    The outermost ValueError or OSError that is not a wrapper comes from this package. The message of this exception
+    names the file and the remedy; the messages of deeper causes do not.
     """
     seen: set[int] = set()
     while id(error) not in seen:

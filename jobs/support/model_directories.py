@@ -1,4 +1,4 @@
-"""Find the pipeline that --model names. Importing this module imports neither torch nor MLflow."""
+"""Find the pipeline that --model names. The import of this module imports neither torch nor MLflow."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_label_kind(model: str) -> str:
 
 
 def find_pipeline_directory(model: str) -> str:
-    """Return the directory that --model names; pipelines in MLflow are downloaded first.
+    """Return the directory of the pipeline that --model names; a pipeline in MLflow is downloaded first.
 
     If --model is empty, the directory is $PRITTI_HOME/models/pritti-town, the only pipeline under $PRITTI_HOME/models,
     or the released weights, in this order.

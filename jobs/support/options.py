@@ -18,7 +18,7 @@ ModelOption = Annotated[
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Which scenes of a dataset directory a job reads."""
+    """Options for the scenes that a job reads from a dataset directory."""
 
     input: str = ""
     """Dataset directory with the scenes (default: $PRITTI_HOME/generated)."""
@@ -32,7 +32,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class GenerationOptions(SceneOptions):
-    """Which scenes to change, with which pipeline."""
+    """Options for the scenes to change and for the pipeline."""
 
     max_scenes: int | None = 1
     """Maximum number of scenes, taken from the first."""
@@ -49,7 +49,7 @@ class GenerationOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class RePaintOptions(GenerationOptions):
-    """Which scenes to change, with which pipeline and RePaint settings (paper, Sec. 3.3 and supplement B.3).
+    """Options for the scenes to change, the pipeline and RePaint (paper, Sec. 3.3 and supplement B.3).
 
     With --guided, seams are less visible, more objects are kept, and the job is 24 times as fast as with the paper's
     settings.

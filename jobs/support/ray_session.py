@@ -16,7 +16,7 @@ def start_ray(training: bool = False) -> None:
 
     Args:
         training: Also start the dashboard. Ray Train asks the dashboard once per second which workers are alive, and
-            logs a warning if there is no dashboard. Other jobs do not need it.
+            logs a warning if there is no dashboard. Other jobs do not need the dashboard.
     """
     set_ray_environment()
     if ray.is_initialized():
@@ -35,6 +35,7 @@ def start_ray(training: bool = False) -> None:
 def run_packed(config: dict[str, bytes]) -> None:
     """Unpickle and call a function in a Ray Train worker.
 
-    Ray Train's controller also unpickles the training function. The packed form avoids that it imports the models.
+    Ray Train's controller also unpickles the training function. With the packed form, the controller does not import
+    the models.
     """
     cloudpickle.loads(config["packed"])()

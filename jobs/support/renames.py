@@ -1,4 +1,7 @@
-"""Earlier names of options and option values. Their use is an error, whose message contains the current name."""
+"""Earlier names of options and option values.
+
+The use of an earlier name is an error, and its message contains the current name.
+"""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ METRICS_PER_CALL = 1000  # MLflow's limit
 def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files: Sequence[str] = ()) -> dict:
     """Write scores to metrics.json and metrics.parquet, and log them with tags and files to MLflow.
 
-    Each output directory has one MLflow run, which a repeated evaluation updates. metrics.parquet has one row per
-    score, with the bounds of its 95 % interval if it has one. In MLflow, the bounds are separate metrics, NAME.low and
-    NAME.high.
+    Each output directory has one MLflow run, which a repeated evaluation updates. The file metrics.parquet has one row
+    per score, with the bounds of its 95 % interval if it has one. In MLflow, the bounds are separate metrics, NAME.low
+    and NAME.high.
 
     Args:
         output: Directory or URI of the files.

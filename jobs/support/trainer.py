@@ -39,8 +39,9 @@ RETRIES = 2  # restarts from the last checkpoint after a worker failure
 class TrainingRun:
     """One training run, as its workers receive it. All fields can be pickled.
 
-    `build(device, wrap)` returns the Trainer. `validate(trainer)` returns metrics and pictures (names to arrays) and
-    runs on rank 0 at every checkpoint. `identity` holds the options that a resumed run must share.
+    The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
+    pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that a
+    resumed run must share.
     """
 
     name: str
@@ -130,7 +131,7 @@ def measure_waiting(iterator: Iterator) -> Iterator[tuple[Any, float]]:
 
 
 def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
-    """Save a checkpoint (rank 0) and report it to Ray Train; every worker must call this."""
+    """Save a checkpoint (rank 0) and report it to Ray Train; every worker must call this function."""
     metrics = {"step": trainer.steps_done, "loss": loss}
     if rank != 0:
         ray.train.report(metrics)
@@ -198,7 +199,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
 
 def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
-    """Return the scaling of workers that fit the cluster and leave CPUs for reading.
+    """Return the resources of the workers, which leave CPUs for the readers of the data.
 
     Raises:
         ValueError: There are too many workers for the cluster, so they would wait forever; or the batch size is not a

@@ -85,16 +85,16 @@ def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path
     inpainted = about | {"sampling": {"weights": about["sampling"]["weights"]}}
     repaired = about | {"sampling": about["sampling"] | {"repair": True}}
     for spoilt, less, message in (
-        (repaired, {}, "of repaired scenes; sample without --repair"),
-        (other, {}, r"of other weights \(aa-bb\)"),
-        (about | {"sampling": None}, {}, "of other weights"),
-        (inpainted, {}, "not of scenes that jobs/sample_scenes.py made"),
+        (repaired, {}, "evaluates repaired scenes; evaluate scenes that were sampled without --repair"),
+        (other, {}, r"belongs to other weights \(aa-bb\)"),
+        (about | {"sampling": None}, {}, "belongs to other weights"),
+        (inpainted, {}, "does not evaluate scenes of jobs/sample_scenes.py"),
         (
             about | {"real": str(elsewhere)},
             {},
-            r"against .*/town, but the Layout VAE was trained on .*; run .* --real",
+            r"uses the real scenes of .*/town, but the Layout VAE was trained on .*; run .* --real",
         ),
-        (about, {"reconstruction"}, "no scores of reconstruction"),
+        (about, {"reconstruction"}, "contains no reconstruction scores"),
     ):
         (tmp_path / "evaluation.json").write_text(json.dumps(spoilt))
         (tmp_path / "metrics.json").write_text(json.dumps({k: v for k, v in scores.items() if k not in less}))
