@@ -1,4 +1,4 @@
-"""Repair faults of a scene with small changes: move objects to the ground, push them apart, and remove the rest.
+"""Repair faults of a scene with small changes: move objects to the ground, push them apart, and remove the others.
 
 metrics/validity.py defines the faults. A repair never makes another fault of the same kind worse: it skips a
 displacement that would move a primitive into a third primitive.
@@ -69,7 +69,7 @@ def find_overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
 
 
 def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
-    """Displace overlapping solid primitives horizontally until they no longer overlap.
+    """Displace overlapping solid primitives horizontally to end their overlaps.
 
     For each pair, the shortest displacement that moves neither primitive into a third one is used. The smaller
     primitive moves farther. If no displacement suffices, both primitives also shrink about their centres.
@@ -156,7 +156,7 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: whether a box of the pair at positions (k, 2) overlaps a third box too much and more than now."""
+        """(k,) bool: whether a box of the pair, at positions (k, 2), overlaps a third box above the limit and more than now."""
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)
@@ -169,9 +169,9 @@ class _Separation:
 
 
 def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:
-    """Select few primitives whose removal ends all overlaps.
+    """Select a small set of primitives whose removal ends the overlaps.
 
-    Of two equal candidates, the one with the lower existence probability is removed, then the smaller one.
+    Between equal candidates, a lower existence probability comes first, then a smaller volume.
 
     Args:
         scene: Scene with n primitives.

@@ -1,10 +1,10 @@
 """Convert raw drives to Parquet tables in two passes, with one Ray Data graph per pass (paper, supplement A).
 
-Pass 1 creates scenes. Each task writes the files of one shard to a staging directory, under a temporary name that it
-then renames. A killed task therefore leaves no partial file, and a finished shard is not written again. Pass 2 needs
-the whole training split. It computes density thresholds, slots per category and value bounds, labels the scenes, and
-moves all files to the dataset directory. It writes dataset.json last, which marks the dataset as complete. The driver
-process reads only manifests and never a scene.
+Pass 1 creates scenes. Each task writes the files of one shard to a staging directory, first under temporary names. A
+killed task therefore leaves no partial file, and a finished shard is not written again. Pass 2 needs the whole training
+split. Pass 2 computes density thresholds, slots per category and value bounds. It then labels the scenes and moves all
+files to the dataset directory. The last file is dataset.json, which marks the dataset as complete. The driver process
+reads only manifests and never a scene.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ def _plan_drives(
 ) -> list[ShardTask]:
     """Plan tasks one drive after the other, so that consecutive tasks share a drive in memory.
 
-    A drive without frames is unreadable. Its task fails to read the drive and writes one reject.
+    A drive without frames is unreadable. The task of an unreadable drive writes one reject.
     """
     plan = [(UNUSED, (ShardPart(key, name),)) for name, key in keys.items() if name not in frames]
     for name, frame in frames.items():

@@ -206,5 +206,5 @@ def test_evaluate_voxels_names_broken_and_unmatched_files(cluster, tmp_path, vox
         save_npz(tmp_path / f"{name}.npz", np.full((64, 64, 8), 99))
     with pytest.raises(ValueError, match=r"truth lack 1 of 5 names: s9; reconstructions lack 3 of 5 names: s1, s2, s3"):
         evaluate(Config(str(root / "truth"), str(tmp_path)))
-    with pytest.raises(Exception, match=r"s0\.npz: class ids \[99\]"):
+    with pytest.raises(Exception, match=r"s0\.npz: holds the class ids \[99\]"):
         evaluate(Config(str(root / "truth"), str(tmp_path), allow_missing=True))

@@ -343,8 +343,8 @@ class Drive:
     def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
         """Crop the Scene ahead of a pose.
 
-        The scene contains the primitives whose centre lies in the crop. They are static or belong to the frame of the
-        pose.
+        The scene contains the primitives whose centre lies in the crop. These primitives are static or belong to
+        the frame of the pose.
 
         Args:
             index: Index of the pose.

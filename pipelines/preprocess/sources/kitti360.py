@@ -5,7 +5,8 @@
 
 The name of a sequence is its four digits. The z axis of the world frame points up. The axes of the IMU are x forward, y
 right and z down. The XML file (over 100 MB for the longest drives) is streamed. The reader skips and reports single
-defective objects. It raises ValueError for a file that is invalid as a whole.
+defective objects. The reader raises ValueError for a file that
+is invalid as a whole.
 """
 
 from __future__ import annotations
