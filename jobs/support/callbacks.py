@@ -141,7 +141,18 @@ def load_cached_lvae(directory: str) -> LayoutVAE:
 
 @lru_cache(maxsize=1)
 def load_held_out_latents(root: str, source: str, latents: str, label: str, count: int) -> dict[str, np.ndarray]:
-    """Return the first latents of the test split, or of the training split if there is none, with their labels."""
+    """Return the first latents of the test split, or of the training split if there is no test split.
+
+    Args:
+        root: Dataset directory.
+        source: Source of the scenes.
+        latents: Directory with latents.json.
+        label: Kind of label.
+        count: Maximum number of scenes.
+
+    Returns:
+        Posteriors and labels {mean, logvar, label}.
+    """
     try:
         shards = find_shards(root, source=source, split="test")
     except ValueError:

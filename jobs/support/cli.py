@@ -59,6 +59,10 @@ def resolve_path(path: str, *default: str) -> str:
 def require_positive(config: object, *names: str) -> None:
     """Check integer options.
 
+    Args:
+        config: Options of a job.
+        *names: Names of fields to check.
+
     Raises:
         ValueError: One of the named options is below 1.
     """

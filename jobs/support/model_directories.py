@@ -28,8 +28,15 @@ def read_label_kind(model: str) -> str:
 def find_pipeline_directory(model: str) -> str:
     """Return the directory of the pipeline that --model names; a pipeline in MLflow is downloaded first.
 
-    If --model is empty, the directory is $PRITTI_HOME/models/pritti-town, the only pipeline under $PRITTI_HOME/models,
-    or the released weights, in this order.
+    If --model is empty, there are three defaults in this order: $PRITTI_HOME/models/pritti-town, the only pipeline
+    under
+    $PRITTI_HOME/models, and the released weights.
+
+    Args:
+        model: Value of --model: a directory, a name, models:/NAME/VERSION, the id of an MLflow run, or empty.
+
+    Returns:
+        Directory or URI of the pipeline.
 
     Raises:
         ValueError: There is no such pipeline, or --model is empty and there are several trained pipelines.

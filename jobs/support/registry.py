@@ -18,7 +18,15 @@ PIPELINE = "pipeline"  # artifact directory of a publishing run
 
 
 def register_version(name: str, run_id: str) -> str:
-    """Register the pipeline of a publishing run as the next version of a model; return models:/NAME/VERSION."""
+    """Register the pipeline of a publishing run as the next version of a model.
+
+    Args:
+        name: Name of the registered model.
+        run_id: Id of the MLflow run that holds the files of the pipeline.
+
+    Returns:
+        Reference models:/NAME/VERSION.
+    """
     api = make_client(find_tracking_uri())
     try:
         api.get_registered_model(name)

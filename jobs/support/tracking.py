@@ -56,6 +56,15 @@ class Tracker:
         """Return a tracker of the MLflow run that the file `record` names, or of a new MLflow run.
 
         Call this method only in the driver, because two processes that create the database concurrently damage it.
+
+        Args:
+            experiment: Name of the MLflow experiment.
+            name: Name of the MLflow run.
+            parameters: Parameters to log for a new run.
+            record: JSON file with the id of the MLflow run, which is written for a new run (None: no file).
+
+        Returns:
+            The tracker.
         """
         uri = find_tracking_uri()
         if record and storage.exists(record) and (known := storage.read_json(record))["tracking_uri"] == uri:

@@ -58,6 +58,7 @@ class TrainingRun:
 
 
 def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    """Convert a batch of arrays to tensors."""
     return {
         name: torch.from_numpy(np.array(value))  # copy, because Ray's arrays are read-only
         for name, value in batch.items()
@@ -109,7 +110,15 @@ def train_worker(run: TrainingRun, threads: int) -> None:
 
 
 def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
-    """Return the message of a non-finite loss, with the ids of the scenes that caused it."""
+    """Return the message of a non-finite loss, with the ids of the scenes that caused it.
+
+    Args:
+        error: Error with the positions of the samples.
+        stream: Order of the training scenes.
+
+    Returns:
+        The message.
+    """
     shards, rows = stream.positions(error.step * stream.batch_size, stream.batch_size)
     ids = [
         stream.shards[shards[k]].read("scenes", ["scene_id"])["scene_id"][int(rows[k])].as_py() for k in error.positions
@@ -131,7 +140,14 @@ def measure_waiting(iterator: Iterator) -> Iterator[tuple[Any, float]]:
 
 
 def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
-    """Save a checkpoint (rank 0) and report it to Ray Train; every worker must call this function."""
+    """Save a checkpoint (rank 0) and report it to Ray Train; every worker must call this function.
+
+    Args:
+        run: Training run.
+        trainer: Trainer of this worker.
+        rank: Rank of this worker.
+        loss: Loss of the last step.
+    """
     metrics = {"step": trainer.steps_done, "loss": loss}
     if rank != 0:
         ray.train.report(metrics)
@@ -157,7 +173,15 @@ def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
 
 
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:
-    """Train to the end and write the model (EMA weights, if enabled) to `output`, which is returned.
+    """Train to the end and write the model to a directory.
+
+    Args:
+        run: Training run.
+        num_workers: Number of Ray Train workers.
+        output: Directory or URI to write the model to; its weights are the EMA weights if EMA is enabled.
+
+    Returns:
+        `output`.
 
     Raises:
         ValueError: The cluster is too small for this number of workers, or a loss is not finite.
@@ -200,6 +224,13 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
 def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
     """Return the resources of the workers, which leave CPUs for the readers of the data.
+
+    Args:
+        num_workers: Number of Ray Train workers.
+        batch_size: Global batch size over all workers.
+
+    Returns:
+        Scaling configuration of Ray Train.
 
     Raises:
         ValueError: There are too many workers for the cluster, so they would wait forever; or the batch size is not a
@@ -244,7 +275,12 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
 
 
 def publish_directory(directory: str, output: str) -> None:
-    """Copy a saved model or pipeline file by file; the files that mark it as complete are copied last."""
+    """Copy a saved model or pipeline file by file; the files that mark it as complete are copied last.
+
+    Args:
+        directory: Local directory.
+        output: Target directory or URI.
+    """
     paths = [
         os.path.relpath(os.path.join(top, name), directory) for top, _, names in os.walk(directory) for name in names
     ]
@@ -257,6 +293,13 @@ def publish_directory(directory: str, output: str) -> None:
 
 def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerConfig:
     """Return the settings with every change that is not None.
+
+    Args:
+        settings: Settings of the preset.
+        **changes: Values of options by name of the setting; None keeps the value of the preset.
+
+    Returns:
+        The changed settings.
 
     Raises:
         ValueError: A change is not positive.
