@@ -156,7 +156,10 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: whether a box of the pair, at positions (k, 2), overlaps a third box above the limit and more than now."""
+        """(k,) bool: whether a box of the pair overlaps a third box above the limit and more than now.
+
+        The pair is at positions (k, 2).
+        """
         others = self.solid.copy()
         others[pair] = False
         around = self.now.take(others)

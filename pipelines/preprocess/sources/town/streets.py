@@ -267,8 +267,8 @@ def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: 
 def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
     """Return the nodes of a walk over all edges.
 
-    The walk prefers unused streets and prefers straight continuation to turns. At a node without unused streets, it
-    goes to the nearest one.
+    The walk prefers unused streets and prefers straight continuation to turns. At a node without unused streets, the
+    walk goes to the nearest unused street.
     """
     near: dict[Node, list[Node]] = {}
     for a, b in sorted(streets.edges):
