@@ -2,11 +2,11 @@
 
 The benchmark compares this project's DiT, the original code with the same weights, and the class of diffusers.
 
-python benchmarks/dit_step.py                      DiT-B, batch 1 and 8; some minutes
-python benchmarks/dit_step.py --preset kitti360-l --batches 1
+python benchmarks/dit_step.py                      DiT-B, batch 1 and 8; some minutes python benchmarks/dit_step.py
+--preset kitti360-l --batches 1
 
 Times are wall-clock seconds; the implementations are measured in turn. The benchmark also times the matrix products
-alone, which are a lower bound. It compares guidance at scale 1 with a batch that is always doubled, too.
+alone, which are a lower bound. The benchmark also compares guidance at scale 1 with a batch that is always doubled.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 python benchmarks/overlap.py --lvae DIRECTORY
 
-Both blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent comes
-from the first block, the new half from the true scene. The second latent is decoded, and its known half is compared
-with the true scene. The upper bound is "own latent", for which the second block is encoded as a whole.
+The two blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent
+comes from the first block, the new half from the true scene. The second latent is decoded, and its known half is
+compared with the true scene. The upper bound is "own latent", for which the second block is encoded as a whole.
 """
 
 from __future__ import annotations

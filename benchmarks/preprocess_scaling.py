@@ -3,8 +3,8 @@
     python benchmarks/preprocess_scaling.py                 about six minutes
     python benchmarks/preprocess_scaling.py --nodes 16      many-node part with 16 simulated nodes of one CPU
 
-The simulated cluster runs on one machine. It shows the CPU time and the network traffic of the driver per scene. Both
-must be small and must not grow with the number of nodes, because there is only one driver.
+The simulated cluster runs on one machine. The results are the CPU time and the network traffic of the driver per scene.
+These two numbers must be small and must not grow with the number of nodes, because there is only one driver.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Run:
     scenes: int
     shards: int
     seconds: float
-    driver_seconds: float  # CPU of the driver process
-    manifest_bytes: int  # size of the manifests that the workers return to the driver
+    driver_seconds: float  # CPU of the driver process.
+    manifest_bytes: int  # Size of the manifests that the workers return to the driver.
 
 
 def time_ingest(tasks: list[ShardTask]) -> Run:

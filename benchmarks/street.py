@@ -3,9 +3,9 @@
 python benchmarks/street.py
 
 The scenes are dense towns of about 250 primitives, with cameras along their roads. Embree casts one ray per pixel at
-the whole mesh, in which ellipsoids consist of facets. Its search tree is built once per scene, like the triangles of
-this project's renderer. This project's renderer also returns normals and intersects ellipsoids exactly. Times are CPU
-seconds of one thread; the target is 250 ms per frame.
+the whole mesh, in which ellipsoids consist of facets. The search tree of embree is built once per scene, like the
+triangles of this project's renderer. This project's renderer also returns normals and intersects ellipsoids exactly.
+Times are CPU seconds of one thread; the target is 250 ms per frame.
 """
 
 from __future__ import annotations

@@ -4,10 +4,11 @@
     jobs/export_scenes.py --input DIR --formats glb xodr
     jobs/export_scenes.py --max-scenes 10 --formats ply npz --output DIR
 
-glb is glTF 2.0 with one named node per primitive; class, instance and exact parameters are in the extras of the node.
-ply is one mesh with a colour, class id and primitive number per vertex. npz contains 256 x 256 x 32 voxels of class
-ids, which import_scenes and evaluate_voxels read. xodr contains the roads as OpenDRIVE 1.7 with lanes, elevation and
-junctions, for simulators. The job writes OUTPUT/<format>/<scene_id>.<format> and keeps existing files.
+A GLB file (glTF 2.0) has one named node per primitive; class, instance and exact parameters are in the extras of the
+node. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x 32
+voxels of class ids, which import_scenes and evaluate_voxels read. An XODR file has the roads as OpenDRIVE 1.7 with
+lanes, elevation and junctions, for simulators. The job writes OUTPUT/<format>/<scene_id>.<format> and keeps existing
+files.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Scenes, networks and their mathematics, built on torch, numpy and scipy.
 
-This package does not import Ray. It imports diffusers only when a function needs it.
+This package does not import Ray. The import of diffusers happens only when a function needs diffusers.
 """
 
 from importlib import import_module

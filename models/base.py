@@ -177,7 +177,7 @@ class ConfiguredModel(nn.Module):
         """Write config.json and diffusion_pytorch_model.safetensors into a directory.
 
         Args:
-            directory: Output directory. It is created if it does not exist.
+            directory: Output directory. The directory is created if it does not exist.
         """
         path = Path(directory)
         path.mkdir(parents=True, exist_ok=True)

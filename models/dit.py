@@ -1,9 +1,9 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
 The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
-`DiTTransformer2DModel` of diffusers embeds timestep and label again in every block, which makes it 8 % larger. That
-class also drops labels for guidance independently per block, so its unconditional branch is never trained. Here, each
-sample has one embedding and one dropout mask for the whole network.
+`DiTTransformer2DModel` of diffusers embeds timestep and label again in every block, which makes it 8 % larger.
+`DiTTransformer2DModel` also drops labels for guidance independently per block, so its unconditional branch is never
+trained. Here, each sample has one embedding and one dropout mask for the whole network.
 """
 
 from __future__ import annotations
@@ -225,8 +225,8 @@ class DiT(ConfiguredModel):
             label: Class indices.
 
         Returns:
-            A list: shifts, scales and gates (b, 6 d) of every block; shift and scale (b, 2 d) of the output; factors
-            (b, 2) of latent and network output in the predicted noise.
+            List of tensors: (b, 6 d) shifts, scales and gates of every block; (b, 2 d) shift and scale of the output;
+            (b, 2) factors of latent and network output in the noise.
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
@@ -273,7 +273,7 @@ class DiT(ConfiguredModel):
             labels: Class indices that will be used, including the null label if guidance needs it.
 
         Returns:
-            A denoiser. It raises IndexError for other timesteps or labels.
+            A denoiser. The denoiser raises IndexError for other timesteps or labels.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
         labels = sorted(set(labels))
@@ -307,8 +307,8 @@ class DiT(ConfiguredModel):
         for block, modulation in zip(self.blocks, of_blocks, strict=True):
             x = block(x, modulation)
         shift, scale = of_output.chunk(2, dim=1)
-        x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c)
-        x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c)
+        x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c).
+        x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c).
         x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
         if self.config.prediction == "epsilon":
             return x

@@ -29,8 +29,8 @@ INITIAL_LOGVAR = -4.0
 SOLVED_LOGVAR = -8.0  # sigma 0.018, for a ground branch with a closed-form shortcut (models/vae/ground.py)
 
 BRANCHES = ("both", "ground", "objects")
-OBJECT_DECODER = "object_decoder."  # prefix of parameter names
-EMPTY_LOGIT = -6.0  # occupancy logit of a model without a ground branch
+OBJECT_DECODER = "object_decoder."  # Prefix of parameter names.
+EMPTY_LOGIT = -6.0  # Occupancy logit of a model without a ground branch.
 
 
 def compute_clamped_logit(probability: Tensor) -> Tensor:
@@ -146,8 +146,8 @@ class LayoutVAE(ConfiguredModel):
     def freeze_all_but_object_decoder(self, state: dict[str, Tensor]) -> None:
         """Load the weights of another model with the same encoders, and train only the object decoder.
 
-        Both models then encode a scene to the same latent. A diffusion transformer that was trained on the latents of
-        the other model remains valid.
+        This model and the other one then encode a scene to the same latent. A diffusion transformer that was trained on
+        the latents of the other model remains valid.
 
         Args:
             state: State dict of the other model; its object decoder is ignored.

@@ -164,7 +164,7 @@ class PrITTIPipeline:
         """Write model_index.json and one directory per component.
 
         Args:
-            directory: Output directory. It is created if it does not exist.
+            directory: Output directory. The directory is created if it does not exist.
         """
         path = Path(directory)
         self.lvae.save_pretrained(path / "lvae")
@@ -499,7 +499,7 @@ class PrITTIPipeline:
             run: Run name, which is part of the scene ids.
             generator: Generator that draws the seed, or one generator per scene. A generator replaces `seed`.
             callback_on_step_end: Function that is called as f(pipeline, step, timestep, {"latents": ...}) after each
-                step. It returns such a dict with the latents for the next step.
+                step. The function returns such a dict with the latents for the next step.
             noise_scaling: Divisor of the predicted noise (default: the pipeline's).
             existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
 

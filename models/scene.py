@@ -247,10 +247,10 @@ class Scene:
     sequence: str
     frame: int
     split: str
-    category: np.ndarray  # (n,) int8, index into CATEGORIES
+    category: np.ndarray  # (n,) int8, index into CATEGORIES.
     center_m: np.ndarray  # (n, 3) float32
     rotation: np.ndarray  # (n, 3, 3) float32
-    size_m: np.ndarray  # (n, 3) float32: length, width, height
+    size_m: np.ndarray  # (n, 3) float32: length, width, height.
     ground_classes: tuple[str, ...]  # (G,) names from GROUND_CLASSES
     height_m: np.ndarray  # (G, H, W) float32
     occupied: np.ndarray  # (G, H, W) bool
@@ -258,7 +258,7 @@ class Scene:
     existence: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) float32; default: 1
     heading_rad: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) float32; default: NaN
     instance_id: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) int64; default: -1
-    label: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) str; default: name of the category
+    label: np.ndarray = field(default_factory=lambda: UNSET)  # (n,) str; default: name of the category.
     world_xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     world_yaw_rad: float = 0.0
     world_from_imu: np.ndarray | None = None

@@ -152,7 +152,7 @@ def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], devi
 def sample_corruption(
     generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
 ) -> Tensor:
-    """Draw normal noise whose standard deviation is |N(0, spread^2)|, drawn once per sample.
+    """Draw normal noise; the standard deviation of each sample is a random number |N(0, spread^2)|.
 
     Args:
         generators: One generator per sample.
@@ -398,7 +398,7 @@ class Trainer:
         `state.json` is written last.
 
         Args:
-            directory: Output directory. It is created if it does not exist.
+            directory: Output directory. The directory is created if it does not exist.
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)

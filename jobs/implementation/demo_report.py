@@ -133,7 +133,7 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
             draw_scene_pictures(
                 "Scenes of the released model",
                 "These weights are included in the package (models/weights/town). "
-                "Their training was longer than the demo's.",
+                "The training of these weights was longer than the demo's.",
                 select_one_per_label(list(read_scenes(home_path("released"), "generated-samples")), SHOWN),
                 "generated",
             )
@@ -170,7 +170,7 @@ def draw_outpainting_pictures(scene: Scene) -> Pictures:
             ),
         ],
         columns=2,
-        note="A generated scene is extended in two passes: four sides, then four corners. Each block overlaps the  "
+        note="A generated scene is extended in two passes: four sides, then four corners. Each block overlaps the "
         "known region by half.",
     )
 

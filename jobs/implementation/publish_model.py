@@ -30,8 +30,8 @@ from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import read_scenes
 from pipelines.training.latents import digest_weights
 
-SHOWN = 32  # number of scenes on the card, taken from the first
-JUDGED = 256  # number of scenes from which the scenes with most faults are selected
+SHOWN = 32  # Number of scenes on the card, taken from the first.
+JUDGED = 256  # Number of scenes from which the scenes with most faults are selected.
 FAILURES = 8
 CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
 
@@ -159,7 +159,7 @@ def find_training(experiment: str, stage: str, digest: str, parameters: int | No
         if record := read_published_training(digest):
             return TrainingRecord(**{**record, "stage": stage})
         raise ValueError(
-            f"no MLflow run of {experiment} in {hide_credentials(uri)} trained these weights ({digest});  "
+            f"no MLflow run of {experiment} in {hide_credentials(uri)} trained these weights ({digest}); "
             "set MLFLOW_TRACKING_URI"
         )
     found, tracker = runs[0], Tracker(uri, runs[0].info.run_id)

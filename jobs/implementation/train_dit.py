@@ -190,8 +190,8 @@ class Start:
     """Trained weights from which a run starts."""
 
     digest: str
-    normalisation: dict  # shift and scale of the latents for these weights
-    sampling: dict  # noise scaling and existence threshold of their pipeline
+    normalisation: dict  # Shift and scale of the latents for these weights.
+    sampling: dict  # Noise scaling and existence threshold of their pipeline.
     state: dict[str, Tensor]
 
 

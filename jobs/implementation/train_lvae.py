@@ -169,7 +169,7 @@ def load_kept_weights(model: str, architecture: dict, spec: LayoutSpec) -> Kept:
     for (key, built), (_, wanted) in zip(list_kept_options(lvae.config), list_kept_options(architecture), strict=True):
         if built != wanted:
             raise ValueError(
-                f"--train-object-decoder-of {model}: its {key} is {built}, but that of this preset is {wanted};  "
+                f"--train-object-decoder-of {model}: its {key} is {built}, but that of this preset is {wanted}; "
                 "use the preset of this pipeline"
             )
     if lvae.spec.fingerprint() != spec.fingerprint():

@@ -18,11 +18,11 @@ RAY_ENVIRONMENT = {
     "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
     "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
     "RAY_TRAIN_ENABLE_PREEMPTION_WATCHER": "0",
-    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # importing torch takes a minute on a busy machine or slow disk
+    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",  # Importing torch takes a minute on a busy machine or slow disk.
     # Without this value, Ray kills the reader process after every read if there are few CPUs. The next reader
     # process then needs 10 s for imports.
     "RAY_idle_worker_killing_time_threshold_ms": "300000",
-    "OMP_WAIT_POLICY": "PASSIVE",  # if another process is busy, spinning threads make torch five times slower
+    "OMP_WAIT_POLICY": "PASSIVE",  # If another process is busy, spinning threads make torch five times slower.
     # By default, glibc returns the memory of every large tensor to the kernel. The resulting page faults take 10 to
     # 20 % of a training step on the CPU.
     "MALLOC_MMAP_MAX_": "0",

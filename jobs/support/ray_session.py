@@ -27,8 +27,8 @@ def start_ray(training: bool = False) -> None:
     context.print_on_execution_start = False
     context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `find_root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # jobs show their own progress bars
-    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # these errors are also raised
+    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # Jobs show their own progress bars.
+    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # These errors are also raised.
         logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
 

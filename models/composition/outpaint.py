@@ -29,8 +29,8 @@ from models.sampling.repaint import RePaintConfig
 from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
 from models.tensors import make_empty_scene
 
-BlockIndex = tuple[int, int]  # (i, j) of a block: steps ahead, steps left
-EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # scenes on the model's grid -> latents (b, c, h, w)
+BlockIndex = tuple[int, int]  # (i, j) of a block: steps ahead, steps left.
+EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Scenes on the model's grid -> latents (b, c, h, w).
 
 
 def rank_outward(index: BlockIndex) -> int:

@@ -23,9 +23,9 @@ from scipy.ndimage import distance_transform_edt
 from models.composition.deduplicate import find_regenerated_objects
 from models.scene import Scene, merge_scenes
 
-BLEND_M = 8.0  # largest distance from the seam at which new ground is changed
-MAX_EDGE_SHIFT_M = 2.0  # largest shift of a class's edge
-MAX_SLOPE = 0.08  # rise per metre across the seam; a steeper rise is a decoder's step unless known ground is as steep
+BLEND_M = 8.0  # Largest distance from the seam at which new ground is changed.
+MAX_EDGE_SHIFT_M = 2.0  # Largest shift of a class's edge.
+MAX_SLOPE = 0.08  # Rise per metre across the seam; a steeper rise is a decoder's step unless known ground is as steep.
 
 
 def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:

@@ -7,7 +7,7 @@ entries may be negative.
 The paper does not specify the order and the bounds of the entries. This module uses the row-major order (L00, L10, L11,
 L20, L21, L22). Bounds come from the training split.
 
-The functions use numpy, because none of them needs a gradient. They accept any leading batch shape.
+The functions use numpy, because none of them needs a gradient. The functions accept any leading batch shape.
 """
 
 from __future__ import annotations

@@ -10,11 +10,11 @@ one code per box and has one box per code.
 * Cholesky factor of the scatter matrix: This encoding is continuous and has one code per box, but not one box per code.
   If two extents are equal, the scatter matrix does not determine the angle in their plane. If two extents l and w are
   similar, noise d in S rotates the box by atan(2 d / |l - w|) / 2.
-* octahedral: The code consists of the scatter matrix S = sum_j s_j v_j v_j^T and the frame tensor T = sum_j v_j (x) v_j
-  (x) v_j (x) v_j. S and T are polynomials that do not depend on the order and the signs of the axes. Equal boxes
-  therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries of a cube. T
-  therefore determines the three axes for all extents, also for cubes. S then gives the extent along each axis. The
-  octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
+* octahedral: The code consists of the scatter matrix S and the frame tensor T of the box. S is sum_j s_j v_j v_j^T, and
+  T is sum_j v_j (x) v_j (x) v_j (x) v_j. S and T are polynomials that do not depend on the order and the signs of the
+  axes. Equal boxes therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries
+  of a cube. T therefore determines the three axes for all extents, also for cubes. S then gives the extent along each
+  axis. The octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
 
 T is symmetric and has 15 distinct entries. The trace part of T is constant, because the v_j are orthonormal. The
 remaining traceless part has nine entries, the spherical harmonics of degree four. These harmonics represent cross
@@ -42,8 +42,8 @@ from models.geometry.cholesky import (
     decode_cholesky_boxes,
 )
 
-TRACE_PART = 3 / 5  # the mean over the unit sphere of sum_j (v_j . x)^4
-STARTS, ROUNDS = 4, 12  # starts and iterations of the frame search; tests/unit/test_ablation.py checks them
+TRACE_PART = 3 / 5  # The mean over the unit sphere of sum_j (v_j . x)^4.
+STARTS, ROUNDS = 4, 12  # Starts and iterations of the frame search; tests/unit/test_ablation.py checks them.
 
 
 class Encoding(NamedTuple):

@@ -22,9 +22,9 @@ import numpy as np
 
 from models.scene import Scene
 
-GROWTH = 1e-9  # enlargement of B as a share of the largest extent of a pair
-PARALLEL = 1e-12  # sine of the angle below which two faces have no common line
-PAIRS_PER_CHUNK = 4096  # fastest of 256 to 16384 on two AVX2 cores
+GROWTH = 1e-9  # Enlargement of B as a share of the largest extent of a pair.
+PARALLEL = 1e-12  # Sine of the angle below which two faces have no common line.
+PAIRS_PER_CHUNK = 4096  # Fastest of 256 to 16384 on two AVX2 cores.
 BALL_POINTS = 4096
 CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
@@ -193,8 +193,8 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     Arrays have shape (..., n): the last axis is the pair.
     """
     rotation_a, rotation_b = np.moveaxis(a.rotation, 0, -1), np.moveaxis(b.rotation, 0, -1)
-    axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n): a_i . b_j
-    offset = np.einsum("kjn,nk->jn", rotation_b, b.center_m - a.center_m)  # (3, n): B's centre along B's axes
+    axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n): a_i . b_j.
+    offset = np.einsum("kjn,nk->jn", rotation_b, b.center_m - a.center_m)  # (3, n): B's centre along B's axes.
     half_a, half_b = a.size_m.T / 2, b.size_m.T / 2
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
     center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n): B's centre along A's axes
@@ -242,12 +242,12 @@ def _clip_crossing_edges(
     total = np.zeros(half_a.shape[1])
     sign_b = np.array([-1.0, 1.0])[None, :, None]
     for i, k, l in CYCLIC:  # noqa: E741
-        plane_a = _list_signs(half_a[i])[:, None]  # (2, 1, n): x_i on the two faces of A
+        plane_a = _list_signs(half_a[i])[:, None]  # (2, 1, n): x_i on the two faces of A.
         for j, *others in CYCLIC:
             sine = np.hypot(axes[k, j], axes[l, j])
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
-            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # normal of the line within A's face
+            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # Normal of the line within A's face.
             # rho (2, 2, n): signed distance of the line from the foot of A's centre; x = rho normal + tau tangent.
             rho = (offset[j] + _list_signs(half_b[j])[None] - axes[i, j] * plane_a) * inverse
             clip = _Clip(-np.inf, np.inf)

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # latent, timestep (b,), label (b,) -> noise
-SceneKey = int | tuple[int, ...]  # a scene's index, or several numbers that identify it
-OnStep = Callable[[int, int, Tensor], Tensor]  # step, timestep, latent -> latent for the next step
+Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # Latent, timestep (b,), label (b,) -> noise.
+SceneKey = int | tuple[int, ...]  # A scene's index, or several numbers that identify it.
+OnStep = Callable[[int, int, Tensor], Tensor]  # Step, timestep, latent -> latent for the next step.
 
 
 @dataclass(frozen=True)
@@ -366,7 +366,7 @@ def sample_with_scheduler(
     Args:
         model: Model that predicts the noise.
         scheduler: A SchedulerMixin after its `set_timesteps`. A scheduler that adds noise must accept the noise as an
-            argument, so that the noise stays keyed per scene.
+            argument, so that the noise is keyed per scene.
         noise: Random numbers of the scenes.
         label: Class index of each scene.
         on_step: Function that is called after every evaluation of the model and returns the latent for the next step.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-NUM_INFERENCE_STEPS = 250  # paper, supplement B.3
-JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper, supplement B.3
+NUM_INFERENCE_STEPS = 250  # Paper, supplement B.3.
+JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper, supplement B.3.
 
 
 def repaint_transitions(

@@ -1,9 +1,9 @@
 """The paper's study "Cholesky vs. quaternion" (supplement): how well a small autoencoder reconstructs one box.
 
 The study compares encodings of the box (models/geometry/encodings.py). The autoencoder is a small object branch of the
-layout VAE with one slot and one query. It is trained to reconstruct the code of a box with an L1 loss. The networks of
-different encodings differ only in their first and last linear layers. Boxes are centred at zero, and the centre is not
-predicted.
+layout VAE with one slot and one query. The autoencoder is trained to reconstruct the code of a box with an L1 loss. The
+networks of different encodings differ only in their first and last linear layers. Boxes are centred at zero, and the
+centre is not predicted.
 
 For boxes that differ only by yaw, some entries of each code are constant: 2 of 6, 2 of 7 and 9 of 15. The L1 gradient
 of an entry does not shrink with its error, so constant entries disturb the training. The study therefore regresses
@@ -35,8 +35,8 @@ from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
 NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
-MARGIN = 0.05  # share of an entry's range added on both sides, because a sigmoid does not reach 0 and 1
-STILL, LEAST_RANGE = 1e-6, 1.0  # an entry with a smaller range than STILL is constant and gets LEAST_RANGE
+MARGIN = 0.05  # Share of an entry's range added on both sides, because a sigmoid does not reach 0 and 1.
+STILL, LEAST_RANGE = 1e-6, 1.0  # An entry with a smaller range than STILL is constant and gets LEAST_RANGE.
 
 
 # ------------------------------------------------------------------------------------------------------- boxes
@@ -70,7 +70,7 @@ class BoxDistribution:
 
 
 THINGS = {
-    "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # the paper's study
+    "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # The paper's study.
     # For square footprints, the scatter matrix does not determine the yaw.
     "any": BoxDistribution((1.0, 6.0), (0.4, 1.0), (0.5, 4.0)),
 }
@@ -82,7 +82,7 @@ def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
     With the same key, the first n boxes of a larger draw equal the draw of n boxes.
 
     Args:
-        things: Distribution of the sizes.
+        things: Distribution of the box sizes.
         count: Number of boxes.
         *key: Integers that key the random numbers.
 

@@ -29,10 +29,10 @@ SPARE = 16  # proposals per slot, if MAX_PER_CELL allows it: many primitives can
 class CellDecoder(nn.Module):
     """Decode an object latent to features and existence logits of `proposals[k]` primitives per category k.
 
-    Features are normalised to [0, 1]. There are SPARE proposals per slot, within the limits of `min_proposals_per_cell`
-    and MAX_PER_CELL proposals per cell and category. The minimum number of proposals exists because rare objects also
-    occur in groups. One small network decodes each cell separately, because the encoder writes a primitive into one
-    cell only.
+    Features are normalised to [0, 1]. The decoder makes SPARE proposals per slot. The number of proposals per cell and
+    category is limited to the range from `min_proposals_per_cell` to MAX_PER_CELL. The minimum number of proposals
+    exists because rare objects also occur in groups. One small network decodes each cell separately, because the
+    encoder writes a primitive into one cell only.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:

@@ -147,9 +147,9 @@ class ObjectEncoder(nn.Module):
     A cell is the sum of a learned value and the mean of the features of its primitives. Padded slots are masked in the
     attention and are not scattered.
 
-    With `shortcut`, a small network also maps each primitive to a term of the mean. Its inputs are the position in the
-    cell, the shape and the category. This network bypasses the transformer, whose normalisations reduce the numerical
-    precision. The paper has no shortcut.
+    With `shortcut`, a small network also maps each primitive to a term of the mean. The inputs of this network are the
+    position in the cell, the shape and the category. This network bypasses the transformer, whose normalisations reduce
+    the numerical precision. The paper has no shortcut.
     """
 
     slot_category: Tensor

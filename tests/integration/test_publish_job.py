@@ -158,7 +158,7 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     first.save_pretrained(more / "dit")
     sampling = load_pipeline(complete(str(more))).config
     assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights
-    with pytest.raises(ValueError, match=r"its label is vegetation, this run's vehicle"):
+    with pytest.raises(ValueError, match=r"its label is vegetation, but that of this run is vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
         prepare(Config(preset="smoke", name="other", start_from="town"))
