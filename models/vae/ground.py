@@ -95,8 +95,8 @@ def init_from_data(
 
     The shortcuts become the principal components of each cell's `compute_smooth_maps`, scaled to unit variance. Signed
     distances are converted to logits. The outputs of the networks start at zero. On the town at 256 pixels, the initial
-    ground IoU is 99.4 % (BENCHMARKS.md). If the decoder's shortcut reads the joint latent, its weights for the object
-    channels become zero.
+    ground IoU is 99.4 % (docs/experiments/linear_ground_start.md). If the decoder's shortcut reads the joint latent,
+    its weights for the object channels become zero.
 
     Args:
         encoder: Encoder to initialise.
