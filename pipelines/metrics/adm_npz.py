@@ -1,8 +1,9 @@
-"""Pictures in ADM's .npz sample batches, read and written in pieces, and the moments of its reference batches.
+"""Read and write pictures in ADM's .npz sample batches, and read the moments of its reference batches.
 
-ADM (guided-diffusion, evaluations/) keeps N pictures as array `arr_0`, uint8 (N, height, width, 3); its reference
-batches also hold the whole dataset's `mu`, `sigma` (pool3) and `mu_s`, `sigma_s` (spatial features). Its evaluator
-reads what `write_npz` writes.
+ADM (guided-diffusion, evaluations/) keeps N pictures as array `arr_0`, uint8 (N, height, width, 3). Its reference
+batches also hold the moments of the whole dataset: `mu` and `sigma` of pool3 features, `mu_s` and `sigma_s` of spatial
+features. ADM's evaluator reads the files of `write_npz`. Pictures are read and written in batches, so that one batch is
+in memory at a time.
 """
 
 from __future__ import annotations
@@ -26,8 +27,15 @@ PICTURES = "arr_0"
 
 
 class ReferenceMoments(NamedTuple):
-    pool3: StoredGaussian  # 2048-d
-    spatial: StoredGaussian | None  # 2023-d; None in files of other evaluators, which hold `mu` and `sigma` only
+    """Mean and covariance of the features of an ADM reference batch.
+
+    Attributes:
+        pool3: Moments of the pool3 features, 2048-d.
+        spatial: Moments of the spatial features, 2023-d. Other evaluators store `mu` and `sigma` only; then it is None.
+    """
+
+    pool3: StoredGaussian
+    spatial: StoredGaussian | None
 
 
 # -------------------------------------------------------------------------------------------------------- reading
@@ -35,7 +43,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """Open the archive. Raises ValueError naming a missing, truncated or damaged file, also during reading."""
+    """Open an archive; raise ValueError with the path for a missing, truncated or damaged file, also during reading."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
@@ -43,12 +51,16 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, pa.ArrowInvalid) as error:
-        raise ValueError(f"{path}: damaged or not an .npz archive ({error}); copy or write it again") from error
+        raise ValueError(f"{path}: damaged or not an .npz archive ({error}); copy or write the file again") from error
 
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Open a C-ordered array: stream at its first number, shape and type. Raises ValueError for any other array."""
+    """Open a C-ordered array: yield its stream at the first number, its shape and its type.
+
+    Raises:
+        ValueError: The array is missing, pickled, in Fortran order or of the wrong size.
+    """
     if f"{name}.npy" not in archive.namelist():
         raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
     with archive.open(f"{name}.npy") as stream:
@@ -59,17 +71,29 @@ def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tupl
         except (ValueError, KeyError) as error:
             raise ValueError(f"{path}: {name} is not a plain numpy array ({error})") from error
         if dtype.hasobject:
-            raise ValueError(f"{path}: {name} holds pickled objects, which are never read; save it as plain numbers")
+            raise ValueError(
+                f"{path}: {name} holds pickled objects; they are not read, so save the array as plain numbers"
+            )
         if fortran and len(shape) > 1:
-            raise ValueError(f"{path}: {name} is in Fortran order; save numpy.ascontiguousarray of it")
+            raise ValueError(f"{path}: {name} is in Fortran order; save numpy.ascontiguousarray(array)")
         needed, held = math.prod(shape) * dtype.itemsize, archive.getinfo(f"{name}.npy").file_size - stream.tell()
         if held != needed:
-            raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write it again")
+            raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write the file again")
         yield cast(zipfile.ZipExtFile, stream), shape, dtype
 
 
 def read_picture_shape(path: str) -> tuple[int, int, int, int]:
-    """(N, height, width, 3) of the pictures in an ADM .npz, checked without reading them; ValueError as below."""
+    """Return the shape of the pictures in an ADM .npz without reading the pictures.
+
+    Args:
+        path: Local path or URI of the archive.
+
+    Returns:
+        (N, height, width, 3).
+
+    Raises:
+        ValueError: The file is missing, damaged or of another type. The message names the file.
+    """
     with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (_, shape, dtype):
         if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3:
             raise ValueError(
@@ -90,7 +114,7 @@ def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
 
     Raises:
         ValueError: The file is missing, truncated, of another type or pickled (raised immediately), or its checksum is
-            wrong (raised while reading). The message names the file.
+            wrong (raised during reading). The message names the file.
     """
     if batch < 1:
         raise ValueError(f"a batch holds at least 1 picture, got {batch}")
@@ -102,21 +126,32 @@ def _iterate_batches(path: str, shape: tuple[int, int, int, int], batch: int) ->
         for start in range(0, shape[0], batch):
             pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
             if (read := stream.readinto(pictures.data)) != pictures.nbytes:
-                raise ValueError(f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write it again")
+                raise ValueError(
+                    f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write the file again"
+                )
             yield pictures
 
 
 def read_reference_moments(path: str) -> ReferenceMoments | None:
-    """Precomputed moments of an ADM reference batch, float64; None if it holds pictures only.
+    """Return the precomputed moments of an ADM reference batch as float64.
 
-    ValueError naming the file if they are incomplete, of other sizes or not finite.
+    Args:
+        path: Local path or URI of the archive.
+
+    Returns:
+        Moments, or None if the file holds pictures only.
+
+    Raises:
+        ValueError: The moments are incomplete, of other sizes or not finite. The message names the file.
     """
     with _open_npz(path) as archive:
         held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if f"{name}.npy" in archive.namelist()}
         if not held:
             return None
         if held not in ({"mu", "sigma"}, {"mu", "sigma", "mu_s", "sigma_s"}):
-            raise ValueError(f"{path}: holds {sorted(held)} only; mean and covariance (mu, sigma) go together")
+            raise ValueError(
+                f"{path}: holds {sorted(held)} only; a mean (mu) and its covariance (sigma) are needed together"
+            )
         pool3 = StoredGaussian(
             _read_numbers(archive, "mu", (FEATURES,), path), _read_numbers(archive, "sigma", (FEATURES,) * 2, path)
         )
@@ -132,7 +167,7 @@ def read_reference_moments(path: str) -> ReferenceMoments | None:
 def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
     with _read_array(archive, name, path) as (stream, found, dtype):
         if found != shape or dtype.kind != "f":
-            raise ValueError(f"{path}: {name} is {dtype} {found}, features of this network need floats {shape}")
+            raise ValueError(f"{path}: {name} is {dtype} {found}, but features of this network need floats {shape}")
         numbers = np.frombuffer(stream.read(), dtype).reshape(shape).astype(np.float64)
     if not np.isfinite(numbers).all():
         raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
@@ -143,9 +178,17 @@ def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], p
 
 
 def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
-    """An ADM sample batch of `count` pictures, from uint8 arrays (n, height, width, 3); one in memory at a time.
+    """Write an ADM sample batch, with one batch of pictures in memory at a time.
 
-    The file appears whole or not at all. ValueError if the batches differ in size or do not add up to `count`.
+    The file appears only when it is complete.
+
+    Args:
+        path: Local path or URI of the new archive.
+        batches: uint8 arrays (n, height, width, 3) of one picture size.
+        count: Total number of pictures.
+
+    Raises:
+        ValueError: The batches differ in picture size, hold no pictures, or do not add up to `count` pictures.
     """
     batches = iter(batches)
     first = next(batches, None)
@@ -155,8 +198,8 @@ def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
 
     def write(file) -> None:
         written = 0
-        # Compressed: pictures in flat colours shrink thirtyfold. zip64, since nothing says beforehand that an entry
-        # exceeds 2 GiB.
+        # Compression reduces pictures in flat colours to a thirtieth of their size. zip64 must be chosen before the
+        # size of the entry is known, and an entry may exceed 2 GiB.
         with (
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
             archive.open(f"{PICTURES}.npy", "w", force_zip64=True) as stream,
@@ -172,6 +215,6 @@ def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
                 written += len(pictures)
                 stream.write(np.ascontiguousarray(pictures).data)
             if written != count:
-                raise ValueError(f"{path}: got {written} pictures, {count} were announced")
+                raise ValueError(f"{path}: got {written} pictures, expected {count}")
 
     write_whole(path, write)

@@ -1,8 +1,9 @@
-"""Describe layouts by histograms per scene, and measure how far two sources differ; without pictures or weights.
+"""Describe layouts by histograms per scene, and measure the distance of two sources without pictures or weights.
 
-A scene gives a vector of counts over fixed bins. Vectors add up to the histogram of a source, and resampled scenes to
-its draws. Sources differ by the Wasserstein distance in the histogram's unit, or by the Jensen-Shannon divergence in
-bits if bins have no order. The bin width limits the resolution; bins are narrow where objects are small.
+A scene gives a vector of counts over fixed bins. The sum over the scenes of a source is the histogram of the source.
+Sums over resampled scenes give the confidence interval. Two histograms are compared by the Wasserstein distance in the
+unit of the histogram. If the bins have no order, the Jensen-Shannon divergence in bits replaces it. The bin width
+limits the resolution, so bins are narrow where objects are small.
 """
 
 from __future__ import annotations
@@ -22,12 +23,18 @@ PAIR_EDGES_M = np.geomspace(0.25, 100, 33)
 ROAD_DISTANCE_EDGES_M = np.linspace(0, 40, 41)
 ROAD_WIDTH_EDGES_M = np.linspace(0, 40, 81)
 NO_GROUND = "none"
-MIN_ROAD_WIDTH_M = 2.0  # narrower stretches are frayed borders
+MIN_ROAD_WIDTH_M = 2.0  # Narrower widths come from rough borders of the road.
 
 
 @dataclass(frozen=True, eq=False)
 class Histogram:
-    """A named histogram: `edges` in metres (values beyond go to the end bins), or `bins` by name."""
+    """A named histogram over lengths or over named bins.
+
+    Attributes:
+        name: Name of the histogram, such as pole.height_m.
+        edges: Edges of the bins (m). The end bins also count values beyond the outer edges. None for named bins.
+        bins: Names of the bins, if the bins have no order.
+    """
 
     name: str
     edges: np.ndarray | None = None
@@ -38,10 +45,18 @@ class Histogram:
 
     @property
     def unit(self) -> str:
+        """Return the unit of distances between two such histograms."""
         return "bits" if self.edges is None else "m"
 
     def count(self, values: np.ndarray) -> np.ndarray:
-        """(bins,) int64 of values in metres, or of bin numbers."""
+        """Count values per bin.
+
+        Args:
+            values: Values (m), or bin numbers for named bins.
+
+        Returns:
+            (bins,) int64 counts.
+        """
         if self.edges is not None:
             values = np.searchsorted(self.edges[1:-1], values, side="right")
         return np.bincount(values, minlength=len(self))
@@ -62,10 +77,17 @@ ENDS = np.cumsum([len(histogram) for histogram in HISTOGRAMS])
 
 
 def compute_scene_histograms(scene: Scene) -> np.ndarray:
-    """(ENDS[-1],) uint32 counts of one scene over the bins of HISTOGRAMS, side by side.
+    """Count the values of one scene over the bins of HISTOGRAMS.
 
-    Per category: extents; the ground class under the centre; distance of the centre from the nearest road pixel, where
-    the scene has road; distances between the centres of each pair, seen from above. And widths of the road.
+    Each category has four kinds of values: extents of the primitives, ground class under the centre, distance of the
+    centre from the nearest road pixel, and horizontal distance between the centres of each pair. A scene without road
+    has no distances to the road. The last histogram holds the widths of the road.
+
+    Args:
+        scene: Scene to describe.
+
+    Returns:
+        (ENDS[-1],) uint32 counts, one histogram after the other.
     """
     width_m, to_road_m = measure_road_widths(scene)
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
@@ -85,7 +107,14 @@ def compute_scene_histograms(scene: Scene) -> np.ndarray:
 
 
 def compute_pair_distances(xy_m: np.ndarray) -> np.ndarray:
-    """(n (n - 1) / 2,) distances between points (n, 2)."""
+    """Return the distances between all pairs of points.
+
+    Args:
+        xy_m: (n, 2) points (m).
+
+    Returns:
+        (n (n - 1) / 2,) distances (m).
+    """
     first, second = np.triu_indices(len(xy_m), 1)
     return np.hypot(*(xy_m[first] - xy_m[second]).T.astype(np.float64))
 
@@ -93,11 +122,14 @@ def compute_pair_distances(xy_m: np.ndarray) -> np.ndarray:
 def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
     """Measure the widths of the road along its middle.
 
-    The middle is the local maxima of the distance from the road's border, and the width is twice that distance. The
-    scene's edge is not a border.
+    The middle is the local maxima of the distance from the border of the road, and the width is twice that distance.
+    The edge of the scene is not a border.
+
+    Args:
+        scene: Scene with rasters of its ground classes.
 
     Returns:
-        (p,) widths in metres, and (H, W) distance of each pixel from the road in metres; None without a road.
+        (p,) widths (m), and (H, W) distance of each pixel from the road (m). The latter is None without road.
     """
     road = np.zeros(scene.occupied.shape[1:], bool)
     if "road" in scene.ground_classes:
@@ -117,9 +149,14 @@ def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
-    """By name, the distance of each histogram in its unit, from scenes (n, bins) and (m, bins).
+    """Compute the distance between two sources for each histogram.
 
-    A histogram that is empty on either side is left out.
+    Args:
+        real: (n, bins) counts of real scenes.
+        generated: (m, bins) counts of generated scenes.
+
+    Returns:
+        Distance by name of the histogram, in its unit. A histogram that is empty on either side has no entry.
     """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
@@ -136,7 +173,15 @@ def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict
 
 
 def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
-    """By category, the Wasserstein distance of its numbers per scene, in objects; counts (n, 11) and (m, 11)."""
+    """Compute the Wasserstein distance of the number of objects per scene, for each category.
+
+    Args:
+        real: (n, 11) objects of each category in real scenes.
+        generated: (m, 11) objects of each category in generated scenes.
+
+    Returns:
+        Distance by category (objects).
+    """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
     for index, category in enumerate(CATEGORIES):
@@ -148,23 +193,55 @@ def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str
 
 
 def normalize_histogram(counts: np.ndarray) -> np.ndarray:
-    """Rows (b, bins) of sum 1; NaN for a row of zeros."""
+    """Scale each histogram to sum 1.
+
+    Args:
+        counts: (b, bins) histograms in rows.
+
+    Returns:
+        (b, bins) rows of sum 1; NaN for a row of zeros.
+    """
     total = counts.sum(axis=1, keepdims=True)
     return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
 
 
 def compute_wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(b,) W1 distance of distributions (b, bins), mass at the middles of the bins, in the unit of the edges."""
+    """Compute the Wasserstein-1 distance of distributions, with the mass of a bin at its middle.
+
+    Args:
+        p: (b, bins) distributions.
+        q: (b, bins) distributions.
+        edges: (bins + 1,) edges of the bins.
+
+    Returns:
+        (b,) distances in the unit of the edges.
+    """
     step = np.diff((edges[1:] + edges[:-1]) / 2)
     return (np.abs(np.cumsum(p - q, axis=1)[:, :-1]) * step).sum(axis=1)
 
 
 def compute_jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(b,) divergence in bits, in [0, 1], of distributions (b, bins)."""
+    """Compute the Jensen-Shannon divergence of distributions.
+
+    Args:
+        p: (b, bins) distributions.
+        q: (b, bins) distributions.
+
+    Returns:
+        (b,) divergences in bits, in [0, 1].
+    """
     return np.clip(
         compute_entropy_bits((p + q) / 2) - (compute_entropy_bits(p) + compute_entropy_bits(q)) / 2, 0.0, 1.0
     )
 
 
 def compute_entropy_bits(p: np.ndarray) -> np.ndarray:
+    """Compute the entropy of distributions over the last axis; 0 log 0 is 0.
+
+    Args:
+        p: (..., bins) distributions.
+
+    Returns:
+        (...) entropies in bits.
+    """
     return -(p * np.log2(np.where(p > 0, p, 1.0))).sum(axis=-1)

@@ -1,6 +1,7 @@
-"""Frechet distance of two sets of features (paper, Sec. 4.1), from moments that add up exactly over parts.
+"""Compute the Frechet distance of two sets of features (paper, Sec. 4.1) from moments that can be added over parts.
 
-float64 throughout. Features come from anywhere; only distances of Inception's pool3 features may be called FID.
+All numbers are float64. Any features may be used, but only the distance of Inception's pool3 features may be called
+FID.
 """
 
 from __future__ import annotations
@@ -13,11 +14,23 @@ from typing import NamedTuple
 import numpy as np
 
 BLOCK_ROWS = 4096
-NEGLIGIBLE = 1e-6  # of the largest singular value: what is below carries rounding and no influence
+NEGLIGIBLE = 1e-6  # Singular values below this share of the largest one are rounding errors without influence.
 
 
 def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray:
-    """features (n, d) as floats, float32 kept; ValueError if not 2-d, of fewer than `at_least` rows, or not finite."""
+    """Check features and convert them to floats; float32 is kept.
+
+    Args:
+        features: (n, d) features.
+        name: Name of the features for the error message.
+        at_least: Minimum number of samples.
+
+    Returns:
+        (n, d) features, float32 or float64.
+
+    Raises:
+        ValueError: Features are not 2-d, have fewer than `at_least` rows, or are not finite.
+    """
     features = np.asarray(features)
     features = features if features.dtype == np.float32 else features.astype(np.float64)
     if features.ndim != 2:
@@ -31,15 +44,26 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
 
 
 class StoredGaussian(NamedTuple):
-    """Mean and covariance of a set of features, for `frechet.compute_frechet_distance`."""
+    """Mean and covariance of a set of features, as a file stores them.
 
-    mean: np.ndarray  # (d,) float64
-    covariance: np.ndarray  # (d, d) float64
+    Attributes:
+        mean: (d,) float64.
+        covariance: (d, d) float64.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean (d,) and scatter (d, d) = sum of (x - mean)(x - mean)^T of a set of features. Adds exactly."""
+    """Count, mean and scatter of a set of features. Moments of two sets add up to those of the union.
+
+    Attributes:
+        count: Number of samples.
+        mean: (d,) mean.
+        scatter: (d, d) sum of (x - mean)(x - mean)^T.
+    """
 
     count: int
     mean: np.ndarray
@@ -47,7 +71,11 @@ class Moments:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(d, d), unbiased (divided by count - 1)."""
+        """Return the unbiased covariance (d, d): the scatter divided by count - 1.
+
+        Raises:
+            ValueError: There are fewer than 2 samples.
+        """
         if self.count < 2:
             raise ValueError(f"a covariance needs at least 2 samples, got {self.count}")
         return self.scatter / (self.count - 1)
@@ -62,17 +90,35 @@ class Moments:
         return Moments(count, mean, self.scatter + other.scatter + between)
 
 
-Gaussian = Moments | StoredGaussian  # mean (d,) and covariance (d, d) of features
+Gaussian = Moments | StoredGaussian  # Both have a mean (d,) and a covariance (d, d) of features.
 
 
 def compute_moments(features: np.ndarray) -> Moments:
-    """Moments of features (n, d), n >= 1; block by block, so that no copy in float64 is held."""
+    """Compute the moments of features in blocks, without a float64 copy of all features.
+
+    Args:
+        features: (n, d) features, n >= 1.
+
+    Returns:
+        Moments of all samples.
+
+    Raises:
+        ValueError: Features are empty, not 2-d or not finite.
+    """
     features = check_features(features, "moment", at_least=1)
     starts = range(0, len(features), BLOCK_ROWS)
     return reduce(operator.add, (compute_block_moments(features[start : start + BLOCK_ROWS]) for start in starts))
 
 
 def compute_block_moments(features: np.ndarray) -> Moments:
+    """Compute the moments of one block of features.
+
+    Args:
+        features: (n, d) features, n >= 1.
+
+    Returns:
+        Moments of the block.
+    """
     mean = features.mean(axis=0, dtype=np.float64)
     centred = features - mean
     return Moments(len(features), mean, centred.T @ centred)
@@ -80,18 +126,33 @@ def compute_block_moments(features: np.ndarray) -> Moments:
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """The decomposition behind the distance of two Gaussians of covariances A and B.
+    """Decomposition that gives the distance of two Gaussians with covariances A and B.
 
-    With A = F F^T, AB has the eigenvalues s^2 of the symmetric F^T B F = U s^2 U^T. Two symmetric eigenproblems replace
-    a general sqrtm, whose result may be complex. Rank-deficient covariances are allowed.
+    With A = F F^T, AB has the eigenvalues s^2 of the symmetric matrix F^T B F = U s^2 U^T. Two symmetric eigenproblems
+    replace a general matrix square root, whose result may be complex. Rank-deficient covariances are allowed.
+
+    Attributes:
+        roots: (d,) s.
+        factor: (d, d) F U.
     """
 
-    roots: np.ndarray  # (d,) s
-    factor: np.ndarray  # (d, d) F U
+    roots: np.ndarray
+    factor: np.ndarray
 
 
 def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
-    """Raises ValueError for unequal dimensions and for fewer than 2 samples."""
+    """Decompose the product of two covariances for their Frechet distance.
+
+    Args:
+        a: Gaussian with covariance A.
+        b: Gaussian with covariance B.
+
+    Returns:
+        The decomposition that `Transport` describes.
+
+    Raises:
+        ValueError: The dimensions differ, or a side has fewer than 2 samples.
+    """
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
     covariance_b = b.covariance
@@ -102,17 +163,33 @@ def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
 
 
 def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None = None) -> float:
-    """Squared Frechet distance of the two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (AB)^1/2)."""
+    """Compute the squared Frechet distance of two Gaussians: |mean_a - mean_b|^2 + tr(A + B - 2 (AB)^1/2).
+
+    Args:
+        a: Gaussian with covariance A.
+        b: Gaussian with covariance B.
+        between: Decomposition of A and B, if it is known already.
+
+    Returns:
+        Squared distance, at least 0.
+    """
     between = between or compute_transport(a, b)
     traces = np.trace(a.covariance) + np.trace(b.covariance)
     return float(max(np.square(a.mean - b.mean).sum() + traces - 2 * between.roots.sum(), 0.0))
 
 
 def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
-    """W (d, r) of either side, with the distance's derivative by its covariance I - W W^T.
+    """Return a matrix W (d, r) per side: the distance's derivative by the covariance of that side is I - W W^T.
 
-    With M = F^T B F = U s^2 U^T, W W^T is (B F U) s^-3 (B F U)^T by A,
-    and (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2 by B.
+    With M = F^T B F = U s^2 U^T, the side of A has W W^T = (B F U) s^-3 (B F U)^T. The side of B has
+    W W^T = (F U) s^-1 (F U)^T, which equals A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
+
+    Args:
+        b: Moments with covariance B.
+        between: Decomposition of A and B.
+
+    Returns:
+        W of A and W of B, each (d, r) with r the rank.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]
@@ -122,10 +199,19 @@ def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, 
 def compute_frechet_influence(
     features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray
 ) -> np.ndarray:
-    """(n,) first-order influence of each sample of a side on the distance, with mean zero; `through` is its W.
+    """Compute the first-order influence of each sample of one side on the Frechet distance.
 
-    The mean influence over a resample is the change of the distance. It is unbiased, whereas the Frechet distance of a
-    resample is biased upwards, like every Frechet distance of few samples.
+    The mean influence over a resample approximates the change of the distance without bias. The Frechet distance of the
+    resample itself is biased upwards, like each Frechet distance of few samples.
+
+    Args:
+        features: (n, d) features of the side.
+        own: Moments of the side.
+        other_mean: (d,) mean of the other side.
+        through: (d, r) matrix W of the side, from `compute_influence_maps`.
+
+    Returns:
+        (n,) influences with mean 0.
     """
     values = np.empty(len(features))
     for start in range(0, len(features), BLOCK_ROWS):

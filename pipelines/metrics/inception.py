@@ -1,8 +1,8 @@
-"""Inception features from a local weight file, and random-network features that need none.
+"""Compute Inception features with weights from a local file, and features of a random network without weights.
 
-The network is the one every FID is defined by: TensorFlow's graph of 2015-12-05 (1008 classes), in plain torch. Its
-parameter names are those of pytorch-fid's and torch-fidelity's converted weights, so that either file loads. Nothing
-is ever fetched: the user downloads the file once and names its path.
+The network is TensorFlow's graph of 2015-12-05 (1008 classes) in plain torch; FID is defined by this network. The
+parameter names equal those of the converted weights of pytorch-fid and torch-fidelity, so that both files load. Nothing
+is downloaded: the user downloads the file once and passes its path.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ INPUT_SIZE = 299
 FEATURES, CLASSES = 2048, 1008
 SPATIAL_CHANNELS, SPATIAL_FEATURES = 7, 7 * 17 * 17
 KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's release v0.2.0"
-KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"  # pytorch-fid's file is the same
+# The file of pytorch-fid has the same sha256.
+KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
 
-# A branch is a chain of convolutions (output channels, kernel height x width); SPLIT ends it with a 1x3 and a 3x1
-# side by side. A chain of one step has the branch's name; the steps of others have name_1, name_2, ...
+# A branch is a chain of convolutions (output channels, kernel height, kernel width). SPLIT ends a chain with two
+# parallel convolutions, 1x3 and 3x1. A chain of one step has the name of its branch; the steps of longer chains are
+# called name_1, name_2 and so on.
 SPLIT = "split"
 Chain = tuple[tuple[int, int, int] | str, ...]
 
@@ -61,15 +63,25 @@ CHAINS_7 = {
 
 
 class InceptionFeatures(NamedTuple):
-    """Of n pictures: Tensors out of the network, float32 arrays out of `compute_inception_features`."""
+    """Features of n pictures: tensors from the network, float32 arrays from `compute_inception_features`.
 
-    pool3: Tensor | np.ndarray  # (n, 2048): FID, precision and recall
-    spatial: Tensor | np.ndarray  # (n, 2023), row, column, channel: ADM's sFID, first 7 channels of mixed_6/conv
-    logits: Tensor | np.ndarray  # (n, 1008), without the bias: what ADM's Inception score takes
+    Attributes:
+        pool3: (n, 2048) features for FID, precision and recall.
+        spatial: (n, 2023) features for ADM's sFID: the first 7 channels of mixed_6/conv, in order row, column, channel.
+        logits: (n, 1008) logits without the bias, as ADM's Inception score uses them.
+    """
+
+    pool3: Tensor | np.ndarray
+    spatial: Tensor | np.ndarray
+    logits: Tensor | np.ndarray
 
 
 class Conv(nn.Module):
-    """Convolution without bias, batch norm (eps 1e-3), ReLU. Same size out unless `reduce`: stride 2, no padding."""
+    """Convolution without bias, batch norm (eps 1e-3) and ReLU.
+
+    The output has the size of the input. With `reduce`, the convolution has stride 2 and no padding. Without `pad`, it
+    has stride 1 and no padding.
+    """
 
     def __init__(self, inputs: int, outputs: int, height: int, width: int, reduce: bool = False, pad: bool = True):
         super().__init__()
@@ -78,19 +90,28 @@ class Conv(nn.Module):
         self.bn = nn.BatchNorm2d(outputs, eps=0.001)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply convolution, batch norm and ReLU.
+
+        Args:
+            x: (n, c, h, w) features.
+
+        Returns:
+            (n, outputs, h', w') features.
+        """
         return F.relu(self.bn(self.conv(x)))
 
 
 class Mixed(nn.Module):
-    """Chains of convolutions and a pooled branch side by side.
+    """Inception block: parallel chains of convolutions and a pooled branch, concatenated along the channels.
 
-    With `pool_channels`, the pool keeps the size and a 1x1 convolution follows; without, everything ends in stride 2.
-    The average leaves padding out, and 7c pools by maximum: both as in the TensorFlow graph.
+    With `pool_channels`, the pooling keeps the size and a 1x1 convolution follows. Without `pool_channels`, all
+    branches end in stride 2. Average pooling leaves out the padding, and block 7c pools by maximum. Both rules follow
+    the TensorFlow graph.
     """
 
     def __init__(self, inputs: int, chains: dict[str, Chain], pool_channels: int | None, max_pool: bool = False):
         super().__init__()
-        self.chains: list[list[list[str]]] = []  # per branch, per step: names of modules side by side
+        self.chains: list[list[list[str]]] = []  # Names of the parallel modules, per branch and step.
         self.reduce, self.max_pool = pool_channels is None, max_pool
         self.outputs = 0
         for branch, chain in chains.items():
@@ -114,6 +135,14 @@ class Mixed(nn.Module):
         self.outputs += inputs if pool_channels is None else pool_channels
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply all branches and concatenate their outputs along the channels.
+
+        Args:
+            x: (n, c, h, w) features.
+
+        Returns:
+            (n, self.outputs, h', w') features.
+        """
         branches = []
         for steps in self.chains:
             y = x
@@ -131,7 +160,11 @@ class Mixed(nn.Module):
 
 
 class Inception(nn.Module):
-    """uint8 pictures (n, height, width, 3) -> InceptionFeatures. `weights_sha256` names the file it was loaded from."""
+    """FID's Inception network: uint8 pictures (n, height, width, 3) to InceptionFeatures.
+
+    Attributes:
+        weights_sha256: Hexadecimal sha256 of the weight file, or None before `load_inception` sets it.
+    """
 
     weights_sha256: str | None = None
 
@@ -157,6 +190,17 @@ class Inception(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, images: Tensor) -> InceptionFeatures:
+        """Compute the features of pictures.
+
+        Args:
+            images: (n, height, width, 3) uint8 pictures.
+
+        Returns:
+            Features as tensors.
+
+        Raises:
+            ValueError: Pictures have another type or shape.
+        """
         if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[-1] != 3:
             raise ValueError(f"Inception takes uint8 (n, height, width, 3), got {images.dtype} {tuple(images.shape)}")
         x = images.permute(0, 3, 1, 2).to(self.fc.weight.dtype)
@@ -167,7 +211,7 @@ class Inception(nn.Module):
         x = F.max_pool2d(x, 3, stride=2)  # n 192 35 35
         x = self.Mixed_5d(self.Mixed_5c(self.Mixed_5b(x)))  # n 288 35 35
         x = self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(self.Mixed_6a(x))))  # n 768 17 17
-        # TensorFlow's mixed_6 is Mixed_6d, which begins with branch1x1, TensorFlow's mixed_6/conv after its ReLU.
+        # TensorFlow's mixed_6 is Mixed_6d here. Its first channels are branch1x1: TensorFlow's mixed_6/conv after ReLU.
         spatial = x[:, :SPATIAL_CHANNELS].permute(0, 2, 3, 1).flatten(1)
         x = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(self.Mixed_6e(x))))  # n 2048 8 8
         pool3 = x.mean(dim=(2, 3))
@@ -175,10 +219,18 @@ class Inception(nn.Module):
 
 
 def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
-    """(n, c, size, size) bilinear, as TF1's ResizeBilinear: corners not aligned, no half-pixel shift.
+    """Resize pictures bilinearly like TensorFlow 1's ResizeBilinear: without aligned corners, without half-pixel shift.
 
-    Output i reads input i * (in / out), so an enlarged picture sits half a pixel up and left of torch's own. Columns
-    before rows, as there, so that rounding is the same too.
+    Output pixel i reads input position i * (in / out). An enlarged picture is therefore shifted by half a pixel up and
+    left against torch's own resizing. Columns are resized before rows, as in TensorFlow, so that the rounding is the
+    same.
+
+    Args:
+        x: (n, c, h, w) pictures.
+        size: Height and width of the output (px).
+
+    Returns:
+        (n, c, size, size) pictures.
     """
     for dim in (3, 2):
         length = x.shape[dim]
@@ -192,11 +244,20 @@ def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
 
 
 def load_inception(path: str | Path) -> Inception:
-    """The network with the weights of a local state dict (.pth, .pt or .safetensors).
+    """Load the Inception network with the weights of a local state dict.
 
-    A name like that of KNOWN_FILE ends in the start of the file's sha256, which is checked; weights other than those
-    raise a warning. Raises ValueError, naming the file, for a missing or corrupted file and for weights of another
-    network.
+    A name such as that of KNOWN_FILE ends in the start of the file's sha256, which is checked. Weights other than the
+    published ones cause a warning.
+
+    Args:
+        path: File of type .pth, .pt or .safetensors.
+
+    Returns:
+        The network in evaluation mode.
+
+    Raises:
+        ValueError: The file is missing or corrupted, or holds the weights of another network. The message names the
+            file.
     """
     path = Path(path)
     sha256 = hash_weights(path)
@@ -205,7 +266,7 @@ def load_inception(path: str | Path) -> Inception:
             state = safetensors.torch.load_file(path)
         else:
             state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch's unpickler raises whatever a corrupted file makes it stumble over
+    except Exception as error:  # The unpickler of torch raises many types of errors for a corrupted file.
         raise ValueError(f"{path}: not a readable state dict ({error})") from error
     network = Inception()
     try:
@@ -219,7 +280,17 @@ def load_inception(path: str | Path) -> Inception:
 
 
 def hash_weights(path: str | Path) -> str:
-    """sha256 of a weight file, hexadecimal. ValueError if it is missing or its name claims another one."""
+    """Return the sha256 of a weight file, hexadecimal.
+
+    Args:
+        path: Weight file.
+
+    Returns:
+        64 hexadecimal digits.
+
+    Raises:
+        ValueError: The file is missing, or its name states another sha256.
+    """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
@@ -232,18 +303,37 @@ def hash_weights(path: str | Path) -> str:
 
 
 def describe_weights(path: str | Path) -> str:
-    """Which file numbers come from, for a report: its path, its sha256, and whether it is the published one."""
+    """Describe a weight file for a report: its path, its sha256, and whether it is the published file.
+
+    Args:
+        path: Weight file.
+
+    Returns:
+        One sentence.
+
+    Raises:
+        ValueError: The file is missing, or its name states another sha256.
+    """
     sha256 = hash_weights(path)
     known = sha256 == KNOWN_SHA256
-    verdict = "the published ones" if known else f"not {KNOWN_FILE}: no score of theirs compares with published ones"
+    verdict = "the published file" if known else f"not {KNOWN_FILE}; scores are not comparable with published scores"
     return f"Inception weights {path}, sha256 {sha256}: {verdict}"
 
 
 @torch.inference_mode()
 def compute_inception_features(network: Inception, images: np.ndarray, batch_size: int = 32) -> InceptionFeatures:
-    """pool3 (n, 2048), spatial (n, 2023) and logits (n, 1008), float32, of uint8 pictures (n, height, width, 3)."""
+    """Compute the Inception features of pictures in batches.
+
+    Args:
+        network: Network on any device.
+        images: (n, height, width, 3) uint8 pictures.
+        batch_size: Pictures per batch.
+
+    Returns:
+        Features as float32 arrays: pool3 (n, 2048), spatial (n, 2023) and logits (n, 1008).
+    """
     device = network.fc.weight.device
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 would keep 10 of 23 bits on a GPU
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 keeps 10 of 23 bits.
         parts = [network(batch.to(device)) for batch in _iterate_batches(images, batch_size)]
     if not parts:
         return InceptionFeatures(*(np.empty((0, size), np.float32) for size in (FEATURES, SPATIAL_FEATURES, CLASSES)))
@@ -251,10 +341,17 @@ def compute_inception_features(network: Inception, images: np.ndarray, batch_siz
 
 
 def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
-    """A small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
+    """Build a small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
 
-    For tests and for comparing sources without Inception weights. Distances of its features are called
-    `random_frechet` or the like, never FID. Weights come from numpy's legacy generator, whose stream is frozen.
+    The network serves tests and comparisons of sources without Inception weights. Distances of its features have names
+    such as `random_frechet`, never FID. Weights come from numpy's legacy generator, whose random stream never changes.
+
+    Args:
+        seed: Seed of the weights.
+        channels: Output channels of each convolution.
+
+    Returns:
+        The network in evaluation mode.
     """
     random = np.random.RandomState(seed)
     layers, inputs = [], 3
@@ -269,9 +366,18 @@ def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128,
 
 @torch.inference_mode()
 def compute_random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
-    """(n, 480) float32 features of uint8 pictures (n, height, width, 3) under `make_random_network(seed)`.
+    """Compute the features of pictures under `make_random_network(seed)`.
 
-    The mean over the picture after each convolution (32 + 64 + 128 + 256): coarse and fine structure alike.
+    The features are the means over the picture after each convolution (32 + 64 + 128 + 256 channels). They cover coarse
+    and fine structure.
+
+    Args:
+        images: (n, height, width, 3) uint8 pictures.
+        seed: Seed of the network.
+        batch_size: Pictures per batch.
+
+    Returns:
+        (n, 480) float32 features.
     """
     network = make_random_network(seed)
     parts = []

@@ -1,4 +1,4 @@
-"""Inception score from logits (paper, Sec. 4.1), with its interval."""
+"""Compute the Inception score from logits (paper, Sec. 4.1) with its confidence interval."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ import numpy as np
 from pipelines.metrics.frechet import check_features
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
-SPLIT_SAMPLES = 5000  # ADM's evaluator
+SPLIT_SAMPLES = 5000  # Samples per split, as in ADM's evaluator.
 
 
 def compute_inception_score(logits: np.ndarray) -> Estimate:
-    """exp of the mean KL(p(y|x) || p(y)), averaged over splits of 5000 samples in order (ADM).
+    """Compute exp of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
 
-    logits (n, classes) are pool3 @ W **without the bias**, as ADM takes them. The mean divergence is the entropy of the
-    mean less the mean entropy, so a resample costs a product of its weights with p.
+    The mean divergence is the entropy of the mean minus the mean entropy. A resample therefore costs one product of its
+    weights with p.
+
+    Args:
+        logits: (n, classes) logits pool3 @ W **without the bias**, as in ADM.
+
+    Returns:
+        Score with its 95 % interval.
+
+    Raises:
+        ValueError: Logits are empty, not 2-d or not finite.
     """
     logits = check_features(logits, "logit", at_least=1).astype(np.float64)
     logits -= logits.max(axis=1, keepdims=True)
@@ -29,5 +38,12 @@ def compute_inception_score(logits: np.ndarray) -> Estimate:
 
 
 def compute_entropy(p: np.ndarray) -> np.ndarray:
-    """Of the distributions in the rows, in nats; 0 log 0 = 0."""
+    """Compute the entropy of the distributions in the last axis; 0 log 0 is 0.
+
+    Args:
+        p: (..., classes) distributions.
+
+    Returns:
+        (...) entropies in nats.
+    """
     return -(p * np.log(np.where(p > 0, p, 1.0))).sum(axis=-1)

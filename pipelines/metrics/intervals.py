@@ -1,8 +1,8 @@
 """Compute 95 % confidence intervals by the bootstrap: resample scenes with replacement and recompute the score.
 
-A draw counts how often each scene is sampled, so a score that is a sum over scenes is one matrix product for all draws.
-Row 0 is the original sample. Its score is the value; the other rows give the interval. The same number of scenes gives
-the same draws.
+A draw (one resample) is the number of times that each scene is sampled. A score that is a sum over scenes is therefore
+one matrix product for all draws. Row 0 is the original sample. Its score is the value, and the scores of the other rows
+give the interval. The same number of scenes and the same key give the same draws.
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ LEVEL = 0.95
 
 
 class Estimate(NamedTuple):
-    """A score with the ends of its 95 % interval."""
+    """A score with its 95 % interval.
+
+    Attributes:
+        value: Score of the original sample.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+    """
 
     value: float
     low: float
@@ -25,9 +31,15 @@ class Estimate(NamedTuple):
 
 
 def draw_resamples(count: int, key: int = 0) -> np.ndarray:
-    """(1 + DRAWS, count) float64 counts of each scene: ones in row 0, then the draws.
+    """Draw bootstrap resamples of scenes.
 
-    Each side of a comparison has its `key`, so that the draws of both sides are independent.
+    Args:
+        count: Number of scenes.
+        key: Part of the seed. Each side of a comparison has its own key, so that the draws of both sides are
+            independent.
+
+    Returns:
+        (1 + DRAWS, count) float64 number of times each scene is sampled: ones in row 0, then the draws.
     """
     random = np.random.default_rng([count, key])
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
@@ -37,26 +49,58 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
 
 
 def compute_weights(count: int, key: int = 0) -> np.ndarray:
-    """Return `draw_resamples` in rows of sum 1."""
+    """Return `draw_resamples` scaled to rows of sum 1.
+
+    Args:
+        count: Number of scenes.
+        key: Part of the seed.
+
+    Returns:
+        (1 + DRAWS, count) float64 weights.
+    """
     return draw_resamples(count, key) / count
 
 
 def make_estimate(scores: np.ndarray) -> Estimate:
-    """Make an estimate from the scores (1 + DRAWS,) of all rows of draws. Draws whose score is NaN do not count."""
+    """Make an estimate from the scores of all rows of draws.
+
+    Args:
+        scores: (1 + DRAWS,) scores. The first is that of the original sample; draws with score NaN are ignored.
+
+    Returns:
+        Score with its 95 % interval.
+    """
     value, drawn = float(scores[0]), scores[1:]
     low, high = np.quantile(drawn[np.isfinite(drawn)], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Estimate(value, float(low), float(high))
 
 
 def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
-    """Estimate the mean of values (n,), one per scene."""
+    """Estimate the mean of one value per scene.
+
+    Args:
+        values: (n,) values.
+        key: Part of the seed.
+
+    Returns:
+        Mean with its 95 % interval.
+    """
     return make_estimate(draw_resamples(len(values), key) @ np.asarray(values, np.float64) / len(values))
 
 
 def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
-    """Estimate the ratio of sums of each column of (n, m) and (n, m), with a row per scene; None if the latter is 0.
+    """Estimate the ratio of the column sums of two arrays with a row per scene.
 
-    Covers shares of objects (bad ones over all) and means over the scenes that have a value (values over ones).
+    A ratio can be a share of objects: objects at fault over all objects. A ratio can be a mean over the scenes that
+    have a value: sum of values over their number.
+
+    Args:
+        numerators: (n, m) numerators.
+        denominators: (n, m) denominators.
+        key: Part of the seed.
+
+    Returns:
+        m ratios with 95 % intervals; None where the denominators sum to 0.
     """
     drawn = draw_resamples(len(numerators), key)
     above, below = (drawn @ np.asarray(part, np.float64) for part in (numerators, denominators))
@@ -65,6 +109,16 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
 
 
 def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> Estimate:
-    """Estimate a score whose first-order change is the mean influence (n,) of each side's samples."""
+    """Estimate a score from the influences of all samples on it.
+
+    The first-order change of the score under a resample is the mean influence of the resample, summed over the sides.
+
+    Args:
+        value: Score of the original sample.
+        influences: (n,) influence of each sample, per side.
+
+    Returns:
+        Score with its 95 % interval.
+    """
     shifts = sum(compute_weights(len(part), key) @ part for key, part in enumerate(influences))
     return make_estimate(np.asarray(value + shifts))

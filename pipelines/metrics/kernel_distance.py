@@ -1,6 +1,6 @@
-"""Kernel distance of two sets of features: unbiased squared MMD with the cubic kernel (Binkowski et al. 2018).
+"""Compute the kernel distance of two sets of features: unbiased squared MMD, cubic kernel (Binkowski et al. 2018).
 
-Only that of Inception's pool3 features may be called KID.
+Only the kernel distance of Inception's pool3 features may be called KID.
 """
 
 from __future__ import annotations
@@ -10,15 +10,25 @@ import numpy as np
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 from pipelines.metrics.neighbours import require_comparable
 
-GROUP_SAMPLES = 1000  # the usual size of subsets
+GROUP_SAMPLES = 1000  # Samples per group; published KIDs usually use subsets of this size.
 
 
 def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    """Estimate the mean over groups of about 1000 samples of each side, with k(x, y) = (x . y / d + 1)^3.
+    """Estimate the squared MMD with k(x, y) = (x . y / d + 1)^3, averaged over groups of about 1000 samples per side.
 
-    Every sample is in one group. The common estimate takes 50 or 100 random subsets of 1000; its expectation is the
-    same for any groups. Bootstrap draws stay within groups. Two draws of the same sample are not a pair, because the
-    kernel of a sample with itself would bias the estimate.
+    Each sample belongs to one group. The common estimate uses 50 or 100 random subsets of 1000 samples; the expectation
+    is the same. Bootstrap draws are made within groups. Two draws of the same sample are not a pair, because the kernel
+    of a sample with itself would bias the estimate.
+
+    Args:
+        real: (n, d) features, n >= 2.
+        generated: (m, d) features, m >= 2.
+
+    Returns:
+        Distance with its 95 % interval.
+
+    Raises:
+        ValueError: Features have unequal dimensions, fewer than 2 samples or infinite numbers.
     """
     real, generated = require_comparable(real, generated, at_least=2)
     groups = max(1, min(len(real), len(generated)) // GROUP_SAMPLES)
@@ -34,12 +44,28 @@ def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate
 
 
 def compute_kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(n, m)"""
+    """Compute the cubic kernel of all pairs of samples.
+
+    Args:
+        x: (n, d) features.
+        y: (m, d) features.
+
+    Returns:
+        (n, m) kernel matrix.
+    """
     return (x @ y.T / x.shape[1] + 1) ** 3
 
 
 def sum_pairs(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """(b,) mean of a kernel matrix (n, n) over pairs of different samples, under weights (b, n)."""
+    """Compute the weighted mean of a kernel matrix over pairs of different samples.
+
+    Args:
+        weights: (b, n) weights of the samples, one row per draw.
+        gram: (n, n) kernel matrix.
+
+    Returns:
+        (b,) means; NaN if a draw holds one sample only.
+    """
     own = np.square(weights)
     total = ((weights @ gram) * weights).sum(axis=1) - own @ np.diag(gram)
     share = 1 - own.sum(axis=1)

@@ -1,9 +1,10 @@
 """Compute precision, recall, density and coverage from nearest neighbours of features, exactly and fast.
 
-The method filters and verifies. A short vector holds the first principal coordinates of features and the length of the
-residual. Distances of short vectors never exceed the true ones, and come from a float32 matrix product. A true distance
-is computed, in float64 by differences, only where the bounds do not decide. The results are those of the full float64
-distance matrix, including ties, in a fraction of its time and memory.
+The method filters pairs by a bound and verifies the remaining pairs. A short vector holds the first principal
+coordinates of a feature vector and the length of its residual. The distance of short vectors is a lower bound of the
+true distance, and a float32 matrix product computes it. Only undecided pairs need the true distance, which is computed
+in float64 by differences. The results equal those of the full float64 distance matrix, including ties, in a fraction of
+its time and memory.
 """
 
 from __future__ import annotations
@@ -17,51 +18,63 @@ from torch import Tensor
 
 from pipelines.metrics.frechet import check_features
 
-BLOCK_ROWS = 1024  # rows of a block of the distance matrix: 4 kB x number of columns
-SPARE_NEIGHBOURS = 8  # candidates beyond the k-th whose upper bounds bound its distance
-PAIRS_PER_BLOCK = 128  # pairs per block of exact distances: 2 MB at 2048-d, which fits a cache
-BASIS_SAMPLES = 512  # samples that the principal axes are computed from
-KEPT_VARIANCE = 0.997  # share of their variance; more axes slow the filter, fewer leave more pairs to verify
-MOST_LEFT_OVER = 0.02  # share of the total variance in the residual; above it the filter uses whole features
+BLOCK_ROWS = 1024  # Rows per block of the distance matrix; a block takes 4 kB per column.
+SPARE_NEIGHBOURS = 8  # Additional candidates, whose upper bounds limit the distance of the k-th neighbour.
+PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances: 2 MB at 2048-d, which fits into a processor cache.
+BASIS_SAMPLES = 512  # Samples from which the principal axes are computed.
+KEPT_VARIANCE = 0.997  # Share of the variance in the axes. More axes slow the filter; fewer leave more pairs to verify.
+MOST_LEFT_OVER = 0.02  # Maximum share of the total variance in the residual; above it, the filter uses whole features.
 FLOAT32_ROUNDING = 2.0**-24
 
 
 @dataclass(frozen=True)
 class NeighbourhoodScores:
-    """Scores at one neighbourhood size. A ball reaches from a sample to its k-th nearest other sample of its side.
+    """Precision, recall, density and coverage at one neighbourhood size.
 
-    Precision and recall: Kynkaanniemi et al. 2019, and the paper's supplement; density and coverage: Naeem et al. 2020.
+    The ball of a sample is centred at the sample and extends to its k-th nearest other sample of the same side.
+    Precision and recall follow Kynkaanniemi et al. 2019 and the supplement of the paper. Density and coverage follow
+    Naeem et al. 2020.
+
+    Attributes:
+        k: Neighbourhood size.
+        in_real: (m,) int64, number of balls of real samples that contain each generated sample.
+        in_generated: (n,) bool, whether each real sample lies in the ball of a generated sample.
+        covered: (n,) bool, whether the ball of each real sample contains a generated sample.
     """
 
     k: int
-    in_real: np.ndarray  # (m,) int64: real balls that each generated sample lies in
-    in_generated: np.ndarray  # (n,) bool: each real sample lies in some generated sample's ball
-    covered: np.ndarray  # (n,) bool: each real sample's ball holds some generated sample
+    in_real: np.ndarray
+    in_generated: np.ndarray
+    covered: np.ndarray
 
     @property
     def precision(self) -> float:
-        """Return the share of generated samples in some real ball."""
+        """Return the share of generated samples that lie in the ball of a real sample."""
         return float((self.in_real > 0).mean())
 
     @property
     def recall(self) -> float:
+        """Return the share of real samples that lie in the ball of a generated sample."""
         return float(self.in_generated.mean())
 
     @property
     def density(self) -> float:
-        """Return the mean number of real balls that a generated sample lies in, over k. It may exceed 1."""
+        """Return the mean number of balls of real samples that contain a generated sample, over k. It may exceed 1."""
         return float(self.in_real.mean() / self.k)
 
     @property
     def coverage(self) -> float:
+        """Return the share of real samples whose ball contains a generated sample."""
         return float(self.covered.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class PrincipalBasis:
-    """Principal axes (p, d) of a sample of both sides, orthonormal rows, and their mean (d,), float64.
+    """Principal axes of samples of both sides.
 
-    None for the features' own axes, all of them.
+    Attributes:
+        mean: (d,) float64 mean of the samples.
+        axes: (p, d) float64 orthonormal rows. None means all axes of the features themselves.
     """
 
     mean: np.ndarray
@@ -70,11 +83,15 @@ class PrincipalBasis:
 
 @dataclass(frozen=True, eq=False)
 class FeatureSet:
-    """One side's features (n, d) with their short vectors.
+    """Features of one side with their short vectors.
 
-    left (n, p + 3) and right (n, p + 3), float32: left[i] . right[j] is the squared distance of the short vectors.
-    length (n,): of the features about their mean; rest (n,): of what the axes leave over; slack (n,): bound of a
-    product's rounding, per sample of a pair.
+    Attributes:
+        features: (n, d) features.
+        left: (n, p + 3) float32. left[i] . right[j] is the squared distance of the short vectors of i and j.
+        right: (n, p + 3) float32.
+        length: (n,) length of the short vector of each sample.
+        rest: (n,) length of the residual, which the axes do not represent.
+        slack: (n,) bound of the rounding error of a product. The bounds of both samples of a pair are added.
     """
 
     features: np.ndarray
@@ -89,9 +106,18 @@ class FeatureSet:
 
 
 def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> tuple[FeatureSet, FeatureSet]:
-    """Convert both sides to the filter's form.
+    """Compute the short vectors of both sides for the filter.
 
-    Raises ValueError for features that are not finite, of unequal width, or of max(k) samples or fewer.
+    Args:
+        real: (n, d) features.
+        generated: (m, d) features.
+        k: Neighbourhood sizes.
+
+    Returns:
+        Feature sets of the real and the generated side.
+
+    Raises:
+        ValueError: Features are not finite or of unequal width, or a side has max(k) samples or fewer.
     """
     real, generated = require_comparable(real, generated, at_least=check_k(k) + 1)
     basis = compute_principal_axes(real, generated)
@@ -107,10 +133,21 @@ def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) 
 def compute_neighbourhoods(
     real: np.ndarray, generated: np.ndarray, k: Sequence[int] = (3,)
 ) -> list[NeighbourhoodScores]:
-    """Compute NeighbourhoodScores for each k, from features (n, d) and (m, d) (paper, supplement, Evaluation).
+    """Compute NeighbourhoodScores for each neighbourhood size (paper, supplement, Evaluation).
 
-    Memory: BLOCK_ROWS x max(n, m) float32, besides the features. The paper's protocol takes n = m; other sizes work.
-    Raises ValueError as `prepare` does.
+    The paper's protocol has n = m; other sizes are allowed. The memory besides the features is BLOCK_ROWS x max(n, m)
+    float32.
+
+    Args:
+        real: (n, d) features.
+        generated: (m, d) features.
+        k: Neighbourhood sizes.
+
+    Returns:
+        Scores in the order of k.
+
+    Raises:
+        ValueError: Features are not finite or of unequal width, or a side has max(k) samples or fewer.
     """
     sides = prepare_features(real, generated, k)
     radii = [compute_ball_radii(side, range(len(side)), k) for side in sides]
@@ -120,7 +157,15 @@ def compute_neighbourhoods(
 def judge_neighbours(
     k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> list[NeighbourhoodScores]:
-    """Compute NeighbourhoodScores for each k from the `find_within` of all parts of the real samples, in order."""
+    """Compute NeighbourhoodScores for each k from the results of `find_within` for all parts of the real samples.
+
+    Args:
+        k: Neighbourhood sizes.
+        parts: Results of `find_within`, in the order of the real samples.
+
+    Returns:
+        Scores in the order of k.
+    """
     parts_in_real, parts_in_generated, parts_covered = zip(*parts, strict=True)
     in_real = np.asarray(sum(parts_in_real))
     in_generated, covered = (np.concatenate(part, axis=1) for part in (parts_in_generated, parts_covered))
@@ -128,14 +173,36 @@ def judge_neighbours(
 
 
 def check_k(k: Sequence[int]) -> int:
-    """Return the largest of the neighbourhood sizes. Raises ValueError if there is none or one is below 1."""
+    """Return the largest neighbourhood size.
+
+    Args:
+        k: Neighbourhood sizes.
+
+    Returns:
+        Maximum of k.
+
+    Raises:
+        ValueError: There is no size, or a size is below 1.
+    """
     if not k or min(k) < 1:
         raise ValueError(f"k must name neighbourhood sizes of at least 1, got {list(k)}")
     return max(k)
 
 
 def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Check and return both sides. Raises ValueError as `check_features` does, and for unequal dimensions."""
+    """Check the features of both sides and return them as floats.
+
+    Args:
+        real: (n, d) features.
+        generated: (m, d) features.
+        at_least: Minimum number of samples per side.
+
+    Returns:
+        Both sides, float32 or float64.
+
+    Raises:
+        ValueError: Features are not 2-d, not finite or of unequal width, or a side has too few samples.
+    """
     real, generated = check_features(real, "real", at_least), check_features(generated, "generated", at_least)
     if real.shape[1] != generated.shape[1]:
         raise ValueError(f"real features have {real.shape[1]} dimensions, generated {generated.shape[1]}")
@@ -146,13 +213,22 @@ def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -
 
 
 def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> PrincipalBasis:
-    """Compute the principal axes that hold KEPT_VARIANCE of evenly spaced samples of both sides."""
+    """Compute the principal axes that hold KEPT_VARIANCE of evenly spaced samples of both sides.
+
+    Args:
+        real: (n, d) features.
+        generated: (m, d) features.
+
+    Returns:
+        Axes and mean.
+    """
     count = min(BASIS_SAMPLES // 2, len(real), len(generated))
     some = np.concatenate([side[np.arange(count) * len(side) // count] for side in (real, generated)])
     some = some.astype(np.float64)
     mean = some.mean(axis=0)
     centred = some - mean
-    strength, vectors = np.linalg.eigh(centred @ centred.T)  # ascending; far smaller than a decomposition of `centred`
+    # The eigenproblem of samples x samples is far smaller than a decomposition of `centred`. Values are ascending.
+    strength, vectors = np.linalg.eigh(centred @ centred.T)
     held = np.cumsum(strength[::-1].clip(0))
     count = 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))
     axes, _ = np.linalg.qr(centred.T @ vectors[:, -count:])
@@ -160,10 +236,18 @@ def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> Principal
 
 
 def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
-    """Convert features (n, d) to the filter's form.
+    """Compute the short vectors of features for the filter.
 
-    For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2, and |r - r'| lies between the difference and the
-    sum of |r| and |r'|. With v = (c, |r|), (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2 in one product.
+    For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2. The length |r - r'| lies between the difference
+    and the sum of |r| and |r'|. With v = (c, |r|), one product gives the bound: (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v
+    - v'|^2.
+
+    Args:
+        features: (n, d) features.
+        basis: Axes and mean.
+
+    Returns:
+        Features with their short vectors.
     """
     width = 1 + (len(basis.mean) if basis.axes is None else len(basis.axes))
     left, right = (np.empty((len(features), width + 2), np.float32) for _ in range(2))
@@ -178,7 +262,8 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
         norm[rows] = np.square(short).sum(axis=1)
         left[rows, :-2], right[rows, :-2] = -2 * short, short
     left[:, -2], left[:, -1], right[:, -2], right[:, -1] = norm, 1, 1, norm
-    # |rounding of a product of t terms| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2), and t + 4 grants the terms' own.
+    # For a product of t terms, |rounding| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2) with unit rounding u. The bound
+    # uses t + 4 instead of t to include the rounding of the terms themselves.
     slack = 2 * (width + 6) * FLOAT32_ROUNDING * norm
     return FeatureSet(features, left, right, np.sqrt(norm), rest, slack)
 
@@ -187,7 +272,19 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
 
 
 def compute_ball_radii(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
-    """(len(k), len(rows)) squared distance of each sample of `rows` to its k-th nearest other sample."""
+    """Compute the squared distance of samples to their k-th nearest other sample of the same side.
+
+    Args:
+        side: Samples of one side.
+        rows: Samples to compute.
+        k: Neighbourhood sizes.
+
+    Returns:
+        (len(k), len(rows)) squared radii.
+
+    Raises:
+        ValueError: There is no size, or a size is below 1.
+    """
     radii = np.empty((len(k), len(rows)))
     for block in iterate_blocks(rows):
         radii[:, block.start - rows.start : block.stop - rows.start] = find_nearest(
@@ -199,9 +296,17 @@ def compute_ball_radii(side: FeatureSet, rows: range, k: Sequence[int]) -> np.nd
 def find_nearest(
     side: FeatureSet, others: FeatureSet, rows: range, count: int, themselves: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distances (rows, count) of samples of `side` to the nearest of `others`, ascending, and their indices.
+    """Find the nearest neighbours of samples in another set. Of equal distances, the lower index comes first.
 
-    `themselves`: both are one side, and no sample is its own neighbour. Of equal distances the lower index comes first.
+    Args:
+        side: Set of the samples.
+        others: Set of the neighbours.
+        rows: Samples of `side`.
+        count: Number of neighbours per sample.
+        themselves: Whether both sets are the same; then no sample is its own neighbour.
+
+    Returns:
+        (rows, count) squared distances, ascending, and (rows, count) indices of the neighbours.
     """
     bound = torch.from_numpy(side.left[rows.start : rows.stop] @ others.right.T)
     own = torch.arange(len(rows))
@@ -222,7 +327,7 @@ def find_nearest(
 def find_within(
     real: FeatureSet, generated: FeatureSet, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the samples within the balls of both sides, for the real samples of `rows`.
+    """Find the samples that lie within the balls of the other side, for some of the real samples.
 
     Args:
         real: Real samples.
@@ -232,7 +337,7 @@ def find_within(
         rows: Real samples to judge.
 
     Returns:
-        in_real (len(k), m): number of balls of `rows` that hold each generated sample, to be summed over parts;
+        in_real (len(k), m): number of balls of `rows` that contain each generated sample, to be summed over parts;
         in_generated and covered (len(k), len(rows)).
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
@@ -260,7 +365,17 @@ def find_within(
 
 
 def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """(p,) squared distances of a[i] and b[j] in float64, by differences; bit-identical if the sides are swapped."""
+    """Compute squared distances in float64 by differences. The result is bit-identical if the sides are swapped.
+
+    Args:
+        a: (n, d) features.
+        i: (p,) indices into a.
+        b: (m, d) features.
+        j: (p,) indices into b.
+
+    Returns:
+        (p,) squared distances of a[i] and b[j].
+    """
     squared = np.empty(len(i))
     for start in range(0, len(i), PAIRS_PER_BLOCK):
         block = slice(start, start + PAIRS_PER_BLOCK)
@@ -270,11 +385,25 @@ def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np
 
 
 def round_up_float32(values: np.ndarray) -> Tensor:
-    """Round values up to float32."""
+    """Round values up to float32.
+
+    Args:
+        values: float64 values.
+
+    Returns:
+        Smallest float32 values that are not below the given ones.
+    """
     rounded = values.astype(np.float32)
     return torch.from_numpy(np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded))
 
 
 def iterate_blocks(rows: range) -> list[range]:
-    """Split rows into blocks of BLOCK_ROWS."""
+    """Split a range of rows into blocks of BLOCK_ROWS.
+
+    Args:
+        rows: Rows.
+
+    Returns:
+        Consecutive ranges; the last may be shorter.
+    """
     return [range(start, min(start + BLOCK_ROWS, rows.stop)) for start in range(rows.start, rows.stop, BLOCK_ROWS)]

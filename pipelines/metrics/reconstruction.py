@@ -1,7 +1,7 @@
-"""Score reconstructions: ground, AP3D, IoU3D of matched primitives, voxels, memory (paper, Sec. 4.1, Tab. 1, 2).
+"""Score reconstructions: ground, AP3D, IoU3D of matched primitives, voxels and memory (paper, Sec. 4.1, Tab. 1 and 2).
 
-Each scene gives one record; records can be added in any grouping. One function per table computes scores from the sum,
-so that every ratio is one of sums over the whole dataset.
+Each scene gives one record, and records can be added in any grouping. For each kind of score, one function computes the
+scores from the sum of the records. Each ratio is therefore a ratio of sums over the whole dataset.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.voxels import NUM_CLASSES
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
-THRESHOLDS = np.linspace(0.05, 0.50, 10)  # IoU3D, Omni3D's ten steps
+THRESHOLDS = np.linspace(0.05, 0.50, 10)  # The ten IoU3D thresholds of Omni3D.
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
-MAX_DETECTIONS = 100  # per scene and category, Omni3D's default
-SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # paper: all categories but VE
+MAX_DETECTIONS = 100  # Maximum number of detections per scene and category, as in Omni3D.
+SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper scores all categories except VE.
 
 
 # --------------------------------------------------------------------------------------------------------- ground
@@ -30,13 +30,21 @@ SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # paper: al
 
 @dataclass(frozen=True)
 class GroundSums:
-    """What ground scores are made of, summed over scenes; all (G,), one entry per ground class."""
+    """Sums over scenes from which ground scores are computed. Each array is (G,), with one entry per ground class.
 
-    intersection: np.ndarray  # pixels occupied in both
-    union: np.ndarray  # pixels occupied in either
-    pixels: np.ndarray  # pixels truly occupied
-    absolute_m: np.ndarray  # sum of |height error| over truly occupied pixels
-    squared_m2: np.ndarray  # sum of squared height errors over truly occupied pixels
+    Attributes:
+        intersection: Number of pixels that are occupied in both scenes.
+        union: Number of pixels that are occupied in either scene.
+        pixels: Number of pixels that are occupied in the true scene.
+        absolute_m: Sum of |height error| over the pixels that are occupied in the true scene (m).
+        squared_m2: Sum of squared height errors over the pixels that are occupied in the true scene (m^2).
+    """
+
+    intersection: np.ndarray
+    union: np.ndarray
+    pixels: np.ndarray
+    absolute_m: np.ndarray
+    squared_m2: np.ndarray
 
     def __add__(self, other: GroundSums) -> GroundSums:
         return GroundSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
@@ -45,17 +53,30 @@ class GroundSums:
 def sum_ground(
     true_occupied: np.ndarray, true_height_m: np.ndarray, occupied: np.ndarray, height_m: np.ndarray
 ) -> GroundSums:
-    """Sums of one scene (or a stack of scenes) from rasters (..., G, H, W): masks bool, heights in metres.
+    """Sum the ground errors of one scene or of a stack of scenes.
 
-    Heights are compared wherever the truth is occupied, as in the paper's loss, whether or not the prediction says
-    occupied: pass the decoder's heights. A Scene holds 0 m where it is not occupied, and then that 0 counts.
+    Heights are compared where the true mask is occupied, as in the paper's loss, regardless of the predicted mask. Pass
+    the heights of the decoder for this reason. A Scene holds 0 m at unoccupied pixels, and that 0 would count as a
+    prediction.
+
+    Args:
+        true_occupied: (..., G, H, W) bool true mask.
+        true_height_m: (..., G, H, W) true height (m).
+        occupied: (..., G, H, W) bool predicted mask.
+        height_m: (..., G, H, W) predicted height (m).
+
+    Returns:
+        Sums per ground class.
+
+    Raises:
+        ValueError: The rasters differ in shape, or a compared height is not finite.
     """
     shapes = {np.shape(part) for part in (true_occupied, true_height_m, occupied, height_m)}
     if len(shapes) != 1:
         raise ValueError(f"ground rasters differ in shape: {sorted(shapes)}")
     error_m = np.where(true_occupied, np.asarray(height_m, np.float64) - true_height_m, 0.0)
     if not np.isfinite(error_m).all():
-        raise ValueError("ground heights hold NaN or infinite numbers on truly occupied pixels")
+        raise ValueError("ground heights hold NaN or infinite numbers on pixels that are occupied in the true scene")
     masks = (true_occupied & occupied, true_occupied | occupied, true_occupied, np.abs(error_m), error_m**2)
     num_classes = error_m.shape[-3]
     return GroundSums(*(np.moveaxis(part, -3, 0).reshape(num_classes, -1).sum(axis=1) for part in masks))
@@ -63,15 +84,27 @@ def sum_ground(
 
 @dataclass(frozen=True)
 class GroundScores:
-    """Ground scores of a dataset. A class that neither side ever occupies has no entry."""
+    """Ground scores of a dataset. A class that neither side ever occupies has no entry.
 
-    iou: float  # intersection over union of all classes' pixels together
-    mean_iou: float  # mean of the classes' own
+    Attributes:
+        iou: Intersection over union of the pixels of all classes together, in [0, 1].
+        mean_iou: Mean over the classes of `class_iou`.
+        class_iou: IoU per ground class.
+        height_mae_m: Mean absolute height error (m).
+        height_rmse_m: Root mean squared height error (m).
+        height_mse: Mean squared error of heights that the bounds normalise to [0, 1], as in the paper.
+        class_height_mae_m: Mean absolute height error per class that the true scenes contain (m).
+        class_height_rmse_m: Root mean squared height error per class that the true scenes contain (m).
+        class_height_mse: Normalised mean squared height error per class that the true scenes contain.
+    """
+
+    iou: float
+    mean_iou: float
     class_iou: dict[str, float]
     height_mae_m: float
     height_rmse_m: float
-    height_mse: float  # the paper's: heights normalised to [0, 1] by the bounds
-    class_height_mae_m: dict[str, float]  # of truly occupied classes, as are the next two
+    height_mse: float
+    class_height_mae_m: dict[str, float]
     class_height_rmse_m: dict[str, float]
     class_height_mse: dict[str, float]
 
@@ -79,16 +112,25 @@ class GroundScores:
 def compute_ground_scores(
     sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray | Sequence[Any]
 ) -> GroundScores:
-    """Scores of the summed scenes; height_bounds_m is (2,) or (G, 2), lowest and highest height of the data.
+    """Compute ground scores from summed scenes.
 
-    Raises ValueError if no pixel is occupied at all or if bounds are empty intervals.
+    Args:
+        sums: Sums over all scenes.
+        ground_classes: Names of the G classes.
+        height_bounds_m: (2,) or (G, 2), lowest and highest height of the data (m).
+
+    Returns:
+        Scores of the dataset.
+
+    Raises:
+        ValueError: No true pixel is occupied, or a lower bound is not below its upper bound.
     """
     low, high = np.broadcast_to(np.asarray(height_bounds_m, np.float64), (len(ground_classes), 2)).T
     if not (high > low).all():
         raise ValueError(f"height bounds must be (lowest, highest) in metres, got {height_bounds_m}")
     pixels = sums.pixels.sum()
     if pixels == 0:
-        raise ValueError("ground scores need at least one truly occupied pixel; all scenes are empty")
+        raise ValueError("ground scores need at least one occupied pixel, but all true scenes are empty")
     seen = sums.union > 0
     names = np.asarray(ground_classes)
     iou = sums.intersection[seen] / sums.union[seen]
@@ -116,21 +158,40 @@ def compute_ground_scores(
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched detections of any number of scenes; per category sorted by score within a scene.
+    """Matched detections of one or more scenes, sorted by score within each category of a scene.
 
-    `rank` is a detection's place in its scene and category (0 = best score): truncating to the best k after matching
-    is the same as before, since greedy matching never looks at worse ones. So is a score threshold.
+    Greedy matching handles detections in order of score. Selecting the k highest scores therefore gives the same result
+    before and after matching. The same holds for a minimum score.
+
+    Attributes:
+        category: (d,) int8 category of each detection.
+        score: (d,) float32 score of each detection.
+        rank: (d,) int32 position among the detections of its scene and category; 0 has the highest score.
+        hit: (d, 10) bool, whether the detection is a true positive at each of THRESHOLDS.
+        truths: (11,) int64 number of true primitives per category.
     """
 
-    category: np.ndarray  # (d,) int8
-    score: np.ndarray  # (d,) float32
-    rank: np.ndarray  # (d,) int32
-    hit: np.ndarray  # (d, 10) bool: true positive at each of THRESHOLDS
-    truths: np.ndarray  # (11,) int64: number of true primitives per category
+    category: np.ndarray
+    score: np.ndarray
+    rank: np.ndarray
+    hit: np.ndarray
+    truths: np.ndarray
 
 
 def join_matches(parts: Sequence[Matches]) -> Matches:
-    """One record of all scenes' matches. Keep scenes in a fixed order: it decides between equal scores, as in COCO."""
+    """Join the matches of all scenes into one record.
+
+    The order of the scenes decides between equal scores, as in COCO. Pass the scenes in a fixed order.
+
+    Args:
+        parts: Matches per scene.
+
+    Returns:
+        Matches of all scenes.
+
+    Raises:
+        ValueError: `parts` is empty.
+    """
     if not parts:
         raise ValueError("AP3D needs at least one scene's matches, got none")
     joined = [np.concatenate([getattr(p, name) for p in parts]) for name in ("category", "score", "rank", "hit")]
@@ -138,7 +199,18 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
 
 
 def match_scene(truth: Scene, prediction: Scene) -> Matches:
-    """Matches of one predicted scene, ranked by `existence`, with its truth, for every category in SCORED."""
+    """Match the primitives of a predicted scene with those of its true scene, for each category in SCORED.
+
+    Args:
+        truth: True scene.
+        prediction: Predicted scene; `existence` is the score of its primitives.
+
+    Returns:
+        Matches of the scene.
+
+    Raises:
+        ValueError: An existence probability is not finite.
+    """
     if not np.isfinite(prediction.existence).all():
         raise ValueError(f"scene {prediction.scene_id}: existence holds NaN or infinite numbers")
     same_category = prediction.category[:, None] == truth.category
@@ -158,16 +230,24 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
 
 
 def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
-    """(d, t) bool: is detection i, best score first, a true positive at threshold j, given iou (d, truths)?
+    """Decide for each detection and threshold whether the detection is a true positive.
 
-    At each threshold on its own, each detection in turn takes the unmatched truth it overlaps most, if by at least
-    the threshold; a later truth wins a tie (COCO).
+    Each threshold is matched separately. Detections take turns in order of score. A detection takes the unmatched true
+    primitive of highest IoU3D, if the IoU3D reaches the threshold. Of equal IoU3D, the later true primitive is taken,
+    as in COCO.
+
+    Args:
+        iou: (d, truths) IoU3D, detections in order of decreasing score.
+        thresholds: (t,) minimum IoU3D of a true positive.
+
+    Returns:
+        (d, t) bool.
     """
     num_detections, num_truths = iou.shape
     hit = np.zeros((num_detections, len(thresholds)), bool)
     if num_truths == 0:
         return hit
-    backwards = iou[:, ::-1]  # argmax takes the first of equals
+    backwards = iou[:, ::-1]  # argmax returns the first of equal values.
     free = np.ones((len(thresholds), num_truths), bool)
     rows = np.arange(len(thresholds))
     for i in np.flatnonzero(iou.max(axis=1) >= thresholds.min()):
@@ -180,17 +260,25 @@ def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.n
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """AP3D in [0, 1]. Categories without a single truth are left out; `table` holds them per threshold."""
+    """AP3D in [0, 1]. Categories without a true primitive have no entry.
 
-    ap3d: float  # mean over categories and thresholds
-    ap3d_50: float  # mean over categories at IoU3D 0.50
+    Attributes:
+        ap3d: Mean over categories and thresholds.
+        ap3d_50: Mean over categories at IoU3D 0.50.
+        category_ap3d: Mean over thresholds, per category.
+        category_ap3d_50: Average precision at IoU3D 0.50, per category.
+        table: (10,) average precision at each of THRESHOLDS, per category.
+    """
+
+    ap3d: float
+    ap3d_50: float
     category_ap3d: dict[str, float]
     category_ap3d_50: dict[str, float]
-    table: dict[str, list[float]]  # (10,) average precision at each of THRESHOLDS
+    table: dict[str, list[float]]
 
     @property
     def at_threshold(self) -> dict[str, float]:
-        """Mean over categories at each of THRESHOLDS."""
+        """Return the mean over categories at each of THRESHOLDS; keys have two decimals."""
         means = np.mean(list(self.table.values()), axis=0)
         return {f"{threshold:.2f}": float(mean) for threshold, mean in zip(THRESHOLDS, means, strict=True)}
 
@@ -202,8 +290,12 @@ def compute_detection_scores(
 
     Args:
         matches: Matches of all scenes.
-        max_detections: Number of best detections kept per scene and category (Omni3D: 100; default: all).
+        max_detections: Number of detections of highest score to keep per scene and category (Omni3D: 100; default:
+            all).
         min_score: Only detections with a higher score count.
+
+    Returns:
+        Scores of the dataset.
 
     Raises:
         ValueError: No category has a true primitive.
@@ -230,9 +322,17 @@ def compute_detection_scores(
 
 
 def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
-    """(t,) mean over 101 recall points of the interpolated precision; hit (d, t), best score first, num_truths > 0.
+    """Compute the mean of the interpolated precision over 101 recall points.
 
-    The precision at a recall is the highest one reached at that recall or beyond, 0 if it is never reached.
+    The interpolated precision at a recall is the highest precision at this recall or a greater one. It is 0 for a
+    recall that the detections never reach.
+
+    Args:
+        hit: (d, t) bool true positives, in order of decreasing score.
+        num_truths: Number of true primitives, > 0.
+
+    Returns:
+        (t,) average precision in [0, 1].
     """
     if len(hit) == 0:
         return np.zeros(hit.shape[1])
@@ -253,12 +353,19 @@ def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PairSums:
-    """The sums from which mean IoU3D is computed, over scenes; all (11,), one entry per category."""
+    """Sums over scenes from which the mean IoU3D is computed. Each array is (11,), with one entry per category.
+
+    Attributes:
+        truths: Number of true primitives.
+        predictions: Number of predicted primitives.
+        pairs: Number of matched pairs.
+        iou: Sum of IoU3D over the matched pairs.
+    """
 
     truths: np.ndarray
     predictions: np.ndarray
-    pairs: np.ndarray  # matched ones
-    iou: np.ndarray  # sum of IoU3D over the pairs
+    pairs: np.ndarray
+    iou: np.ndarray
 
     def __add__(self, other: PairSums) -> PairSums:
         return PairSums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
@@ -267,9 +374,16 @@ class PairSums:
 def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
     """Match the primitives of one scene with their predictions and sum the pairs.
 
-    Matching is one to one within each category and maximises the sum of IoU3D; two primitives that do not overlap are
-    not a pair. IoU3D of boxes is exact, that of ellipsoids is sampled (iou3d.py). Every prediction counts, regardless
-    of its existence, so pass only those to keep.
+    Matching is one-to-one within each category and maximises the sum of IoU3D. Two primitives that do not overlap are
+    not a pair. The IoU3D of boxes is exact, and the IoU3D of ellipsoids is sampled (iou3d.py). Each prediction counts,
+    regardless of its existence probability. Remove improbable predictions before the call.
+
+    Args:
+        truth: True scene.
+        prediction: Predicted scene.
+
+    Returns:
+        Sums of the scene.
     """
     sums = PairSums(truth.counts(), prediction.counts(), *np.zeros((2, len(CATEGORIES))))
     for c in np.flatnonzero((sums.truths > 0) & (sums.predictions > 0)):
@@ -284,15 +398,26 @@ def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
 
 @dataclass(frozen=True)
 class PairScores:
-    """IoU3D of matched primitives in [0, 1], over all SCORED categories together and by category, VE among them.
+    """IoU3D of matched primitives in [0, 1].
 
-    A category without a truth, or without a pair, has no entry where its share or mean is undefined.
+    Scores over all categories use SCORED, while scores per category include VE. Where a share or mean is 0 / 0, the
+    category has no entry.
+
+    Attributes:
+        mean_iou3d: Mean over matched pairs, None without pairs.
+        truth_iou3d: Mean over true primitives; a true primitive without a partner counts as 0.
+        found: Share of true primitives with a partner.
+        right: Share of predictions with a partner, None without predictions.
+        category_mean_iou3d: `mean_iou3d` per category.
+        category_truth_iou3d: `truth_iou3d` per category.
+        category_found: `found` per category.
+        category_right: `right` per category.
     """
 
-    mean_iou3d: float | None  # over matched pairs; None if there are none
-    truth_iou3d: float  # over truths, those without a partner as 0
-    found: float  # share of truths with a partner
-    right: float | None  # share of predictions with a partner
+    mean_iou3d: float | None
+    truth_iou3d: float
+    found: float
+    right: float | None
     category_mean_iou3d: dict[str, float]
     category_truth_iou3d: dict[str, float]
     category_found: dict[str, float]
@@ -300,7 +425,17 @@ class PairScores:
 
 
 def compute_pair_scores(sums: PairSums) -> PairScores:
-    """Scores of the summed scenes. Raises ValueError if no scored category has a truth."""
+    """Compute the IoU3D of matched primitives from summed scenes.
+
+    Args:
+        sums: Sums over all scenes.
+
+    Returns:
+        Scores of the dataset.
+
+    Raises:
+        ValueError: No scored category has a true primitive.
+    """
     truths, predictions, pairs, iou = (getattr(sums, name) for name in PairSums.__dataclass_fields__)
     total = [part[list(SCORED)].sum() for part in (truths, predictions, pairs, iou)]
     if total[0] == 0:
@@ -325,13 +460,21 @@ def compute_pair_scores(sums: PairSums) -> PairScores:
 
 
 def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
-    """(classes, classes) int64 voxels by true class (rows) and predicted class, from class ids of equal shape.
+    """Count voxels by true and predicted class. Confusion matrices can be added over scenes.
 
-    Confusion matrices add up over scenes. Raises ValueError if the shapes differ.
+    Args:
+        truth: Class ids of the true voxel grid.
+        prediction: Class ids of the predicted voxel grid, of equal shape.
+
+    Returns:
+        (classes, classes) int64 voxels, true class in rows.
+
+    Raises:
+        ValueError: The shapes differ.
     """
     if truth.shape != prediction.shape:
         raise ValueError(f"voxel grids differ in shape: {truth.shape} and {prediction.shape}")
-    filled = np.flatnonzero((truth | prediction).reshape(-1) != EMPTY)  # half of a scene and more is air
+    filled = np.flatnonzero((truth | prediction).reshape(-1) != EMPTY)  # At least half of a scene is empty.
     pair = truth.reshape(-1).take(filled).astype(np.int16) * np.int16(NUM_CLASSES) + prediction.reshape(-1).take(filled)
     confusion = np.bincount(pair, minlength=NUM_CLASSES**2).reshape(NUM_CLASSES, NUM_CLASSES)
     confusion[EMPTY, EMPTY] = truth.size - len(filled)
@@ -340,19 +483,35 @@ def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class VoxelScores:
-    """Voxel scores of a dataset (paper, Tab. 1). A class that neither side ever has, has no entry."""
+    """Voxel scores of a dataset (paper, Tab. 1). A class that occurs on neither side has no entry.
 
-    iou: float  # of occupancy: any class against empty
-    miou: float  # mean of the classes' own, empty left out
+    Attributes:
+        iou: IoU of occupancy: any class against empty.
+        miou: Mean of `class_iou`.
+        class_iou: IoU per class, without the empty class.
+    """
+
+    iou: float
+    miou: float
     class_iou: dict[str, float]
 
 
 def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
-    """Scores of a dataset's summed confusion matrix. Raises ValueError if no voxel is filled on either side."""
+    """Compute voxel scores from the summed confusion matrix of a dataset.
+
+    Args:
+        confusion: (classes, classes) voxels, true class in rows.
+
+    Returns:
+        Scores of the dataset.
+
+    Raises:
+        ValueError: No voxel is filled on either side.
+    """
     hit, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
     class_iou = {name: float(hit[k] / either[k]) for name, k in CLASS_ID.items() if either[k]}
     if not class_iou:
-        raise ValueError("voxel scores need at least one filled voxel; all scenes are empty within the voxel grid")
+        raise ValueError("voxel scores need at least one filled voxel, but all scenes are empty within the voxel grid")
     occupied = np.arange(NUM_CLASSES) != EMPTY
     both = confusion[np.ix_(occupied, occupied)].sum()
     return VoxelScores(
@@ -366,17 +525,26 @@ def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
 
 
 MEMORY = (
-    "rasters",  # float32 tensors of heights and masks, the paper's count (its MB are 2^20 bytes)
-    "vectors",  # float32 features and flags of all slots, the paper's count
-    "vectors_filled",  # the same without empty slots
+    "rasters",  # Height and mask as float32, as the paper counts them; 1 MB in the paper is 2^20 bytes.
+    "vectors",  # Features as float32 and flags of all slots, as the paper counts them.
+    "vectors_filled",  # Features of the filled slots only.
     "latent",
-    "voxels",  # a byte per voxel
-    "voxels_32_bit",  # four, the paper's count for SemCity
+    "voxels",  # One byte per voxel.
+    "voxels_32_bit",  # Four bytes per voxel, as the paper counts them for SemCity.
 )
 
 
 def measure_memory_bytes(layout: LayoutBatch, latent: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """(6,) int64 bytes of the forms MEMORY that one scene takes (paper, Tab. 1); layout is a batch of one."""
+    """Measure the memory of one scene in each of the representations MEMORY (paper, Tab. 1).
+
+    Args:
+        layout: Batch of one scene.
+        latent: Latent of the scene.
+        voxels: Voxel grid of the scene, one byte per voxel.
+
+    Returns:
+        (6,) int64 bytes.
+    """
     return np.array(
         [
             layout.height.nbytes + layout.occupied.nbytes,

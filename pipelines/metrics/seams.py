@@ -1,10 +1,12 @@
 """Measure the visibility of seams between given and generated parts of a scene, relative to nearby lines.
 
-A score is the rate across seams over the rate across nearby lines; 1 means that seams are invisible. A line runs
-between two rows, or two columns, of pixels. Its neighbours are the parallel lines NEAR_M to FAR_M away from it and at
-least NEAR_M away from every seam: far enough to be independent of it, and near enough that streets are similar. Each
-scene gives a record, (measures, 2, 2) float64: numerator and denominator across seams, then across their neighbours.
-Records add up, and a stack of records can be resampled for intervals.
+A score is the rate across seams divided by the rate across nearby lines. A score of 1 means that seams are invisible.
+A line runs between two rows, or two columns, of pixels. A seam is compared with its neighbouring lines. These are
+parallel to the seam, NEAR_M to FAR_M away from it, and at least NEAR_M away from all seams. They are far enough to be
+independent of the seam, and near enough to cross similar streets.
+
+Each scene gives a record (measures, 2, 2) float64. The second axis is seams, then neighbouring lines. The last axis is
+numerator, then denominator. Records can be added, and a stack of records can be resampled for confidence intervals.
 """
 
 from __future__ import annotations
@@ -18,20 +20,29 @@ from models.scene import Scene
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 MEASURES = (
-    "class_changes",  # pairs of pixels across the line, either of them ground, that differ in class
-    "height_step",  # metres of height between such pairs, both of them ground
-    "cut_objects",  # objects at the line that end there instead of crossing it
-    "doubled_objects",  # objects at the line that overlap one of their category from the other side
+    "class_changes",  # Share of pixel pairs across the line that differ in ground class, if at least one is ground.
+    "height_step",  # Mean height difference of pixel pairs across the line (m), if both are ground.
+    "cut_objects",  # Share of objects at the line that end at the line instead of crossing it.
+    "doubled_objects",  # Share of objects at the line that overlap an object of their category from the other side.
 )
 NEAR_M, FAR_M = 4.0, 16.0
-END_M = 0.25  # an object that ends so close to the line ends at it
+END_M = 0.25  # An object ends at a line if its end is at most this far from the line (m).
 DOUBLE_IOU3D = 0.05
 
 
 def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[int] = ()) -> np.ndarray:
-    """(4, 2, 2) of MEASURES for the lines before pixel rows `rows` and pixel columns `cols`.
+    """Measure the seams of one scene and the lines next to them.
 
-    Raises ValueError for a line on or beyond the scene's edge.
+    Args:
+        scene: Scene with seams.
+        rows: Pixel rows; a seam lies before each.
+        cols: Pixel columns; a seam lies before each.
+
+    Returns:
+        (4, 2, 2) record: MEASURES, seams or neighbouring lines, numerator and denominator.
+
+    Raises:
+        ValueError: A seam lies on or beyond the edge of the scene.
     """
     grid = scene.grid
     height_m, ground_class = scene.surface()
@@ -42,14 +53,14 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
         if bad := [line for line in seams if not 0 < line < count]:
             raise ValueError(f"scene {scene.scene_id}: seam before pixel {bad[0]}, expected 1 to {count - 1}")
         edge_m = grid.front_m if axis == 0 else grid.left_m
-        # Along an axis, positions grow with pixels: metres from the far or left edge.
+        # Positions are distances from the front or left edge of the scene, so that they grow with the pixel index.
         low_m, high_m = edge_m - corners_m[:, axis, 1], edge_m - corners_m[:, axis, 0]
         center_m = edge_m - scene.center_m[:, axis]
         pixels = ground_class.swapaxes(0, axis), height_m.swapaxes(0, axis)
         across = np.stack([measure_line(*pixels, line) for line in range(1, count)])
         at_m = grid.resolution_m * np.arange(1, count)
         objects = measure_objects(at_m, low_m, high_m, center_m, doubles)
-        every = np.concatenate([across, objects], axis=1)  # (lines, measures, 2)
+        every = np.concatenate([across, objects], axis=1)  # Shape (lines, measures, 2).
         for line, near in list_parallel_lines(seams, count, grid.resolution_m).items():
             total[:, 0] += every[line - 1]
             total[:, 1] += every[near - 1].mean(axis=0) if len(near) else 0
@@ -57,7 +68,16 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
 
 
 def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -> dict[int, np.ndarray]:
-    """The lines that each seam is compared with."""
+    """List the lines with which each seam is compared.
+
+    Args:
+        seams: Seams, as indices of the pixel after the line.
+        count: Number of pixel rows or columns.
+        resolution_m: Pixel size (m).
+
+    Returns:
+        Indices of the neighbouring lines, by seam.
+    """
     lines = np.arange(1, count)
     nearest_m = np.abs(lines[:, None] - np.array(seams, int).reshape(1, -1)).min(axis=1, initial=count) * resolution_m
     free = lines[nearest_m >= NEAR_M]
@@ -65,7 +85,16 @@ def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -
 
 
 def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> np.ndarray:
-    """(2, 2) class changes and height steps across the line before row `line`."""
+    """Count class changes and sum height steps across a line.
+
+    Args:
+        ground_class: (H, W) index of the ground class, -1 without ground.
+        height_m: (H, W) height of the ground (m).
+        line: Row after the line.
+
+    Returns:
+        (2, 2): class changes and height steps, each with numerator and denominator.
+    """
     before, after = ground_class[line - 1], ground_class[line]
     either, both = (before >= 0) | (after >= 0), (before >= 0) & (after >= 0)
     step = np.abs(height_m[line - 1] - height_m[line])[both]
@@ -75,12 +104,23 @@ def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> n
 def measure_objects(
     at_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, center_m: np.ndarray, doubles: np.ndarray
 ) -> np.ndarray:
-    """(lines, 2, 2) cut and doubled objects at lines (l,), from the objects' ranges and centres along the normal."""
+    """Count cut and doubled objects at lines. Positions are measured along the normal of the lines.
+
+    Args:
+        at_m: (l,) positions of the lines (m).
+        low_m: (n,) lower ends of the objects (m).
+        high_m: (n,) upper ends of the objects (m).
+        center_m: (n,) centres of the objects (m).
+        doubles: (p, 2) indices of overlapping objects of one category.
+
+    Returns:
+        (l, 2, 2): cut and doubled objects, each with numerator and denominator.
+    """
     at = at_m[:, None]
     ends = (np.abs(low_m - at) <= END_M) | (np.abs(high_m - at) <= END_M)
     crosses = (low_m < at - END_M) & (high_m > at + END_M)
     touches = ends | crosses
-    beyond = center_m[None] > at  # (l, n)
+    beyond = center_m[None] > at  # Shape (l, n).
     a, b = doubles.T
     parted = (beyond[:, a] != beyond[:, b]) & touches[:, a] & touches[:, b]
     doubled = np.zeros_like(touches)
@@ -93,13 +133,27 @@ def measure_objects(
 
 
 def compute_footprint_ranges(scene: Scene) -> np.ndarray:
-    """(n, 2, 2) least and greatest x, and y, of each primitive's box."""
+    """Compute the range of x and of y that the box of each primitive covers.
+
+    Args:
+        scene: Scene with n primitives.
+
+    Returns:
+        (n, 2, 2): x and y, each with minimum and maximum (m, scene frame).
+    """
     reach = 0.5 * (np.abs(scene.rotation) * scene.size_m[:, None, :]).sum(axis=2)[:, :2]
     return np.stack([scene.center_m[:, :2] - reach, scene.center_m[:, :2] + reach], axis=2)
 
 
 def find_doubled_objects(scene: Scene) -> np.ndarray:
-    """(p, 2) indices of objects of one category whose IoU3D is above DOUBLE_IOU3D."""
+    """Find pairs of objects of one category whose IoU3D is above DOUBLE_IOU3D.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        (p, 2) indices of the objects.
+    """
     boxes = extract_boxes(scene)
     iou = np.triu(compute_iou3d_matrix(boxes, boxes), 1)
     iou[scene.category[:, None] != scene.category] = 0
@@ -107,11 +161,16 @@ def find_doubled_objects(scene: Scene) -> np.ndarray:
 
 
 def estimate_seam_ratios(records: np.ndarray, key: int = 0) -> dict[str, Estimate | None]:
-    """Rate across seams over the rate across neighbouring lines, from records (scenes, 4, 2, 2).
+    """Estimate the rate across seams divided by the rate across neighbouring lines.
 
-    None where no neighbouring line has anything that could show.
+    Args:
+        records: (scenes, 4, 2, 2) records of `measure_scene_seams`.
+        key: Part of the seed of the bootstrap.
+
+    Returns:
+        Ratio with its 95 % interval by measure. None where the ratio is undefined because a denominator is 0.
     """
-    drawn = np.tensordot(compute_weights(len(records), key), records, axes=1)  # (1 + draws, 4, 2, 2)
+    drawn = np.tensordot(compute_weights(len(records), key), records, axes=1)  # Shape (1 + draws, 4, 2, 2).
     with np.errstate(divide="ignore", invalid="ignore"):
         rates = drawn[..., 0] / drawn[..., 1]
         ratios = rates[..., 0] / rates[..., 1]

@@ -1,4 +1,4 @@
-"""Compute layout statistics: one vector of named numbers per scene. Sources compare as sets of these vectors."""
+"""Compute layout statistics: one vector of named numbers per scene. Sources are compared as sets of these vectors."""
 
 from __future__ import annotations
 
@@ -12,17 +12,30 @@ EXTENTS = ("length_m", "width_m", "height_m")
 
 
 def list_statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
-    """Columns of `compute_layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share."""
+    """Return the column names of `compute_layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share.
+
+    Args:
+        ground_classes: Names of the ground classes.
+
+    Returns:
+        11 + 33 + G names.
+    """
     counts = [f"num_{category}" for category in CATEGORIES]
     extents = [f"{category}_{extent}" for category in CATEGORIES for extent in EXTENTS]
     return (*counts, *extents, *(f"{name}_share" for name in ground_classes))
 
 
 def compute_layout_statistics(scene: Scene) -> np.ndarray:
-    """(11 + 33 + G,) float64, columns as in `list_statistic_names(scene.ground_classes)`.
+    """Compute the layout statistics of one scene: object counts, mean extents and shares of ground classes.
 
-    Counts; mean extents in metres, NaN for an absent category; share of the scene's pixels per ground class (classes
-    may overlap).
+    Ground classes may overlap, so that their shares may sum to more than 1.
+
+    Args:
+        scene: Scene with G ground classes.
+
+    Returns:
+        (11 + 33 + G,) float64: objects per category, mean extents per category (m, NaN without objects), share of
+        pixels per ground class.
     """
     counts = scene.counts()
     totals = np.zeros((len(CATEGORIES), 3))
@@ -33,19 +46,28 @@ def compute_layout_statistics(scene: Scene) -> np.ndarray:
 
 
 def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shift and scale layout statistics (n, s) and (m, s) by the reference's mean and standard deviation.
+    """Shift and scale layout statistics by the reference's mean and standard deviation.
 
-    Distances then have no unit, and columns have about the same weight; a constant column is only shifted. NaN, the
-    size of an absent category, becomes the reference's mean.
+    Distances are then without unit, and all columns have about the same weight. A constant column is only shifted. NaN,
+    the size of an absent category, becomes the reference's mean.
+
+    Args:
+        reference: (n, s) statistics that define mean and standard deviation.
+        other: (m, s) statistics.
+
+    Returns:
+        Both sides, standardised.
 
     Raises:
-        ValueError: There are fewer than 2 scenes, or the columns differ.
+        ValueError: A side has fewer than 2 scenes, or the columns differ.
     """
     reference, other = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if reference.ndim != 2 or other.ndim != 2 or reference.shape[1] != other.shape[1]:
-        raise ValueError(f"layout statistics must be (scenes, columns), alike: {reference.shape}, {other.shape}")
+        raise ValueError(
+            f"layout statistics must be (scenes, columns) with equal columns, got {reference.shape} and {other.shape}"
+        )
     if min(len(reference), len(other)) < 2:
-        raise ValueError(f"layout statistics need at least 2 scenes a side, got {len(reference)} and {len(other)}")
+        raise ValueError(f"layout statistics need at least 2 scenes per side, got {len(reference)} and {len(other)}")
     known = ~np.isnan(reference)
     number = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, reference, 0).sum(axis=0) / number

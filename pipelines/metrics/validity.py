@@ -1,8 +1,9 @@
-"""Validity of scenes: overlapping, floating or sunken objects, cars off the road, buildings on it, broken roads.
+"""Compute the validity of scenes: shares of implausible primitives, connectivity of the road and label fidelity.
 
-One record per scene: (measures, 2) float64, a numerator and a denominator per measure. Records add up; a stack of them
-can be resampled for intervals. A measure is a share, the lower the better except `road_connectivity` and label
-fidelity; real scenes give the level to compare with, it is not 0.
+Each scene gives one record (measures, 2) float64 with a numerator and a denominator per measure. Records can be added,
+and a stack of records can be resampled for confidence intervals. Each measure is a share. Lower is better, except for
+`road_connectivity` and label fidelity. Compare the shares with those of real scenes, because real scenes do not reach
+0.
 """
 
 from __future__ import annotations
@@ -18,22 +19,24 @@ from pipelines.geometry.masks import label_parts
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
-    "overlapping",  # solid primitives with IoU3D > 0.05 with another solid one
-    "floating",  # standing primitives with known ground whose lowest point is more than 0.5 m above the surface
-    "sunken",  # ... more than 0.5 m below it
-    "over_unknown_ground",  # standing primitives inside the grid whose centre lies over no ground at all
-    "off_road_vehicles",  # vehicles with known ground whose centre lies on no drivable class
-    "buildings_on_road",  # buildings with known ground whose centre lies on the road
-    "road_connectivity",  # road pixels in the scene's largest 4-connected road component; mean over scenes with road
+    "overlapping",  # Solid primitives whose IoU3D with another solid primitive exceeds 0.05.
+    "floating",  # Standing primitives with known ground whose lowest point is more than 0.5 m above the surface.
+    "sunken",  # Standing primitives with known ground whose lowest point is more than 0.5 m below the surface.
+    "over_unknown_ground",  # Standing primitives inside the grid without any ground under their centre.
+    "off_road_vehicles",  # Vehicles with known ground whose centre lies on no drivable class.
+    "buildings_on_road",  # Buildings with known ground whose centre lies on the road.
+    "road_connectivity",  # Share of road pixels in the largest 4-connected component, averaged over scenes with road.
 )
 LABEL_MEASURES = ("vegetation_fidelity", "vehicle_fidelity", "joint_fidelity")
 
 OVERLAP_IOU3D = 0.05
 TOLERANCE_M = 0.5
-SLAB_OFFSET_M = 0.3  # where ground heights are slab tops (KITTI-360, town); 0 where they are the surface (Argoverse 2)
+SLAB_OFFSET_M = 0.3  # For ground heights that are slab tops (KITTI-360, town); 0 for surface heights (Argoverse 2).
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
-# Of these, 0 % float and 7 % are sunk in a real drive of KITTI-360. Left out: signs, lamps and crowns, which hang in
-# the air there too (100 % and 29 %), and hedges and walls, which are drawn into the ground (37 % and 28 %).
+# Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of their primitives float and 7 %
+# are sunken. The other categories are excluded because annotators place them differently in the same drive:
+# traffic_control (100 % float), vegetation_ellipsoid (29 % float), vegetation_cuboid (37 % sunken) and
+# construction_small (28 % sunken).
 STANDING = tuple(
     CATEGORY_INDEX[name]
     for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole", "object")
@@ -42,17 +45,29 @@ BUILDING = CATEGORY_INDEX["construction_big"]
 
 
 def find_slab_offset_m(surface: str) -> float:
-    """Return the height of a dataset's ground above the objects' surface, by `surface` of its LayoutSpec; metres."""
+    """Return the height of a dataset's ground raster above the surface on which its objects stand.
+
+    Args:
+        surface: Attribute `surface` of the dataset's LayoutSpec.
+
+    Returns:
+        Offset (m).
+    """
     return SLAB_OFFSET_M if surface == "top" else 0.0
 
 
 def find_faults(
     scene: Scene, slab_offset_m: float, tolerance_m: float = TOLERANCE_M
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """For each of MEASURES but the last: which primitives (n,) bool are at fault, and among which it is looked for.
+    """Find the primitives at fault, for each of MEASURES except `road_connectivity`.
 
-    slab_offset_m is how far the scene's ground heights lie above the surface that objects stand on (SLAB_OFFSET_M);
-    tolerance_m how far off it a thing may be.
+    Args:
+        scene: Scene with n primitives.
+        slab_offset_m: Height of the scene's ground raster above the surface on which objects stand (m).
+        tolerance_m: Maximum distance of an object from the surface (m).
+
+    Returns:
+        By measure: (n,) bool primitives at fault, and (n,) bool primitives to which the measure applies.
     """
     category = scene.category
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
@@ -77,18 +92,37 @@ def find_faults(
 
 
 def compute_scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
-    """(7, 2) numerators and denominators of MEASURES for one scene; slab_offset_m as for `find_faults`."""
+    """Compute the validity record of one scene.
+
+    Args:
+        scene: Scene.
+        slab_offset_m: Height of the scene's ground raster above the surface on which objects stand (m).
+
+    Returns:
+        (7, 2) numerators and denominators of MEASURES.
+    """
     shares = [(int(bad.sum()), int(among.sum())) for bad, among in find_faults(scene, slab_offset_m).values()]
     return np.array([*shares, _find_largest_component(_make_mask(scene, ROAD_CLASSES))], np.float64)
 
 
 def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
-    """(3, 2) LABEL_MEASURES: whether the density computed from the scene equals its label, the requested one.
+    """Compare the density computed from a scene with its density label, the requested one.
 
-    A missing label is not judged. Raises ValueError for a scene without any label.
+    A missing label is not judged.
+
+    Args:
+        scene: Scene with at least one density label.
+        vegetation: Thresholds of the vegetation density.
+        vehicle: Thresholds of the vehicle density.
+
+    Returns:
+        (3, 2) numerators and denominators of LABEL_MEASURES.
+
+    Raises:
+        ValueError: The scene has no density label.
     """
     if scene.vegetation_density is None and scene.vehicle_density is None:
-        raise ValueError(f"scene {scene.scene_id} has no density label; label fidelity needs the requested one")
+        raise ValueError(f"scene {scene.scene_id} has no density label; label fidelity needs the requested label")
     right = []
     for categories, thresholds, label in (
         (VEGETATION, vegetation, scene.vegetation_density),
@@ -104,14 +138,22 @@ def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle:
 def compute_validity_rates(
     records: np.ndarray | Sequence[Any], names: Sequence[str] = MEASURES
 ) -> dict[str, float | None]:
-    """Compute the share per measure over all scenes, from records (scenes, measures, 2); None if nothing was judged."""
+    """Compute the share of each measure over all scenes.
+
+    Args:
+        records: (scenes, measures, 2) numerators and denominators.
+        names: Names of the measures.
+
+    Returns:
+        Share in [0, 1] by measure, None if its denominators sum to 0.
+    """
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T
     return {n: float(a / b) if b > 0 else None for n, a, b in zip(names, numerator, denominator, strict=True)}
 
 
 def _find_overlapping(scene: Scene) -> np.ndarray:
-    """(n,) bool: whether a solid primitive overlaps another solid one by more than OVERLAP_IOU3D."""
+    """Return (n,) bool: whether a solid primitive overlaps another solid primitive with IoU3D above OVERLAP_IOU3D."""
     solid = np.flatnonzero(np.isin(scene.category, SOLID))
     boxes = extract_boxes(scene).take(solid)
     iou = compute_iou3d_matrix(boxes, boxes)
@@ -122,13 +164,13 @@ def _find_overlapping(scene: Scene) -> np.ndarray:
 
 
 def _make_mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
-    """(H, W) bool: whether any of the classes occupies the pixel (classes may overlap)."""
+    """Return (H, W) bool: whether any of the classes occupies the pixel. Classes may overlap."""
     index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
     return np.any(scene.occupied[index], axis=0)
 
 
 def _find_largest_component(mask: np.ndarray) -> tuple[float, int]:
-    """Share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
+    """Return the share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
     components, _ = label_parts(mask)
     sizes = np.bincount(components.ravel())[1:]
     return (float(sizes.max() / sizes.sum()), 1) if len(sizes) else (0.0, 0)

@@ -54,7 +54,7 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
         written = json.loads((tmp_path / directory / "metrics.json").read_text())["generation"]
         page = (tmp_path / directory / "evaluation.html").read_text()
         assert written["memorisation"]["generated"]["mean"]["value"] > 0
-        assert "no score of theirs compares with published ones" in page and page.count("<img") > 10
+        assert "scores are not comparable with published scores" in page and page.count("<img") > 10
 
 
 def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):

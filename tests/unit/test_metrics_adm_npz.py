@@ -117,8 +117,8 @@ def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
 def test_npz_writer_rejects_bad_images_and_leaves_nothing(tmp_path):
     path = str(tmp_path / "x.npz")
     for batches, count, match in (
-        ([pictures()], 8, "got 7 pictures, 8 were announced"),
-        ([pictures(), pictures()], 7, "got 14 pictures, 7 were announced"),
+        ([pictures()], 8, "got 7 pictures, expected 8"),
+        ([pictures(), pictures()], 7, "got 14 pictures, expected 7"),
         ([pictures(), pictures(1, 4, 6)], 8, r"one size, got uint8 \(1, 4, 6, 3\) after 7"),
         ([pictures().astype(np.float32)], 7, "got float32"),
         ([pictures()[..., :1]], 7, r"got uint8 \(7, 5, 6, 1\)"),
@@ -165,7 +165,7 @@ def test_npz_reader_rejects_incomplete_or_foreign_moments(tmp_path):
     broken[5] = np.nan
     for arrays, match in (
         ({"mu": mu}, r"holds \['mu'\] only"),
-        ({"mu": mu, "sigma": sigma, "mu_s": mu}, "only; mean and covariance"),
+        ({"mu": mu, "sigma": sigma, "mu_s": mu}, r"only; a mean \(mu\) and its covariance"),
         ({"mu": mu[:768], "sigma": sigma}, r"mu is float64 \(768,\), .* need floats \(2048,\)"),
         ({"mu": mu, "sigma": sigma[:5]}, "sigma is float32"),
         ({"mu": broken, "sigma": sigma}, "mu holds NaN"),

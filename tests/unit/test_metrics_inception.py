@@ -313,7 +313,7 @@ def test_inception_loads_pth_and_safetensors(network, tmp_path):
     images = pictures(1)
     expected = compute_inception_features(network, images)
     for name in ("weights.pth", "weights.safetensors"):
-        with pytest.warns(UserWarning, match="no score of theirs compares with published ones"):
+        with pytest.warns(UserWarning, match="scores are not comparable with published scores"):
             loaded = load_inception(tmp_path / name)
         assert loaded.weights_sha256 == hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
         for got, want in zip(compute_inception_features(loaded, images), expected, strict=True):
@@ -345,7 +345,7 @@ def test_inception_recognizes_published_weights_by_sha(network, tmp_path, monkey
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     assert f"{path}, sha256 {sha256}: not weights-inception-2015-12-05-6726825d.pth" in describe_weights(path)
     monkeypatch.setattr(inception, "KNOWN_SHA256", sha256)
-    assert describe_weights(path) == f"Inception weights {path}, sha256 {sha256}: the published ones"
+    assert describe_weights(path) == f"Inception weights {path}, sha256 {sha256}: the published file"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_inception(path).weights_sha256 == sha256

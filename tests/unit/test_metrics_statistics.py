@@ -79,5 +79,5 @@ def test_layout_frechet_is_finite_for_constant_columns():
     assert np.isfinite(layout_frechet(a, b))
     with pytest.raises(ValueError, match="at least 2 scenes"):
         layout_frechet(a, b[:1])
-    with pytest.raises(ValueError, match="alike"):
+    with pytest.raises(ValueError, match="equal columns"):
         layout_frechet(a, b[:, :2])
