@@ -5,6 +5,7 @@
 #   make test-fast   tests/unit: no Ray, no browser, about a minute
 #   make test        all tests but slow ones, with line coverage
 #   make test-slow   long checks, marked slow
+#   make docs        the documentation site in build/site; executes the tutorials
 #   make coverage    lines that the last make test did not run, without those in Ray's processes
 PYTHON ?= python3
 BIN := .venv/bin
@@ -22,7 +23,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 unexport PYTHONDONTWRITEBYTECODE
 
 TESTS := test test-fast test-slow
-.PHONY: demo lint $(TESTS) coverage browser clean
+.PHONY: demo lint docs $(TESTS) coverage browser clean
 demo: .venv/ready
 	$(BIN)/python jobs/run_demo.py --output runs/demo
 
@@ -30,6 +31,10 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+docs: .venv/ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "documentation: build/site/index.html"
 
 $(TESTS): export RAY_DATA_USE_DATASOURCE_V2 = 0
 $(TESTS): export RAY_TRAIN_HEALTH_CHECK_INTERVAL_S = 0.2

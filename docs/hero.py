@@ -1,6 +1,6 @@
-"""README's picture, from the released weights: scenes by label, one of them outpainted, and a drive through it.
+"""Draw the picture of README from the released weights: scenes by label, one of them outpainted, and street views.
 
-python docs/hero.py            writes docs/hero.png; half a minute on two cores
+python docs/hero.py            writes docs/pictures/hero.png in half a minute on two cores
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
     above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stack_pictures(draw_street_views(larger), 0)
     below = stack_pictures([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
-    Path(__file__).with_name("hero.png").write_bytes(encode_png(stack_pictures([above, below], 0)))
+    Path(__file__).with_name("pictures/hero.png").write_bytes(encode_png(stack_pictures([above, below], 0)))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -281,7 +282,7 @@ def decode_layout(
     )
 
 
-def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields) -> Scene:
+def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec: LayoutSpec, **fields: Any) -> Scene:
     """Make an empty generated Scene, for example as the identity for `decode_layout`.
 
     Args:

@@ -4,7 +4,7 @@ import duckdb
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers import ROOT, random_scene
+from helpers import random_scene
 
 from models.scene import Grid
 from pipelines.runtime import storage
@@ -70,18 +70,6 @@ def test_shard_is_queryable_by_duckdb(tmp_path, scenes):
     )
     gap, low, high = canonical.fetchall()[0]
     assert gap >= 0 and low >= -np.pi / 2 - 1e-6 and high < np.pi / 2
-
-
-def test_shard_is_readable_by_decoder_of_readme(tmp_path, scenes):
-    """The ten lines of the README that decode tables without this package."""
-    Shard(str(tmp_path), "town", "train", 0).write(scenes)
-    readme = ROOT / "README.md"
-    block = readme.read_text().split("<!-- decoder -->")[1].split("```python")[1].split("```")[0]
-    assert len([line for line in block.splitlines() if line.strip()]) <= 10
-    names = {}
-    exec(block.replace("DIR", str(tmp_path)), names)
-    assert np.abs(names["height_m"] - scenes[0].height_m).max() <= HEIGHT_STEP_M / 2 + 1e-5
-    assert np.array_equal(names["occupied"], scenes[0].occupied)
 
 
 def test_shard_names_truncated_and_missing_files(tmp_path, scenes):

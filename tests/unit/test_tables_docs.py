@@ -1,4 +1,4 @@
-"""docs/tables.md: every block runs, every answer is right, the column lists are the schemas'; files explain themselves.
+"""docs/reference/tables.md: every block runs, every answer is right, the column lists are the schemas'; files explain themselves.
 
 python tests/unit/test_tables_docs.py      writes the lists of columns and categories into the page
 """
@@ -40,7 +40,7 @@ from pipelines.schema.tables import (
     read_scenes,
 )
 
-PAGE = ROOT / "docs/tables.md"
+PAGE = ROOT / "docs/reference/tables.md"
 SCHEMAS = {
     "scenes": SCENES,
     "primitives": PRIMITIVES,
@@ -241,7 +241,7 @@ def test_tables_page_trees_per_kilometer(answers, town):
 
 
 def test_tables_page_ground_shares(answers, town, fake):
-    answer = asked(answers, "How is the ground", "source", "vehicle_density")
+    answer = asked(answers, "Which ground classes", "source", "vehicle_density")
     for label in {s.vehicle_density for s in town}:
         share = np.mean([s.ground_area_m2() for s in town if s.vehicle_density == label], axis=0) / 64**2
         for name, expected in zip(town[0].ground_classes, share, strict=True):
@@ -255,7 +255,7 @@ def test_tables_page_cluttered_sidewalks(answers, town):
     for sequence, drive in drives_of(town).items():
         things = sum(of(s, "pole", "traffic_control", "object").sum() for s in drive)
         sidewalk_m2 = sum(s.ground_area_m2()[1] for s in drive)
-        assert abs(answer.things_per_1000_m2[sequence] - 1000 * things / sidewalk_m2) <= 0.051
+        assert abs(answer.objects_per_1000_m2[sequence] - 1000 * things / sidewalk_m2) <= 0.051
 
 
 def test_tables_page_pole_heights(answers, town):
@@ -309,7 +309,7 @@ def test_tables_page_objects_seen_again(answers, town):
             seen_again.update(a.category[np.nonzero(same_object)[0]].tolist())
             moved.update(a.category[np.nonzero(same_object & ~same_place)[0]].tolist())
             mistaken.update(a.category[np.nonzero(same_place & ~same_object)[0]].tolist())
-    answer = asked(answers, "seen again", "category")
+    answer = asked(answers, "visible from the next", "category")
     for k, name in enumerate(CATEGORIES):
         if name in answer.index:
             assert answer.loc[name].tolist() == [seen_again[k], moved[k], mistaken[k]]
@@ -343,7 +343,7 @@ def test_tables_page_label_combinations(answers, town):
 
 
 def test_tables_page_nearest_training_pose(answers, town):
-    answer = asked(answers, "Do test scenes", "sequence")
+    answer = asked(answers, "How close are test scenes", "sequence")
     place = {split: [s.world_xyz_m[:2] for s in town[:16] if s.split == split] for split in ("train", "test")}
     nearest_m = np.linalg.norm(np.array(place["test"])[:, None] - np.array(place["train"]), axis=2).min()
     assert answer.loc[town[0].sequence, ["test_scenes", "nearest_m"]].tolist() == pytest.approx(
@@ -353,7 +353,7 @@ def test_tables_page_nearest_training_pose(answers, town):
 
 
 def test_tables_page_reject_reasons(answers, rejects):
-    answer = asked(answers, "What was left out", "reason")
+    answer = asked(answers, "Which scenes were left out", "reason")
     assert answer.scenes.to_dict() == Counter(row["reason"] for row in rejects)
 
 
