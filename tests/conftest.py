@@ -12,11 +12,15 @@ os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-UNCHECKED = "pipelines.preprocess.sources.town.land"  # millions of calls of one subtraction
+UNCHECKED = "pipelines.preprocess.sources.town.land"  # checks would slow millions of calls of a short function
 
 
 def list_checked_modules() -> list[str]:
-    """Modules of models and pipelines without Ray, which pickles local functions by value; checked ones cannot be."""
+    """Return the modules of models and pipelines whose annotations are checked.
+
+    Modules that import Ray are left out: Ray pickles their local functions by value, and checked functions cannot be
+    pickled.
+    """
     paths = [path for package in ("models", "pipelines") for path in sorted((ROOT / package).rglob("[!_]*.py"))]
     modules = [
         path
@@ -27,7 +31,7 @@ def list_checked_modules() -> list[str]:
     return [name for name in names if name != UNCHECKED]
 
 
-# Annotations of arguments, returns and dataclass fields are checked in this process, shapes included.
+# This process checks annotations of arguments, returns and dataclass fields, including shapes.
 ROOT = Path(__file__).parents[1]
 install_import_hook(list_checked_modules(), "typechecker.check_types")
 
@@ -37,7 +41,7 @@ from helpers import (
     REJECT_REASON,
     SHARD_SIZES,
     TOWN_SLOTS,
-    free_port,
+    find_free_port,
     random_scene,
     small_spec,
     studio_scene,
@@ -51,13 +55,21 @@ from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.runtime import storage
 from pipelines.schema.tables import Shard, make_rejects_table
 
-MARKERS = {"unit": (), "integration": ("ray",), "faults": ("ray", "faults"), "browser": ("ray", "browser")}  # by folder
+MARKERS = {
+    "unit": (),
+    "integration": ("ray",),
+    "faults": ("ray", "faults"),
+    "browser": ("ray", "browser"),
+}  # folder -> markers of its tests
 SMOKE_MODULES = {"test_evaluate_job", "test_generation_jobs", "test_publish_job", "test_voxel_import_job"}
 SLOW_MODULES = ("test_faults", "test_train_jobs", "test_commands", "test_ablation_job", "test_preprocess_job")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks tests by their folder. Slow modules run first, so that none of them is left for one process at the end."""
+    """Mark tests by their folder and sort slow modules first.
+
+    Otherwise one process may run a slow module at the end while the other processes are idle.
+    """
     for item in items:
         folder, module = item.path.parent.name, item.path.stem
         for marker in MARKERS[folder]:
@@ -72,7 +84,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """With several processes, a module runs in one of them, and all SMOKE_MODULES in the same: they share `smoke`."""
+    """Return a scheduler that runs each module in one process.
+
+    All SMOKE_MODULES run in the same process because they share the fixture `smoke`.
+    """
     from xdist.scheduler import LoadFileScheduling
 
     class SmokeScheduling(LoadFileScheduling):
@@ -86,7 +101,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Real excerpts (kitti360/, av2/): $PRITTI_TEST_DATA, or if unset shared/data next to the repository."""
+    """Folder with excerpts of real drives (kitti360/, av2/).
+
+    The folder is $PRITTI_TEST_DATA. The default is shared/data next to the repository.
+    """
     path = Path(os.environ.get("PRITTI_TEST_DATA") or ROOT.parent / "shared" / "data")
     if not path.is_dir():
         pytest.skip(f"no real data: {path} does not exist; set PRITTI_TEST_DATA to a folder with kitti360/ and av2/")
@@ -129,7 +147,7 @@ def cluster(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory, cluster) -> Path:
-    """A separate $PRITTI_HOME in which the smoke presets have run once: data, models, latents."""
+    """A separate $PRITTI_HOME with data, models and latents of the smoke presets."""
     path = tmp_path_factory.mktemp("home")
     os.environ["PRITTI_HOME"] = str(path)
     from jobs.implementation.train_dit import train
@@ -141,7 +159,7 @@ def home(tmp_path_factory, cluster) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME for jobs after training: as `home`, but trained in this process, without Ray Train."""
+    """A $PRITTI_HOME like `home`, but with models that this process trains without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
     import torch
@@ -185,7 +203,7 @@ def layout_shards(tmp_path_factory) -> tuple[Shard, ...]:
 
 @pytest.fixture(scope="session")
 def town_dataset(tmp_path_factory) -> str:
-    """A town dataset of 8 + 4 scenes in three shards, with rejects and reader reports, written without Ray."""
+    """A town dataset of 8 training and 4 test scenes in three shards, with rejects and reader reports."""
     root = str(tmp_path_factory.mktemp("inspect") / "town")
     for seed, split, number, count in ((0, "train", 0, 5), (1, "train", 1, 3), (1_000_000, "test", 0, 4)):
         drive = generate_town(seed)
@@ -290,7 +308,7 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
     controlnet = ControlNetModel(in_channels=4, conditioning_embedding_out_channels=(16, 32), **common)
     embedding = controlnet.controlnet_cond_embedding.conv_out
     for block in (*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block, embedding):
-        torch.nn.init.normal_(block.weight, std=0.5)  # initially zero: the image would have no effect
+        torch.nn.init.normal_(block.weight, std=0.5)  # these weights are initially zero, which would disable the image
     vae = AutoencoderKL(
         block_out_channels=(32, 64),
         down_block_types=("DownEncoderBlock2D",) * 2,
@@ -315,7 +333,7 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
 
 @pytest.fixture(scope="session")
 def studio_files(tmp_path_factory) -> Path:
-    """`tables` with three scenes and `model`, a pipeline with random weights."""
+    """Folder with three scenes in `tables` and a pipeline with random weights in `model`."""
     root = tmp_path_factory.mktemp("studio")
     Shard(str(root / "tables"), "town", "test", 0).write([studio_scene(k) for k in range(3)])
     tiny_pipeline(small_spec()).save_pretrained(root / "model")
@@ -324,14 +342,14 @@ def studio_files(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def studio_url(studio_files, cluster) -> Iterator[str]:
-    """URL of a studio that Ray Serve serves."""
+    """URL of a studio on Ray Serve."""
     from ray import serve as ray_serve
 
     from jobs.implementation.serve_studio import serve_studio
     from jobs.serve_studio import Config
 
     yield serve_studio(
-        Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=free_port(), num_threads=1)
+        Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=find_free_port(), num_threads=1)
     )
     ray_serve.shutdown()
 

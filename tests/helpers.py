@@ -31,17 +31,17 @@ from models.scene import (
 )
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
-ROOT = Path(__file__).parents[1]  # of the repository
+ROOT = Path(__file__).parents[1]  # folder of the repository
 LATENT_SHAPE = (4, 8, 8)
 VOID = {"meta", "img", "line", "polyline", "rect", "circle"}  # elements without a closing tag
 QUICK = RePaintConfig(num_inference_steps=6, jump_length=2, resamplings=2)
 SHARD_SIZES = (5, 3, 7, 4, 6)
-TOWN_SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}  # of the dataset that the fixture town_dataset writes
+TOWN_SLOTS = {"vegetation_cuboid": 90, "vehicle_small": 12}  # slots in the fixture town_dataset
 REJECT_REASON = "heights <beyond> 327 m"
 
 
 def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) -> np.ndarray:
-    """(n, 3, 3): yaw anywhere, then pitch up to tilt_rad."""
+    """Return n random rotations (n, 3, 3): any yaw and a pitch of at most tilt_rad."""
     yaw, pitch = rng.uniform(-np.pi, np.pi, n), rng.uniform(-tilt_rad, tilt_rad, n)
     cos, sin, zero, one = np.cos(pitch), np.sin(pitch), np.zeros(n), np.ones(n)
     tilt = np.stack([np.stack(r, -1) for r in ([cos, zero, sin], [zero, one, zero], [-sin, zero, cos])], -2)
@@ -49,7 +49,7 @@ def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) 
 
 
 def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad: float = 0.2, **fields) -> Scene:
-    """n primitives of random categories on half planes of ground."""
+    """Return a scene with n primitives of random categories on half planes of ground."""
     rng = np.random.default_rng(seed)
     grid = grid or Grid()
     size = rng.uniform(0.3, 5.0, (n, 3))
@@ -82,7 +82,7 @@ def small_spec(pixels: int = 32, slots: int = 6) -> LayoutSpec:
 
 
 def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
-    """Random weights: a smoke LVAE and a DiT of one block."""
+    """Return a pipeline with random weights: an LVAE of the smoke preset and a DiT of one block."""
     torch.manual_seed(0)
     lvae = LayoutVAE(layout=spec.to_dict(), **LVAE_PRESETS["smoke"].architecture())
     channels, size, _ = lvae.latent_shape
@@ -95,13 +95,13 @@ def tiny_pipeline(spec: LayoutSpec) -> PrITTIPipeline:
 
 
 def scenes_equal(a, b) -> bool:
-    """True if all fields that decoders predict are equal."""
+    """Return True if two scenes are equal in all fields that decoders predict."""
     names = ("category", "center_m", "size_m", "rotation", "height_m", "occupied")
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
 def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene:
-    """A road with sidewalks over rolling terrain, and n tilted primitives of every category."""
+    """Return a road with sidewalks on rolling terrain, with n tilted primitives of all categories."""
     rng = np.random.default_rng(seed)
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
@@ -135,7 +135,7 @@ def example_scene(n: int = 60, grid: Grid | None = None, seed: int = 0) -> Scene
 
 
 def empty_scene() -> Scene:
-    """A scene without primitives and ground."""
+    """Return a scene without primitives and without ground."""
     scene = example_scene(0)
     return Scene(
         scene_id="town-1-0000000008",
@@ -154,14 +154,14 @@ def empty_scene() -> Scene:
 
 
 def run_command(*words: str, **environment: str) -> subprocess.CompletedProcess:
-    """Runs a Python script from the root of the repository, with environment variables added."""
+    """Run a Python script from the root of the repository with additional environment variables."""
     return subprocess.run(
         [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, env=os.environ | environment, timeout=120
     )
 
 
 def kill_ray_workers(title: str) -> list[int]:
-    """Kills all Ray workers of this process whose title contains `title`; returns their process ids."""
+    """Kill all Ray workers of this process whose title contains `title` and return their process ids."""
     import psutil  # bundled with Ray, importable after ray
 
     killed = []
@@ -174,7 +174,10 @@ def kill_ray_workers(title: str) -> list[int]:
 
 
 class Page(HTMLParser):
-    """Checks that every element is closed in order; collects elements and text."""
+    """A parsed HTML page with its elements and text.
+
+    Raises AssertionError if an element is not closed in order.
+    """
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -203,13 +206,13 @@ class Page(HTMLParser):
 
 
 def assert_same_primitives(got: Scene, want: Scene, but: tuple[str, ...] = ()) -> None:
-    """Asserts that all fields of the primitives except `but` are equal."""
+    """Assert that all fields of the primitives are equal, except the fields in `but`."""
     for name in set(PER_PRIMITIVE) - set(but):
         assert np.array_equal(getattr(got, name), getattr(want, name), equal_nan=name == "heading_rad"), name
 
 
 class SvgPage(Page):
-    """A page whose drawings have shapes with a title: only these tags stay open."""
+    """A page whose SVG shapes contain titles: only `meta` and `img` have no closing tag."""
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
@@ -218,20 +221,20 @@ class SvgPage(Page):
 
 
 def street_class_ids(rows: int = 44, cols: int = 60) -> np.ndarray:
-    """Sky above a road with a car."""
+    """Return class ids of a picture (rows, cols) with sky above a road with a car."""
     ids = np.full((rows, cols), EMPTY, np.uint8)
     ids[rows // 2 :], ids[rows // 2 : rows // 2 + 8, 20:40] = CLASS_ID["road"], CLASS_ID["vehicle_small"]
     return ids
 
 
 def save_npz(path, voxels: np.ndarray, name: str = "voxels") -> str:
-    """Writes one array as .npz and returns the path."""
+    """Write one array as .npz and return the path."""
     np.savez(path, **{name: voxels})
     return str(path)
 
 
 def studio_scene(number: int) -> Scene:
-    """Three cars on ground, on the model's grid."""
+    """Return a scene with three cars on ground, on the grid of the tiny pipeline."""
     scene = random_scene(number, 3, grid=small_spec().grid, tilt_rad=0, vegetation_density="low")
     center_m = np.array([[12, 0, 0.5], [30, 4, 0.5], [50, -6, 0.5]], np.float32)
     size_m = np.tile(np.array([[4.2, 1.8, 1.5]], np.float32), (3, 1))
@@ -246,8 +249,8 @@ def studio_scene(number: int) -> Scene:
     return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=UNSET, **boxes)
 
 
-def free_port() -> int:
-    """Returns a TCP port of this host that is free."""
+def find_free_port() -> int:
+    """Return a free TCP port of this host."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return listener.getsockname()[1]

@@ -1,9 +1,9 @@
-"""The type checker that jaxtyping's import hook applies to our packages in tests (tests/conftest.py)."""
+"""Type checker for the import hook of jaxtyping, which tests/conftest.py installs."""
 
 import numpy as np
 from beartype import BeartypeConf, BeartypeHintOverrides, beartype
 
-# Python and numpy scalars may stand for each other, and whole numbers for others, as PEP 484 allows for Python's own.
+# A NumPy scalar is accepted where a Python scalar is annotated. An integer is accepted for a float, as in PEP 484.
 check_types = beartype(
     conf=BeartypeConf(
         hint_overrides=BeartypeHintOverrides(

@@ -1,4 +1,4 @@
-"""Headless Chromium for the tests of the gallery and the studio."""
+"""Fixture with a headless Chromium for the tests of the gallery and the studio."""
 
 import os
 import shutil
@@ -13,25 +13,28 @@ from selenium.webdriver.chrome.service import Service
 
 class Browser(webdriver.Chrome):
     def wait_for(self, condition: str, timeout_s: float = 60) -> Any:
-        """Returns the value of a JavaScript expression as soon as it is true."""
+        """Wait until a JavaScript expression is true and return its value."""
         end = time.monotonic() + timeout_s
         while time.monotonic() < end:
             if value := self.execute_script(f"return {condition}"):
                 return value
             time.sleep(0.1)
-        raise AssertionError(f"not true within {timeout_s} s: {condition}")
+        raise AssertionError(f"condition is not true after {timeout_s} s: {condition}")
 
     def console_errors(self) -> list[str]:
-        """Returns the errors that the page logged since the last call."""
+        """Return the errors that the page logged since the last call."""
         return [line["message"] for line in self.get_log("browser") if line["level"] == "SEVERE"]
 
 
 @pytest.fixture
 def browser() -> Iterator[Browser]:
-    """A fresh headless Chromium. Without one the test is skipped; in CI it fails."""
+    """A new headless Chromium.
+
+    Without Chromium or its driver, the test is skipped, or fails if $CI is true.
+    """
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if not (chromium and driver):
-        reason = "chromium or chromedriver is missing: apt-get install -y chromium chromium-driver"
+        reason = "chromium or chromedriver is missing: run apt-get install -y chromium chromium-driver"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
     options = webdriver.ChromeOptions()
     options.binary_location = chromium

@@ -1,4 +1,4 @@
-"""The gallery page in a browser: filters, the 3D view, picking of objects."""
+"""Tests of the gallery page in a browser: filters, the 3D view and picking of objects."""
 
 import io
 import time
@@ -24,15 +24,15 @@ def test_gallery_page_filters_opens_and_picks(gallery_page, gallery_scenes, brow
     time.sleep(0.5)
     canvas = browser.find_element("id", "view")
     shown = np.asarray(Image.open(io.BytesIO(canvas.screenshot_as_png)).convert("RGB"))
-    assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500  # a lit scene, not a plain field
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 500  # the view shows a shaded scene
     picked = browser.execute_script(
         "const v = document.getElementById('view'), r = v.getBoundingClientRect();"
         "for (let y = 0.3; y < 0.9; y += 0.05) for (let x = 0.1; x < 0.9; x += 0.05) {"
         "  for (const kind of ['pointerdown', 'pointerup']) v.dispatchEvent(new PointerEvent(kind,"
         "    {pointerId: 1, button: 0, clientX: r.left + x * r.width, clientY: r.top + y * r.height}));"
-        "  const said = document.getElementById('picked').textContent;"
-        "  if (/^[0-9]+:/.test(said)) return said; } return '';"
+        "  const text = document.getElementById('picked').textContent;"
+        "  if (/^[0-9]+:/.test(text)) return text; } return '';"
     )
     number = int(picked.split(":")[0])
     assert scene.label[number] in picked
-    assert not [said for said in browser.console_errors() if "setPointerCapture" not in said]
+    assert not [message for message in browser.console_errors() if "setPointerCapture" not in message]

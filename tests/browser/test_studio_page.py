@@ -1,4 +1,4 @@
-"""The studio in a browser."""
+"""Tests of the studio in a browser."""
 
 import io
 import json
@@ -25,7 +25,7 @@ def test_studio_page_edits_inpaints_undoes_and_downloads(studio_url, studio_file
 
     view = browser.find_element("id", "view")
     picked = ""
-    for y in range(-200, 250, 25):  # look for a car
+    for y in range(-200, 250, 25):  # click until a car is selected
         for x in range(-300, 300, 30):
             ActionChains(browser).move_to_element_with_offset(view, x, y).click().perform()
             picked = browser.find_element("id", "picked").text

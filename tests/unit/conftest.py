@@ -1,4 +1,4 @@
-"""Fixtures of tests without Ray."""
+"""Fixtures for tests that run without Ray."""
 
 import pytest
 from helpers import small_spec, tiny_pipeline
