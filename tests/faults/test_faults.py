@@ -1,4 +1,4 @@
-"""Preprocessing tolerates killed workers and drivers, full disks and files damaged in two hundred ways."""
+"""Tests of preprocessing with killed workers, killed drivers, full disks and 260 damaged files."""
 
 import hashlib
 import io
@@ -49,8 +49,8 @@ TOWN = Town(num_train=48, num_test=8)  # twelve shards
 TOWN_WORDS = ("jobs/preprocess_scenes.py", "town", "--num-train", "48", "--num-test", "8", "--output")
 
 
-def content(root: Path) -> dict[str, Any]:
-    """All files of a directory by path, tables row by row, so that a surplus file is a difference."""
+def read_directory(root: Path) -> dict[str, Any]:
+    """Return the content of all files of a directory by path: tables from Parquet files, values from JSON files."""
     files = {str(path.relative_to(root)): path for path in sorted(root.rglob("*")) if path.is_file()}
     return {
         name: pq.read_table(path, partitioning=None) if name.endswith(".parquet") else json.loads(path.read_text())
@@ -59,13 +59,13 @@ def content(root: Path) -> dict[str, Any]:
 
 
 def assert_same(root: Path, undisturbed: Path) -> None:
-    ours, theirs = content(root), content(undisturbed)
+    ours, theirs = read_directory(root), read_directory(undisturbed)
     assert ours.keys() == theirs.keys()
     assert [name for name in ours if ours[name] != theirs[name]] == []
 
 
-def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
-    """Faults that a query over the tables would find at this moment."""
+def find_partial_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
+    """Return the faults that a query over the tables finds at this moment, for files that are not in `seen`."""
     wrong = []
     for path in [path for table in TABLES for path in (root / table).rglob("*.parquet")]:
         with suppress(FileNotFoundError):
@@ -82,13 +82,13 @@ def half_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
 
 
 @contextmanager
-def watched(root: Path) -> Iterator[None]:
-    """Asserts that a partial shard is never visible."""
+def assert_no_partial_shards(root: Path) -> Iterator[None]:
+    """Assert that no partial shard is visible while the body runs."""
     wrong, seen, stop = [], set(), threading.Event()
 
     def watch() -> None:
         while not stop.wait(0.02):
-            wrong.extend(half_shards(root, seen))
+            wrong.extend(find_partial_shards(root, seen))
 
     thread = threading.Thread(target=watch)
     thread.start()
@@ -97,12 +97,12 @@ def watched(root: Path) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-    assert wrong + half_shards(root, set()) == []
+    assert wrong + find_partial_shards(root, set()) == []
 
 
 @pytest.fixture(scope="module")
 def town(cluster, tmp_path_factory) -> Path:
-    """The output of an undisturbed run."""
+    """Output of a run without faults."""
     root = tmp_path_factory.mktemp("undisturbed") / "town"
     preprocess(replace(TOWN, output=str(root)))
     assert len(list((root / "scenes").rglob("*.parquet"))) == 12
@@ -114,7 +114,10 @@ def town(cluster, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def shards(cluster, tmp_path_factory) -> tuple[list[ShardTask], Path]:
-    """Eleven shards of one drive, which a separate task reads once, and the output of an undisturbed run."""
+    """Tasks for eleven shards of one drive, and the output of a run without faults.
+
+    One separate Ray task reads the drive once for all shards.
+    """
     root = tmp_path_factory.mktemp("shards")
     write_kitti360(generate_town(7).at(np.arange(40, 84), CROP), root / "raw")
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -126,12 +129,15 @@ def shards(cluster, tmp_path_factory) -> tuple[list[ShardTask], Path]:
 
 
 @contextmanager
-def killed_workers(quota: dict[str, int], seed: int) -> Iterator[list[str]]:
-    """Kills workers of this Ray while they run these tasks, up to a quota per task; yields the tasks."""
+def kill_workers(quota: dict[str, int], seed: int) -> Iterator[list[str]]:
+    """Kill Ray workers while the body runs and yield the names of the killed tasks.
+
+    `quota` is the number of kills per task name.
+    """
     rng, killed, stop = np.random.default_rng(seed), [], threading.Event()
 
     def kill() -> None:
-        # The wait is shorter than the slowed tasks, so that every kind of task is hit.
+        # The wait is shorter than each delayed task, so a kill hits every kind of task.
         while not stop.wait(rng.uniform(0.05, 0.4)) and len(killed) < sum(quota.values()):
             for process in rng.permutation(psutil.Process().children(recursive=True)):
                 with suppress(psutil.Error, IndexError):
@@ -150,15 +156,15 @@ def killed_workers(quota: dict[str, int], seed: int) -> Iterator[list[str]]:
         thread.join()
 
 
-def slowed(function: Callable, seconds: float) -> Callable:
-    def slow(*arguments: Any) -> Any:
+def add_delay(function: Callable, seconds: float) -> Callable:
+    def run_with_delay(*arguments: Any) -> Any:
         time.sleep(seconds)
         result = function(*arguments)
         time.sleep(seconds)
         return result
 
-    slow.__qualname__ = function.__name__  # the name of the task in Ray
-    return slow
+    run_with_delay.__qualname__ = function.__name__  # Ray names the task by this attribute
+    return run_with_delay
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -173,15 +179,15 @@ def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatc
         ("compute_training_statistics", 0.6),
         ("label_scenes", 0.2),
     ):
-        monkeypatch.setattr(ingest, name, slowed(getattr(ingest, name), seconds))
-    with killed_workers(quota, seed=seed) as killed:
+        monkeypatch.setattr(ingest, name, add_delay(getattr(ingest, name), seconds))
+    with kill_workers(quota, seed=seed) as killed:
         ingest.ingest_drives(tasks, str(tmp_path), {}, grid=CROP)
     assert Counter(killed) == quota
     assert_same(tmp_path, undisturbed)
 
 
 def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monkeypatch):
-    """The first writer of a staged table, of a manifest and of a table about to be published is killed."""
+    """The test kills the first writer of a staged table, of a manifest and of a published table."""
     (tasks, undisturbed), root, died = shards, tmp_path / "out", tmp_path / "died"
     died.mkdir()
     doomed = (
@@ -190,7 +196,7 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
         "out/scenes/source=kitti360/split=train/part-00002.parquet",
     )
 
-    def armed(function: Callable) -> Callable:
+    def arm_writers(function: Callable) -> Callable:
         def call(*arguments: Any) -> Any:
             whole, at_once = storage.write_whole, storage.move_file
 
@@ -206,7 +212,7 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
                 whole(uri, die if uri.endswith(doomed) and not marker.exists() else write)
 
             def move(source: str, target: str) -> None:
-                time.sleep(0.1 * target.startswith(str(root)))  # a partial shard would be visible
+                time.sleep(0.1 * target.startswith(str(root)))  # the delay would make a partial shard visible
                 at_once(source, target)
 
             if not hasattr(storage, "armed"):
@@ -215,9 +221,9 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
 
         return call
 
-    monkeypatch.setattr(ingest, "write_shard", armed(ingest.write_shard))
-    monkeypatch.setattr(ingest, "label_scenes", armed(ingest.label_scenes))
-    with watched(root):
+    monkeypatch.setattr(ingest, "write_shard", arm_writers(ingest.write_shard))
+    monkeypatch.setattr(ingest, "label_scenes", arm_writers(ingest.label_scenes))
+    with assert_no_partial_shards(root):
         ingest.ingest_drives(tasks, str(root), {}, grid=CROP)
     assert len(list(died.iterdir())) == len(doomed)
     assert_same(root, undisturbed)
@@ -226,8 +232,11 @@ def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monke
 # ------------------------------------------------------------------------------------------------- killed drivers
 
 
-def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
-    """Runs the job in a separate process and kills it as soon as `when` is true; its Ray has ended on return."""
+def run_and_kill_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
+    """Run the job in a separate process and kill the process as soon as `when` is true.
+
+    The Ray processes of the job have ended when this function returns.
+    """
     with log.open("w") as output:
         job = subprocess.Popen(
             [sys.executable, *TOWN_WORDS, str(root)],
@@ -241,7 +250,7 @@ def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             assert job.poll() is None, log.read_text()
             time.sleep(0.01)
     finally:
-        with suppress(psutil.NoSuchProcess):  # it ended by itself: the assertion reports how
+        with suppress(psutil.NoSuchProcess):  # the process ended before the kill; the assertion above reports its log
             family = psutil.Process(job.pid).children(recursive=True)
             job.kill()
             job.wait()
@@ -255,15 +264,15 @@ def killed_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
 def test_preprocess_resumes_after_driver_kills(town, tmp_path):
     root, log = tmp_path / "out", tmp_path / "log"
     staging = root / ".staging"
-    with watched(root):
-        killed_job(root, log, lambda: any(staging.glob("manifest/*.json")))
+    with assert_no_partial_shards(root):
+        run_and_kill_job(root, log, lambda: any(staging.glob("manifest/*.json")))
         done = sorted(path.stem for path in staging.glob("manifest/*.json"))
         assert 1 <= len(done) < 12 and not any((root / name).exists() for name in (*TABLES, "dataset.json"))
         _, split, number = done[0].split("-")
         kept = f"rasters/source=town/split={split}/part-{number}.parquet"
         stamp = (staging / kept).stat().st_mtime_ns
 
-        killed_job(root, log, lambda: any(root.glob("scenes/*/*/*.parquet")))
+        run_and_kill_job(root, log, lambda: any(root.glob("scenes/*/*/*.parquet")))
         assert len(list(staging.glob("manifest/*.json"))) == 12 and not (root / "dataset.json").exists()
         preprocess(replace(TOWN, output=str(root)))
     assert (root / kept).stat().st_mtime_ns == stamp
@@ -294,7 +303,7 @@ def test_write_whole_hides_unfinished_file_from_queries(tmp_path):
 
 
 def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
-    """Uses a small tmpfs in a separate mount namespace."""
+    """The full disk is a small tmpfs in a separate mount namespace."""
     full, left = tmp_path / "full", tmp_path / "left"
     full.mkdir()
     mount = 'mount -t tmpfs -o size=250k none "$0"'
@@ -309,7 +318,7 @@ def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
     assert re.fullmatch(
         rf"error: {full}/\S+: cannot be written \(No space left on device\); make room there.*", lines[0]
     )
-    assert not (left / "dataset.json").exists() and half_shards(left / ".staging", set()) == []
+    assert not (left / "dataset.json").exists() and find_partial_shards(left / ".staging", set()) == []
     preprocess(replace(TOWN, output=str(left)))
     assert_same(left, town)
     if "Traceback" in done.stderr:
@@ -328,7 +337,7 @@ def test_write_shard_names_failed_file_and_cleans_up(raw, tmp_path):
             write_shard(task, str(staging), CROP)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert half_shards(staging, set()) == [] and not list(staging.rglob(f"{storage.TEMPORARY}*"))
+    assert find_partial_shards(staging, set()) == [] and not list(staging.rglob(f"{storage.TEMPORARY}*"))
     assert write_shard(task, str(staging), CROP)["scenes"] == 4
 
 
@@ -336,7 +345,7 @@ def test_write_shard_names_failed_file_and_cleans_up(raw, tmp_path):
 
 
 def test_preprocess_rejects_drive_without_poses(cluster, raw, tmp_path):
-    """Its XML exists; poses.txt is missing."""
+    """The XML file of drive 0003 exists, but its poses.txt is missing."""
     root = tmp_path / "raw"
     shutil.copytree(raw["kitti360"], root)
     (xml,) = root.glob("data_3d_bboxes/train_full/*.xml")
@@ -345,11 +354,11 @@ def test_preprocess_rejects_drive_without_poses(cluster, raw, tmp_path):
     with pytest.raises(ValueError, match=r"drive_0003_sync/poses\.txt: .*Or add --skip-unreadable"):
         preprocess(asked)
     preprocess(replace(asked, skip_unreadable=True))
-    made = content(tmp_path / "out")
+    made = read_directory(tmp_path / "out")
     (reject,) = made["rejects/source=kitti360/split=unused/part-00000.parquet"].to_pylist()
     assert reject["scene_id"] == "kitti360-0003" and reject["frame"] is None and "poses.txt" in reject["reason"]
     preprocess(replace(asked, input=str(raw["kitti360"]), output=str(tmp_path / "alone")))
-    alone = content(tmp_path / "alone")
+    alone = read_directory(tmp_path / "alone")
     assert [name for name in alone if name != "dataset.json" and alone[name] != made[name]] == []
 
 
@@ -382,7 +391,7 @@ def test_write_shard_detects_poses_changed_during_run(raw, tmp_path):
 
 
 def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
-    """The poses are repaired, or a drive is added, between an interrupted run and the next."""
+    """The poses change between an interrupted run and the next run."""
     root, staging = tmp_path / "raw", str(tmp_path / "staging")
     shutil.copytree(raw["kitti360"], root)
     (path,) = root.glob("data_poses/*/poses.txt")
@@ -395,11 +404,11 @@ def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
         assert frames == [int(line.split()[0]) for line in kept]
 
 
-# ------------------------------------------------------------------ 200 broken files, through write_shard without Ray
+# --------------------------------------------------------------------- broken files read by write_shard without Ray
 
-CASE_SECONDS = 5.0  # of a processor
+CASE_SECONDS = 5.0  # processor time
 Tables = dict[str, list[dict]]
-Touches = Callable[[str, dict], bool]  # table, row -> whether this row may differ from that of the whole file
+Touches = Callable[[str, dict], bool]  # (table, row) -> True if a damaged file may change this row
 PLANS = {
     "kitti360": lambda root: plan_kitti360(root, split=False),
     "av2": plan_argoverse2,
@@ -407,8 +416,8 @@ PLANS = {
 }
 
 
-def cut_all(source: str, root: Path, staging: Path) -> tuple[Tables, list[dict]]:
-    """Every row of every table, checked to be sound, and the manifests."""
+def write_all_shards(source: str, root: Path, staging: Path) -> tuple[Tables, list[dict]]:
+    """Write all shards of a source, check them, and return the rows of every table and the manifests."""
     tasks = PLANS[source](str(root))
     manifests = [write_shard(task, str(staging), CROP) for task in tasks]
     tables: Tables = {"scenes": [], "primitives": [], "rasters": [], "rejects": []}
@@ -422,7 +431,7 @@ def cut_all(source: str, root: Path, staging: Path) -> tuple[Tables, list[dict]]
 
 
 def check_sound(rows: Tables) -> None:
-    """One shard: finite, aligned, and what is stored twice agrees."""
+    """Assert that a shard has finite values, aligned tables and consistent counts."""
     scenes, primitives, rasters = (rows.get(name, []) for name in ("scenes", "primitives", "rasters"))
     names = [row["scene_id"] for row in scenes]
     assert len(set(names)) == len(names) and [row["scene_id"] for row in rasters] == names
@@ -444,8 +453,8 @@ def check_sound(rows: Tables) -> None:
         assert len(row["height"]) == 2 * np.unpackbits(np.frombuffer(row["occupied"], np.uint8)).sum()
 
 
-def changed(before: list[dict], after: list[dict]) -> list[dict]:
-    """The rows that only one of the two has."""
+def find_changed_rows(before: list[dict], after: list[dict]) -> list[dict]:
+    """Return the rows that only one of two tables contains."""
     rows, counts = {}, Counter()
     for sign, side in ((1, before), (-1, after)):
         for row in side:
@@ -455,10 +464,14 @@ def changed(before: list[dict], after: list[dict]) -> list[dict]:
     return [rows[key] for key, count in counts.items() if count]
 
 
-def outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, touches: Touches) -> str:
-    """ "refused" by a reason that names the file, "same" rows, or "changed" where the broken file may change them."""
+def classify_outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, touches: Touches) -> str:
+    """Return the effect of a broken file on the tables and assert that the effect is allowed.
+
+    Returns:
+        "refused" if a reason names the file, "same" if all rows are equal, "changed" if only affected rows differ.
+    """
     try:
-        tables, manifests = cut_all(source, root, staging)
+        tables, manifests = write_all_shards(source, root, staging)
     except ValueError as error:
         check_reason(str(error), path)
         return "refused"
@@ -473,10 +486,10 @@ def outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, t
 
     scenes = set()
     for table in ("primitives", "rasters"):
-        for row in changed(whole[table], tables[table]):
+        for row in find_changed_rows(whole[table], tables[table]):
             assert may_differ(table, row), (table, row)
             scenes.add(row["scene_id"])
-    for row in changed(whole["scenes"], tables["scenes"]):
+    for row in find_changed_rows(whole["scenes"], tables["scenes"]):
         assert row["scene_id"] in scenes or may_differ("scenes", row), row
     for report in [r for manifest in manifests for r in manifest["reports"].values() if r and path.suffix == ".xml"]:
         kept = report["boxes"] + report["slabs"] + report["duplicates"]
@@ -486,10 +499,10 @@ def outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, t
 
 
 def check_reason(reason: str, path: Path) -> None:
-    """Asserts that the reason is one line that names the file or the file that it contradicts."""
+    """Assert that the reason is one line and names a file in the folder of `path`."""
     assert any(file.name in reason for file in path.parent.iterdir()), reason
     assert "\n" not in reason and len(reason) < 700, reason
-    reason.encode()  # goes into a table
+    reason.encode()  # the tables store the reason as UTF-8
 
 
 @contextmanager
@@ -506,27 +519,27 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def one_of(rng: np.random.Generator, choices: Sequence) -> Any:
+def choose(rng: np.random.Generator, choices: Sequence) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
 GARBAGE = (b"", b" \n", bytes(64), bytes(range(256)) * 8, b"\x89PNG\r\n\x1a\n" + bytes(99), b"PK\x03\x04" + bytes(60))
 
 
-def damaged(rng: np.random.Generator, whole: bytes) -> bytes:
-    """Bytes that no writer wrote: cut off, overwritten, shifted, or of another file altogether."""
+def damage_bytes(rng: np.random.Generator, whole: bytes) -> bytes:
+    """Return damaged content of a file: truncated, overwritten, shifted or replaced."""
     at, length = int(rng.integers(len(whole))), int(rng.integers(1, 200))
     flipped = bytearray(whole)
     for place in rng.integers(len(whole), size=rng.integers(1, 9)):
         flipped[place] = rng.integers(256)
     hole = whole[:at] + bytes(length) + whole[at + length :]
     noise = whole[: length // 5] + rng.bytes(300)
-    return one_of(
-        rng, [whole[:at], bytes(flipped), hole, whole[:at] + whole[at + length :], noise, one_of(rng, GARBAGE)]
+    return choose(
+        rng, [whole[:at], bytes(flipped), hole, whole[:at] + whole[at + length :], noise, choose(rng, GARBAGE)]
     )
 
 
-# ---------------------------------------------------------------------------------------------- KITTI-360's files
+# ----------------------------------------------------------------------------------------------- KITTI-360 files
 
 BAD_NUMBERS = ("nan", "inf", "-inf", "1e308", "-1e30", "9e5", "four", "", "0x10", "1,5", "9" * 400, "0", "-1", "1e-300")
 BAD_TEXTS = ("", " ", "-1", "-2", "9" * 18, "9" * 5000, "1.5", "car", "road", "tunnel", "spaceship", "\u0663", "&amp;")
@@ -538,73 +551,75 @@ GROUND_NAMES = {label for labels in GROUND_LABELS.values() for label in labels}
 
 
 def write_kitti360_excerpt(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four poses of the town and what lies about them, in two annotation windows that share objects."""
+    """Write four poses of a town and the objects near them, in two annotation windows that share objects."""
     monkeypatch.setattr(kitti360_writer, "WINDOW_POSES", 2)
     write_kitti360(generate_town(7).at(np.arange(60, 64), Grid(4.0, 4.0, 0.5, 16, 16)), root)
 
 
-def objects_of(xml: bytes) -> list[str]:
+def find_objects(xml: bytes) -> list[str]:
     return re.findall(r"<object\d+>.*?</object\d+>", xml.decode("utf-8", "replace"), re.S)
 
 
-def field(block: str, tag: str) -> str:
-    """The inside of a field, empty if it is not there."""
+def read_field(block: str, tag: str) -> str:
+    """Return the content of a field, or an empty text if the field is missing."""
     found = re.search(rf"<{tag}(?: [^>]*)?>(.*?)</{tag}>", block, re.S)
     return found[1] if found else ""
 
 
-def with_field(block: str, tag: str, content: str | None) -> str:
+def replace_field(block: str, tag: str, content: str | None) -> str:
     def put(found: re.Match) -> str:
         return "" if content is None else f"{found[1]}{content}</{tag}>"
 
     return re.sub(rf"(<{tag}(?: [^>]*)?>).*?</{tag}>", put, block, count=1, flags=re.S)
 
 
-def broken_object(rng: np.random.Generator, block: str) -> str:
-    tag, other = one_of(rng, FIELDS), one_of(rng, FIELDS)
-    match one_of(rng, ["number", "number", "digit", "missing", "text", "swap", "size", "deep", "twice"]):
+def break_object(rng: np.random.Generator, block: str) -> str:
+    tag, other = choose(rng, FIELDS), choose(rng, FIELDS)
+    match choose(rng, ["number", "number", "digit", "missing", "text", "swap", "size", "deep", "twice"]):
         case "number":
-            tag = one_of(rng, ["transform", "vertices", "faces"])
-            head, data = field(block, tag).split("<data>")
+            tag = choose(rng, ["transform", "vertices", "faces"])
+            head, data = read_field(block, tag).split("<data>")
             words = data.removesuffix("</data>").split()
-            words[int(rng.integers(len(words)))] = one_of(rng, BAD_NUMBERS)
-            return with_field(block, tag, f"{head}<data>{' '.join(words)}</data>")
+            words[int(rng.integers(len(words)))] = choose(rng, BAD_NUMBERS)
+            return replace_field(block, tag, f"{head}<data>{' '.join(words)}</data>")
         case "digit":
-            at = one_of(rng, [m.start() for m in re.finditer(r"(?<=[ .\d])\d", block)])
+            at = choose(rng, [m.start() for m in re.finditer(r"(?<=[ .\d])\d", block)])
             return block[:at] + str(rng.integers(10)) + block[at + 1 :]
         case "missing":
-            return with_field(block, tag, None)
+            return replace_field(block, tag, None)
         case "text":
-            return with_field(block, one_of(rng, ["index", "label", "dynamicSeq", "timestamp"]), one_of(rng, BAD_TEXTS))
+            return replace_field(
+                block, choose(rng, ["index", "label", "dynamicSeq", "timestamp"]), choose(rng, BAD_TEXTS)
+            )
         case "swap":
-            return with_field(with_field(block, tag, field(block, other)), other, field(block, tag))
+            return replace_field(replace_field(block, tag, read_field(block, other)), other, read_field(block, tag))
         case "size":
-            bad = one_of(rng, ["-4", "5", "9" * 18, "9" * 5000, "four", ""])
-            return re.sub(rf"<{one_of(rng, ['rows', 'cols'])}>\d+", lambda m: m[0][:6] + bad, block, count=2)
+            bad = choose(rng, ["-4", "5", "9" * 18, "9" * 5000, "four", ""])
+            return re.sub(rf"<{choose(rng, ['rows', 'cols'])}>\d+", lambda m: m[0][:6] + bad, block, count=2)
         case "deep":
-            depth = one_of(rng, [50, 900, 20_000])
-            return with_field(block, tag, "<a>" * depth + "</a>" * depth)
+            depth = choose(rng, [50, 900, 20_000])
+            return replace_field(block, tag, "<a>" * depth + "</a>" * depth)
         case _:
-            return block.replace(f"</{tag}>", f"</{tag}><{tag}>{one_of(rng, BAD_TEXTS)}</{tag}>", 1)
+            return block.replace(f"</{tag}>", f"</{tag}><{tag}>{choose(rng, BAD_TEXTS)}</{tag}>", 1)
 
 
-def broken_xml(rng: np.random.Generator, whole: bytes) -> bytes:
-    text, blocks = whole.decode(), objects_of(whole)
+def break_xml(rng: np.random.Generator, whole: bytes) -> bytes:
+    text, blocks = whole.decode(), find_objects(whole)
     if rng.random() < 0.6:
         for k in rng.choice(len(blocks), int(rng.integers(1, 4)), replace=False):
-            text = text.replace(blocks[k], broken_object(rng, blocks[k]))
+            text = text.replace(blocks[k], break_object(rng, blocks[k]))
         return text.encode()
-    root, block = "<opencv_storage>", one_of(rng, blocks)
-    return one_of(
+    root, block = "<opencv_storage>", choose(rng, blocks)
+    return choose(
         rng,
         [
-            *[damaged(rng, whole) for _ in range(4)],
+            *[damage_bytes(rng, whole) for _ in range(4)],
             *[
                 text.replace(root, f"<!DOCTYPE b [{entities}]>{root}").replace(">car<", ">&i;<").encode()
                 for entities in (BOMB, EXTERNAL)
             ],
-            text.replace('"1.0"', f'"1.0" encoding="{one_of(rng, ENCODINGS)}"').encode(),
-            text.replace("opencv_storage", one_of(rng, ["kml", "a" * 9999])).encode(),
+            text.replace('"1.0"', f'"1.0" encoding="{choose(rng, ENCODINGS)}"').encode(),
+            text.replace("opencv_storage", choose(rng, ["kml", "a" * 9999])).encode(),
             text.replace(f"</{root[1:]}", "<a>" * 20_000 + "</a>" * 20_000 + f"</{root[1:]}").encode(),
             text.replace(block, "").encode(),
             text.replace(block, block * 2).encode(),
@@ -613,49 +628,53 @@ def broken_xml(rng: np.random.Generator, whole: bytes) -> bytes:
     )
 
 
-def touched_by_xml(whole: bytes, broken: bytes) -> Touches:
-    """Rows of objects that differ and of their copies in other windows; the ground if one is, or was, of it."""
-    before, after = ([" ".join(b.replace("><", "> <").split()) for b in objects_of(xml)] for xml in (whole, broken))
-    places = {field(block, "transform") for block in set(before) - set(after)}
-    involved = (set(after) - set(before)) | {block for block in before if field(block, "transform") in places}
+def find_rows_of_xml(whole: bytes, broken: bytes) -> Touches:
+    """Return the rows that a broken XML file may change.
+
+    These are the primitives of changed objects and of their copies in other windows. They include rasters if a changed
+    object is or was ground.
+    """
+    before, after = ([" ".join(b.replace("><", "> <").split()) for b in find_objects(xml)] for xml in (whole, broken))
+    places = {read_field(block, "transform") for block in set(before) - set(after)}
+    involved = (set(after) - set(before)) | {block for block in before if read_field(block, "transform") in places}
     ids = {int(n) for b in involved for n in re.findall(r"<(?:index|dynamicSeq)>\s*(-?\d{1,18})\s*<", b)}
-    ground = any(field(block, "label").lower() in GROUND_NAMES for block in involved)
+    ground = any(read_field(block, "label").lower() in GROUND_NAMES for block in involved)
     return lambda table, row: row["instance_id"] in ids if table == "primitives" else ground and table == "rasters"
 
 
-def broken_poses(rng: np.random.Generator, whole: bytes) -> bytes:
+def break_poses(rng: np.random.Generator, whole: bytes) -> bytes:
     lines = whole.decode().splitlines()
     k, i, j = int(rng.integers(len(lines))), int(rng.integers(13)), int(rng.integers(13))
     words = lines[k].split()
-    bad = [*words[:i], one_of(rng, BAD_NUMBERS), *words[i + 1 :]]
+    bad = [*words[:i], choose(rng, BAD_NUMBERS), *words[i + 1 :]]
     swapped = [words[j if n == i else i if n == j else n] for n in range(13)]
-    digits = one_of(rng, [m.start() for m in re.finditer(r"\d", lines[k])])
+    digits = choose(rng, [m.start() for m in re.finditer(r"\d", lines[k])])
     digit = lines[k][:digits] + str(rng.integers(10)) + lines[k][digits + 1 :]
-    frame = one_of(rng, ["-1", "9" * 30, "1e3", "0.5", "x", "9" * 18])
-    new = one_of(
+    frame = choose(rng, ["-1", "9" * 30, "1e3", "0.5", "x", "9" * 18])
+    new = choose(
         rng,
         [
             *[[" ".join(w)] for w in (bad, bad, swapped, words[:i], words * 2, [frame, *words[1:]])],
             *([digit], [digit], [], [lines[k], lines[k]], [lines[k - 1]], ["\t".join(words) + "\r\n"]),
         ],
     )
-    return one_of(rng, [damaged(rng, whole), *["\n".join([*lines[:k], *new, *lines[k + 1 :], ""]).encode()] * 3])
+    return choose(rng, [damage_bytes(rng, whole), *["\n".join([*lines[:k], *new, *lines[k + 1 :], ""]).encode()] * 3])
 
 
-def touched_by_poses(whole: bytes, broken: bytes) -> Touches:
+def find_rows_of_poses(whole: bytes, broken: bytes) -> Touches:
     before, after = ({" ".join(n.split()) for n in x.decode("ascii", "replace").splitlines()} for x in (whole, broken))
     frames = {line.split()[0] for line in before ^ after if line}
     return lambda table, row: str(int(row["scene_id"].rsplit("-", 1)[1])) in {f.lstrip("0") or "0" for f in frames}
 
 
-# ---------------------------------------------------------------------------------------------- Argoverse 2's files
+# ----------------------------------------------------------------------------------------------- Argoverse 2 files
 
-AV2_LOGS = ("broken", "beside")  # two logs of one shard: faults of one do not affect the other
+AV2_LOGS = ("broken", "intact")  # two logs of one shard: faults of the first must not affect the second
 SWEEPS = 315969904359876000 + 100_000_000 * np.arange(3)
 
 
 def write_av2(root: Path) -> None:
-    """Two logs of three sweeps with six boxes each, on a square of road with a crossing."""
+    """Write two logs of three sweeps with six boxes per sweep, on a square of road with a crossing."""
     rng = np.random.default_rng(0)
     for log in AV2_LOGS:
         folder = root / "train" / log
@@ -699,18 +718,18 @@ BAD_VALUES: dict[str, tuple] = {
 }
 
 
-def broken_table(rng: np.random.Generator, table: pa.Table) -> pa.Table:
-    """A table in which cells, types, columns or rows are not what they should be."""
+def break_table(rng: np.random.Generator, table: pa.Table) -> pa.Table:
+    """Return a copy of a table with a fault in its cells, types, columns or rows."""
     k, j = int(rng.integers(table.num_columns)), int(rng.integers(table.num_columns))
     name, column, names = table.column_names[k], table.column(k), table.column_names
     kind = "int" if pa.types.is_integer(column.type) else "float" if pa.types.is_floating(column.type) else "text"
-    match one_of(rng, ["cell"] * 6 + ["drop", "type", "type", "names", "names", "order", "rows", "rows", "twice"]):
+    match choose(rng, ["cell"] * 6 + ["drop", "type", "type", "names", "names", "order", "rows", "rows", "twice"]):
         case "cell":
             values = column.to_pylist()
             if pa.types.is_nested(column.type):
-                value = one_of(rng, [None, [], [[1.0, 2.0]], [[float("nan")] * 3] * 3, [[0.0, 0.0, 0.0]] * 3])
+                value = choose(rng, [None, [], [[1.0, 2.0]], [[float("nan")] * 3] * 3, [[0.0, 0.0, 0.0]] * 3])
             else:
-                value = one_of(rng, BAD_VALUES[kind])
+                value = choose(rng, BAD_VALUES[kind])
             values[int(rng.integers(len(values)))] = value
             return table.set_column(k, name, pa.array(values, column.type))
         case "drop":
@@ -727,7 +746,7 @@ def broken_table(rng: np.random.Generator, table: pa.Table) -> pa.Table:
                 [b"\xff"] * n,
             ]
             same = [column.dictionary_encode(), column.cast(pa.float32())] if kind == "float" else []
-            return table.set_column(k, name, one_of(rng, [*map(pa.array, bad), *same]))
+            return table.set_column(k, name, choose(rng, [*map(pa.array, bad), *same]))
         case "names":
             names[k], names[j] = names[j], names[k]
             return table.rename_columns(names)
@@ -735,64 +754,67 @@ def broken_table(rng: np.random.Generator, table: pa.Table) -> pa.Table:
             return table.select([names[n] for n in rng.permutation(len(names))])
         case "rows":
             some = rng.integers(len(table), size=len(table))
-            return one_of(
+            return choose(
                 rng, [table.slice(0, 0), table.slice(2), table.take(some), table.take(rng.permutation(len(table)))]
             )
         case _:
-            return table.append_column(one_of(rng, [name, "__index_level_0__", "\x00", "x" * 999]), column)
+            return table.append_column(choose(rng, [name, "__index_level_0__", "\x00", "x" * 999]), column)
 
 
-def broken_feather(rng: np.random.Generator, whole: bytes) -> bytes:
+def break_feather(rng: np.random.Generator, whole: bytes) -> bytes:
     if rng.random() < 0.4:
-        return damaged(rng, whole)
-    sink, table = io.BytesIO(), broken_table(rng, pyarrow.feather.read_table(io.BytesIO(whole)))
+        return damage_bytes(rng, whole)
+    sink, table = io.BytesIO(), break_table(rng, pyarrow.feather.read_table(io.BytesIO(whole)))
     if rng.random() < 0.1:
         pq.write_table(table.drop_columns(["track_uuid"] if "track_uuid" in table.column_names else []), sink)
     else:
-        pyarrow.feather.write_feather(table, sink, compression=one_of(rng, ["lz4", "zstd", "uncompressed"]))
+        pyarrow.feather.write_feather(table, sink, compression=choose(rng, ["lz4", "zstd", "uncompressed"]))
     return sink.getvalue()
 
 
-def rows_that_differ(read: Callable[[bytes], list[dict]], whole: bytes, broken: bytes) -> list[dict]:
-    """The rows that only one of two files has; none if one is no such file at all: then it must be refused."""
+def find_differing_rows(read: Callable[[bytes], list[dict]], whole: bytes, broken: bytes) -> list[dict]:
+    """Return the rows that only one of two files contains, or no rows if one file is unreadable.
+
+    An unreadable file must be refused, so none of its rows may differ.
+    """
     try:
-        return changed(read(whole), read(broken))
+        return find_changed_rows(read(whole), read(broken))
     except Exception:
         return []
 
 
-def in_broken(row: dict) -> bool:
+def is_of_broken_log(row: dict) -> bool:
     return "-broken-" in row["scene_id"]
 
 
-def frame_of(row: dict) -> int:
+def parse_frame(row: dict) -> int:
     return int(row["scene_id"].rsplit("-", 1)[1])
 
 
-def instance_id(given: Any) -> Any:
-    """As tables hold it: texts as a hash."""
+def make_instance_id(given: Any) -> Any:
+    """Return an instance id as tables store it: a text is replaced by its hash."""
     if not isinstance(given, str):
         return -1 if given is None else given
     return int.from_bytes(hashlib.blake2b(given.encode(errors="replace"), digest_size=8).digest(), "big") >> 1
 
 
-def feather_rows(content: bytes) -> list[dict]:
+def read_feather_rows(content: bytes) -> list[dict]:
     return pyarrow.feather.read_table(io.BytesIO(content)).to_pylist()
 
 
-def touched_by_annotations(whole: bytes, broken: bytes) -> Touches:
-    rows = rows_that_differ(feather_rows, whole, broken)
-    ids = [instance_id(row.get("track_uuid")) for row in rows]
-    sweeps = [{row["timestamp_ns"] for row in feather_rows(c)} for c in (whole, broken)] if ids else [set(), set()]
-    alone = sweeps[0] ^ sweeps[1]  # sweeps of which one file has no box at all, so no scene
+def find_rows_of_annotations(whole: bytes, broken: bytes) -> Touches:
+    rows = find_differing_rows(read_feather_rows, whole, broken)
+    ids = [make_instance_id(row.get("track_uuid")) for row in rows]
+    sweeps = [{row["timestamp_ns"] for row in read_feather_rows(c)} for c in (whole, broken)] if ids else [set(), set()]
+    alone = sweeps[0] ^ sweeps[1]  # sweeps with boxes in only one of the files; the other file yields no scene
     return lambda table, row: (
-        in_broken(row) and (row["instance_id"] in ids if table == "primitives" else frame_of(row) in alone)
+        is_of_broken_log(row) and (row["instance_id"] in ids if table == "primitives" else parse_frame(row) in alone)
     )
 
 
-def touched_by_av2_poses(whole: bytes, broken: bytes) -> Touches:
-    sweeps = [row.get("timestamp_ns") for row in rows_that_differ(feather_rows, whole, broken)]
-    return lambda table, row: in_broken(row) and frame_of(row) in sweeps
+def find_rows_of_av2_poses(whole: bytes, broken: bytes) -> Touches:
+    sweeps = [row.get("timestamp_ns") for row in find_differing_rows(read_feather_rows, whole, broken)]
+    return lambda table, row: is_of_broken_log(row) and parse_frame(row) in sweeps
 
 
 HEADERS = (
@@ -811,16 +833,16 @@ HEADERS = (
 )
 
 
-def broken_heights(rng: np.random.Generator, whole: bytes) -> bytes:
+def break_heights(rng: np.random.Generator, whole: bytes) -> bytes:
     height_m = np.load(io.BytesIO(whole))
-    match one_of(rng, ["bytes", "header", "array"]):
+    match choose(rng, ["bytes", "header", "array"]):
         case "bytes":
-            return damaged(rng, whole)
+            return damage_bytes(rng, whole)
         case "header":
-            text = one_of(rng, HEADERS).encode() + b"\n"
+            text = choose(rng, HEADERS).encode() + b"\n"
             return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + height_m.tobytes()
     spiked = height_m.astype("f8")
-    spiked[int(rng.integers(60)), int(rng.integers(60))] = one_of(rng, [np.nan, np.inf, 1e30, 1e300, 900.0, 5.0])
+    spiked[int(rng.integers(60)), int(rng.integers(60))] = choose(rng, [np.nan, np.inf, 1e30, 1e300, 900.0, 5.0])
     kinds = ["f8", ">f4", "i4", "c8", "?", "O", [("a", "f4")]]
     arrays = [
         spiked,
@@ -832,16 +854,16 @@ def broken_heights(rng: np.random.Generator, whole: bytes) -> bytes:
         height_m * np.nan,
     ]
     sink = io.BytesIO()
-    np.save(sink, one_of(rng, [*arrays, *[height_m.astype(kind) for kind in kinds]]), allow_pickle=True)
+    np.save(sink, choose(rng, [*arrays, *[height_m.astype(kind) for kind in kinds]]), allow_pickle=True)
     return sink.getvalue()
 
 
-def touched_by_heights(whole: bytes, broken: bytes) -> Touches:
+def find_rows_of_heights(whole: bytes, broken: bytes) -> Touches:
     try:
         same = np.array_equal(np.load(io.BytesIO(whole)), np.load(io.BytesIO(broken)))
     except Exception:
         same = True
-    return lambda table, row: table == "rasters" and in_broken(row) and not same
+    return lambda table, row: table == "rasters" and is_of_broken_log(row) and not same
 
 
 BAD_JSON = (
@@ -864,53 +886,53 @@ BAD_JSON = (
 )
 
 
-def broken_json(rng: np.random.Generator, whole: bytes) -> bytes:
+def break_json(rng: np.random.Generator, whole: bytes) -> bytes:
     if rng.random() < 0.2:
-        return damaged(rng, whole)
+        return damage_bytes(rng, whole)
     content = json.loads(whole)
     for _ in range(int(rng.integers(1, 4))):
-        spoil(rng, content)
+        change_json_value(rng, content)
     deep = "[" * 3000 + "]" * 3000 if rng.random() < 0.2 else "[" * (n := int(rng.integers(500, 1000))) + "]" * n
-    text = json.dumps(one_of(rng, [content] * 8 + [[content], {"a": content}])).replace('"@deep@"', deep)
-    return text.replace('"@long@"', "9" * 5000).encode(one_of(rng, ["utf-8"] * 8 + ["utf-8-sig", "utf-16"]))
+    text = json.dumps(choose(rng, [content] * 8 + [[content], {"a": content}])).replace('"@deep@"', deep)
+    return text.replace('"@long@"', "9" * 5000).encode(choose(rng, ["utf-8"] * 8 + ["utf-8-sig", "utf-16"]))
 
 
-def spoil(rng: np.random.Generator, inside: dict | list) -> None:
-    """Change one thing at a random place of a JSON value."""
+def change_json_value(rng: np.random.Generator, inside: dict | list) -> None:
+    """Change one value or key at a random position of a JSON value."""
     while inside:
-        key = one_of(rng, list(inside) if isinstance(inside, dict) else range(len(inside)))
+        key = choose(rng, list(inside) if isinstance(inside, dict) else range(len(inside)))
         child = inside[key]
         if isinstance(child, dict | list) and child and rng.random() < 0.8:
             inside = child
             continue
-        match one_of(rng, ["value"] * 6 + ["near"] * 4 + ["gone", "other", "key"]):
+        match choose(rng, ["value"] * 6 + ["near"] * 4 + ["gone", "other", "key"]):
             case "value":
-                inside[key] = one_of(rng, [*BAD_JSON, "@deep@", "@deep@", "@long@"])
+                inside[key] = choose(rng, [*BAD_JSON, "@deep@", "@deep@", "@long@"])
             case "near" if isinstance(child, int | float):
                 inside[key] = child + float(rng.normal())
             case "gone":
                 del inside[key]
             case "other":
-                other = one_of(rng, list(inside) if isinstance(inside, dict) else range(len(inside)))
+                other = choose(rng, list(inside) if isinstance(inside, dict) else range(len(inside)))
                 inside[key], inside[other] = inside[other], child
             case "key" if isinstance(inside, dict):
                 inside[key.upper()] = child
         return
 
 
-def touched_by_map(whole: bytes, broken: bytes) -> Touches:
+def find_rows_of_map(whole: bytes, broken: bytes) -> Touches:
     try:
         same = json.loads(whole) == json.loads(broken)
     except (ValueError, RecursionError):
         same = True
-    return lambda table, row: table == "rasters" and in_broken(row) and not same
+    return lambda table, row: table == "rasters" and is_of_broken_log(row) and not same
 
 
-# -------------------------------------------------------------------------------------------------------- custom drives
+# -------------------------------------------------------------------------------------------------- custom drives
 
 
-def write_own(root: Path, suffix: str) -> None:
-    """Two drives of three poses each, twenty boxes about them, some moving, and four polygons."""
+def write_custom(root: Path, suffix: str) -> None:
+    """Write two drives of three poses, each with four polygons and twenty boxes, of which six move."""
     rng = np.random.default_rng(1)
     x0, y0, z0 = 456_789.0, 5_432_100.0, 115.0
     for name in AV2_LOGS:
@@ -922,7 +944,7 @@ def write_own(root: Path, suffix: str) -> None:
                 "yaw_rad": float(rng.uniform(-3, 3)),
                 "frame": None if k < 14 else k % 3,
                 "instance_id": 100 + k,
-                "label": f"thing {k}",
+                "label": f"object {k}",
             }
             for k in range(20)
         ]
@@ -947,78 +969,78 @@ def write_own(root: Path, suffix: str) -> None:
                 (folder / f"{table}.json").write_text(json.dumps(rows))
 
 
-def broken_parquet(rng: np.random.Generator, whole: bytes) -> bytes:
+def break_parquet(rng: np.random.Generator, whole: bytes) -> bytes:
     if rng.random() < 0.4:
-        return damaged(rng, whole)
-    sink, table = io.BytesIO(), broken_table(rng, pq.read_table(io.BytesIO(whole)))
+        return damage_bytes(rng, whole)
+    sink, table = io.BytesIO(), break_table(rng, pq.read_table(io.BytesIO(whole)))
     if rng.random() < 0.1:
         pyarrow.feather.write_feather(table.drop_columns(table.column_names[1:]), sink)
     else:
-        pq.write_table(table, sink, compression=one_of(rng, ["snappy", "zstd", "none"]))
+        pq.write_table(table, sink, compression=choose(rng, ["snappy", "zstd", "none"]))
     return sink.getvalue()
 
 
-def own_rows(content: bytes) -> list[dict]:
+def read_custom_rows(content: bytes) -> list[dict]:
     if content.startswith(b"PAR1"):
         return pq.read_table(io.BytesIO(content)).to_pylist()
     return json.loads(content)
 
 
-def touched_by_boxes(whole: bytes, broken: bytes) -> Touches:
-    ids = [instance_id(row.get("instance_id")) for row in rows_that_differ(own_rows, whole, broken)]
-    return lambda table, row: table == "primitives" and in_broken(row) and row["instance_id"] in ids
+def find_rows_of_boxes(whole: bytes, broken: bytes) -> Touches:
+    ids = [make_instance_id(row.get("instance_id")) for row in find_differing_rows(read_custom_rows, whole, broken)]
+    return lambda table, row: table == "primitives" and is_of_broken_log(row) and row["instance_id"] in ids
 
 
-def touched_by_polygons(whole: bytes, broken: bytes) -> Touches:
-    rows = rows_that_differ(own_rows, whole, broken)
-    return lambda table, row: table == "rasters" and in_broken(row) and bool(rows)
+def find_rows_of_polygons(whole: bytes, broken: bytes) -> Touches:
+    rows = find_differing_rows(read_custom_rows, whole, broken)
+    return lambda table, row: table == "rasters" and is_of_broken_log(row) and bool(rows)
 
 
-def touched_by_own_poses(whole: bytes, broken: bytes) -> Touches:
-    frames = [row.get("frame") for row in rows_that_differ(own_rows, whole, broken)]
-    return lambda table, row: in_broken(row) and frame_of(row) in frames
+def find_rows_of_custom_poses(whole: bytes, broken: bytes) -> Touches:
+    frames = [row.get("frame") for row in find_differing_rows(read_custom_rows, whole, broken)]
+    return lambda table, row: is_of_broken_log(row) and parse_frame(row) in frames
 
 
-# -------------------------------------------------------------------------------------------------------- the test
+# ------------------------------------------------------------------------------------------------ damaged files
 
 
 @dataclass(frozen=True)
 class Format:
     source: str
-    file: str  # a pattern below the root
+    file: str  # glob pattern below the root
     breaks: Callable[[np.random.Generator, bytes], bytes]
     touched: Callable[[bytes, bytes], Touches]
-    count: int  # of mutations
+    count: int  # number of mutations
 
 
-KITTI360_XML = Format("kitti360", "data_3d_bboxes/train_full/*.xml", broken_xml, touched_by_xml, 35)
+KITTI360_XML = Format("kitti360", "data_3d_bboxes/train_full/*.xml", break_xml, find_rows_of_xml, 35)
 FORMATS = {
     "kitti360 objects": KITTI360_XML,
     "kitti360 objects again": KITTI360_XML,
-    "kitti360 poses": Format("kitti360", "data_poses/*/poses.txt", broken_poses, touched_by_poses, 25),
-    "av2 boxes": Format("av2", "train/broken/annotations.feather", broken_feather, touched_by_annotations, 25),
-    "av2 poses": Format("av2", "train/broken/city*.feather", broken_feather, touched_by_av2_poses, 15),
-    "av2 heights": Format("av2", "train/broken/map/*.npy", broken_heights, touched_by_heights, 20),
-    "av2 map": Format("av2", "train/broken/map/log*.json", broken_json, touched_by_map, 15),
-    "av2 raster frame": Format("av2", "train/broken/map/*Sim2*.json", broken_json, touched_by_map, 10),
-    "own boxes, Parquet": Format("own parquet", "broken/boxes.*", broken_parquet, touched_by_boxes, 20),
-    "own polygons, Parquet": Format("own parquet", "broken/polygons.*", broken_parquet, touched_by_polygons, 10),
-    "own poses, Parquet": Format("own parquet", "broken/poses.*", broken_parquet, touched_by_own_poses, 10),
-    "own boxes, JSON": Format("own json", "broken/boxes.*", broken_json, touched_by_boxes, 20),
-    "own polygons, JSON": Format("own json", "broken/polygons.*", broken_json, touched_by_polygons, 10),
-    "own poses, JSON": Format("own json", "broken/poses.*", broken_json, touched_by_own_poses, 10),
+    "kitti360 poses": Format("kitti360", "data_poses/*/poses.txt", break_poses, find_rows_of_poses, 25),
+    "av2 boxes": Format("av2", "train/broken/annotations.feather", break_feather, find_rows_of_annotations, 25),
+    "av2 poses": Format("av2", "train/broken/city*.feather", break_feather, find_rows_of_av2_poses, 15),
+    "av2 heights": Format("av2", "train/broken/map/*.npy", break_heights, find_rows_of_heights, 20),
+    "av2 map": Format("av2", "train/broken/map/log*.json", break_json, find_rows_of_map, 15),
+    "av2 raster frame": Format("av2", "train/broken/map/*Sim2*.json", break_json, find_rows_of_map, 10),
+    "own boxes, Parquet": Format("own parquet", "broken/boxes.*", break_parquet, find_rows_of_boxes, 20),
+    "own polygons, Parquet": Format("own parquet", "broken/polygons.*", break_parquet, find_rows_of_polygons, 10),
+    "own poses, Parquet": Format("own parquet", "broken/poses.*", break_parquet, find_rows_of_custom_poses, 10),
+    "own boxes, JSON": Format("own json", "broken/boxes.*", break_json, find_rows_of_boxes, 20),
+    "own polygons, JSON": Format("own json", "broken/polygons.*", break_json, find_rows_of_polygons, 10),
+    "own poses, JSON": Format("own json", "broken/poses.*", break_json, find_rows_of_custom_poses, 10),
 }
 
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory) -> dict[str, Path]:
-    """Small whole drives of every source."""
+    """Folders with small undamaged drives of every source."""
     root = tmp_path_factory.mktemp("raw")
     with pytest.MonkeyPatch.context() as monkeypatch:
         write_kitti360_excerpt(root / "kitti360", monkeypatch)
     write_av2(root / "av2")
-    write_own(root / "own parquet", "parquet")
-    write_own(root / "own json", "json")
+    write_custom(root / "own parquet", "parquet")
+    write_custom(root / "own json", "json")
     return {path.name: path for path in root.iterdir()}
 
 
@@ -1027,7 +1049,7 @@ def test_write_shard_rejects_or_contains_damaged_file(raw, tmp_path, name):
     chosen, chunk = FORMATS[name], list(FORMATS).index(name)
     source, root = chosen.source.split()[0], tmp_path / "raw"
     shutil.copytree(raw[chosen.source], root)
-    whole_tables, manifests = cut_all(source, root, tmp_path / "whole")
+    whole_tables, manifests = write_all_shards(source, root, tmp_path / "whole")
     assert len(whole_tables["scenes"]) >= 4 and len(whole_tables["primitives"]) > 20 and not manifests[0]["unreadable"]
     (path,) = root.glob(chosen.file)
     whole, outcomes = path.read_bytes(), Counter()
@@ -1037,7 +1059,7 @@ def test_write_shard_rejects_or_contains_damaged_file(raw, tmp_path, name):
         try:
             with time_limit(CASE_SECONDS):
                 touches = chosen.touched(whole, broken)
-                outcomes[outcome(source, root, path, tmp_path / str(k), whole_tables, touches)] += 1
+                outcomes[classify_outcome(source, root, path, tmp_path / str(k), whole_tables, touches)] += 1
         except BaseException as error:
             error.add_note(f"{name}: mutation {k}, {len(broken)} bytes of {len(whole)}")
             raise
