@@ -1,4 +1,4 @@
-"""Apply a list of edits to a whole table, one Ray task per shard, and render a page of scenes before and after."""
+"""Apply a list of edits to the scenes of a dataset, one Ray task per shard, and render a page before and after."""
 
 from __future__ import annotations
 
@@ -23,12 +23,18 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table
 
 PICTURE_PX = 512
-OUTLINE_M = 0.4  # around what an edit changed
+OUTLINE_M = 0.4  # Margin of the outline around changed objects.
 
 
 @dataclass(frozen=True)
 class EditRequest:
-    """Which edits, and where the edited scenes go: source edited-<run>, each in its split."""
+    """Edits, and the place of the edited scenes: source edited-<run>, in the split of each given scene.
+
+    Attributes:
+        edits: Edits in the order of application.
+        output: Dataset directory of the edited scenes.
+        run: Run name.
+    """
 
     edits: tuple[Edit, ...]
     output: str
@@ -36,14 +42,30 @@ class EditRequest:
 
     @property
     def source(self) -> str:
+        """Return the source of the edited scenes."""
         return f"edited-{self.run}"
 
     def shard(self, number: int, given: Shard) -> Shard:
-        """Return the run's shard of that number, for the edited scenes of the given shard."""
+        """Return the shard of the run for the edited scenes of a given shard.
+
+        Args:
+            number: Number of the new shard.
+            given: Shard of the given scenes.
+
+        Returns:
+            Shard with the split of the given one.
+        """
         return Shard(self.output, self.source, given.split, number)
 
     def guard(self, selection: SceneSubset) -> None:
-        """Bind the source to these edits of these scenes (run_guard.py)."""
+        """Bind the source to these edits of these scenes (run_guard.py).
+
+        Args:
+            selection: Scenes to edit.
+
+        Raises:
+            ValueError: The output holds a run of the same name with other edits or other scenes.
+        """
         chosen = {
             "input": selection.root,
             "source": selection.source,
@@ -54,7 +76,18 @@ class EditRequest:
 
 
 def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table]]:
-    """Return the edited scene and its rows of the edits table. Raises ValueError naming an edit that fails."""
+    """Apply the edits to one scene.
+
+    Args:
+        scene: Given scene.
+        request: Edits and run name.
+
+    Returns:
+        Edited scene, and its rows of the edits table.
+
+    Raises:
+        ValueError: An edit fails. The message names the edit.
+    """
     after, done = replay_edits(scene, request.edits)
     rows = []
     for step, (edit, changes) in enumerate(zip(request.edits, done, strict=True)):
@@ -65,7 +98,16 @@ def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table
 
 
 def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[int]]]) -> dict:
-    """Row in: number of a shard. Row out: numbers of scenes and of rejected scenes. Writes the shard's tables."""
+    """Edit the scenes of one shard and write its tables.
+
+    Args:
+        row: Row with the number of a shard.
+        request: Edits, and the place of the edited scenes.
+        parts: Given shards and the selected rows of each.
+
+    Returns:
+        Row with the numbers of scenes and of rejected scenes.
+    """
     given, rows = parts[row["shard"]]
     shard = request.shard(row["shard"], given)
     if not storage.exists(shard.path("edits")):
@@ -82,14 +124,22 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
             storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
         if scenes:
             shard.write(scenes)
-        storage.write_parquet(pa.concat_tables(done), shard.path("edits"))  # last: the shard is done
+        # The edits table is written last and marks the shard as complete.
+        storage.write_parquet(pa.concat_tables(done), shard.path("edits"))
     rejected = len(shard.read("rejects", ["reason"])) if storage.exists(shard.path("rejects")) else 0
     return {"scenes": len(rows), "rejects": rejected}
 
 
 @dataclass(frozen=True)
 class EditResult:
-    """Result of a run: numbers of scenes written and rejected, and the changes of each step of the list."""
+    """Result of a run of edits.
+
+    Attributes:
+        scenes: Number of scenes written.
+        rejects: Number of rejected scenes.
+        table: Changes of each edit.
+        page: Path of the HTML page.
+    """
 
     scenes: int
     rejects: int
@@ -100,16 +150,20 @@ class EditResult:
 def edit_scenes(
     request: EditRequest, selection: SceneSubset, pictures: int = 8, on_shard: Callable[[int], None] | None = None
 ) -> EditResult:
-    """Write the edited tables, the edits table and a page. Another call resumes an interrupted one.
+    """Edit scenes; write the edited tables, the edits table and a page. Another call resumes an interrupted run.
 
     Args:
-        request: Edits, and where the edited scenes go.
+        request: Edits, and the place of the edited scenes.
         selection: Scenes to edit.
         pictures: Number of changed scenes on the page.
-        on_shard: Receives the number of scenes of each finished shard.
+        on_shard: Called with the number of scenes of each finished shard.
+
+    Returns:
+        Numbers of scenes, the table of changes and the path of the page.
 
     Raises:
-        ValueError: The output holds a run with other edits, every scene rejects the edits, or they change nothing.
+        ValueError: The output holds a run of the same name with other edits, all scenes are rejected, or no edit
+            changes a scene.
     """
     if not request.edits:
         raise ValueError("the list of edits is empty")
@@ -161,25 +215,29 @@ def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
         "change",
         "scenes",
         "primitives",
-        "moved at most, m",
-        "turned at most, deg",
-        "resized at most",
+        "maximum displacement, m",
+        "maximum rotation, deg",
+        "maximum relative size change",
     )
     return Table("Edits", columns, rows)
 
 
 def _find_maximum(column: pa.ChunkedArray) -> float | None:
+    """Return the maximum of the values that are not null, or None."""
     return max((value for value in column.to_pylist() if value is not None), default=None)
 
 
 def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
-    """Show the first changed scenes before and after; the objects of the first edit are outlined."""
+    """Show the first changed scenes before and after the edits; the objects of the first edit are outlined."""
     shown: list[Picture] = []
     for scene, after, changes in islice(_list_changed(request, parts), count):
         region = select_around_objects(scene, changes.primitive, OUTLINE_M)
         shown.append(Picture(scene.scene_id, render_outlined_bev(scene, region, PICTURE_PX), "given"))
         shown.append(Picture(scene.scene_id, render_bev(after, PICTURE_PX, 2), "edited"))
-    note = "Left as given, what the first edit changed outlined in red; right after all edits."
+    note = (
+        "The left picture shows the given scene, with the objects that the first edit changes outlined in red. The "
+        "right picture shows the scene after all edits."
+    )
     return Pictures("Before and after", shown, 4, note)
 
 
@@ -189,7 +247,7 @@ def _list_changed(
     """Yield the scenes that the edits change, before and after, and the changes of the first edit."""
     for given, rows in parts:
         for scene in given.scenes(rows):
-            with suppress(ValueError):  # a scene that is rejected
+            with suppress(ValueError):  # Rejected scenes are skipped.
                 after, done = replay_edits(scene, request.edits)
                 if any(len(changes.primitive) for changes in done):
                     yield scene, after, done[0]

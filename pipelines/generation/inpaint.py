@@ -1,4 +1,4 @@
-"""Regenerate scenes inside a region: one Ray Data graph, a pipeline per actor, all variants of a scene per task."""
+"""Regenerate scenes inside a region: one Ray Data graph, one pipeline per actor, all variants of a scene per task."""
 
 from __future__ import annotations
 
@@ -31,24 +31,44 @@ from pipelines.schema.tables import Shard
 
 @dataclass(frozen=True)
 class RegionConfig:
-    """The region: the union of the given parts, or with `outside` its complement."""
+    """Region to regenerate: the union of the given parts, or the complement of the union.
 
-    polygon_m: tuple[float, ...] = ()  # x, y, x, y, ...
-    half_plane: tuple[float, ...] = ()  # direction x, y, and the metres along it where it begins
-    objects: tuple[int, ...] = ()  # primitives of a scene by number
-    margin_m: float = 1.0  # around objects
+    Attributes:
+        polygon_m: Corners of a polygon as x, y, x, y, ... (m, scene frame).
+        half_plane: Direction x, y of a half plane, and the distance along the direction at which it begins (m).
+        objects: Indices of primitives of a scene.
+        margin_m: Margin around the objects (m).
+        outside: Whether to regenerate the complement.
+    """
+
+    polygon_m: tuple[float, ...] = ()
+    half_plane: tuple[float, ...] = ()
+    objects: tuple[int, ...] = ()
+    margin_m: float = 1.0
     outside: bool = False
 
     def region(self, scene: Scene) -> np.ndarray:
-        """(rows, cols) bool pixels of a scene, True: regenerate. Raises ValueError for an invalid region."""
+        """Return the pixels of a scene to regenerate.
+
+        Args:
+            scene: Scene.
+
+        Returns:
+            (rows, cols) bool; True means regenerate.
+
+        Raises:
+            ValueError: A part of the region is invalid, or no pixel of the scene lies in the region.
+        """
         found = np.zeros((scene.grid.rows, scene.grid.cols), bool)
         if self.polygon_m:
             if len(self.polygon_m) % 2:
-                raise ValueError(f"a polygon of {len(self.polygon_m)} numbers: expected x y x y ... in metres")
+                raise ValueError(f"a polygon has {len(self.polygon_m)} numbers, expected pairs x y x y ... in metres")
             found |= select_polygon(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
         if self.half_plane:
             if len(self.half_plane) != 3:
-                raise ValueError(f"a half plane of {len(self.half_plane)} numbers: expected direction x y, and metres")
+                raise ValueError(
+                    f"a half plane has {len(self.half_plane)} numbers, expected direction x y and distance in metres"
+                )
             found |= select_half_plane(scene.grid, self.half_plane[:2], self.half_plane[2])
         if self.objects:
             if not -1 < min(self.objects) <= max(self.objects) < len(scene):
@@ -56,13 +76,23 @@ class RegionConfig:
             found |= select_around_objects(scene, self.objects, self.margin_m)
         found = found != self.outside
         if not found.any():
-            raise ValueError(f"scene {scene.scene_id}: the region holds no pixel of its {scene.grid}")
+            raise ValueError(f"scene {scene.scene_id}: the region contains no pixel of the scene's {scene.grid}")
         return found
 
 
 @dataclass(frozen=True)
 class InpaintRequest(Request):
-    """Options of inpainting: region and contents, `variants` per scene; `label` None keeps each scene's label."""
+    """Options of inpainting.
+
+    Attributes:
+        where: Region to regenerate.
+        contents: Contents to regenerate: ground, objects or both.
+        variants: Variants per scene.
+        label: Label of the generated region; None keeps the label of each scene.
+        seed: Seed of the noise.
+        repaint: RePaint options.
+        guidance_scale: Scale of classifier-free guidance.
+    """
 
     where: RegionConfig
     contents: Contents
@@ -74,7 +104,16 @@ class InpaintRequest(Request):
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
-    """Sum the errors of a raw decode outside the region: pixels, squared metres, primitives and their IoU3D."""
+    """Sum the errors of a raw decode in the known region, that is outside the generated region.
+
+    Args:
+        scene: Known scene.
+        raw: Decoded scene before compositing.
+        region: (rows, cols) bool generated region.
+
+    Returns:
+        Sums over pixels, squared height errors (m^2), primitives and their IoU3D.
+    """
     given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied
     sums = sum_pairs(given, made)
@@ -89,7 +128,14 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
 
 
 def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Compute ground IoU, height RMSE, share of objects found and their mean IoU3D from all sums; None for 0 / 0."""
+    """Compute scores of the known region from the sums of all decodes.
+
+    Args:
+        sums: Results of `compute_drift`.
+
+    Returns:
+        Ground IoU, height RMSE (m), share of objects found and their mean IoU3D. A ratio 0 / 0 is None.
+    """
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 
     def share(above: str, below: str) -> float | None:
@@ -107,7 +153,20 @@ def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float
 def inpaint_one(
     pipeline: PrITTIPipeline, request: InpaintRequest, scene: Scene, number: int
 ) -> tuple[list[Scene], list[dict[str, float]]]:
-    """Generate all variants of scene `number` of a run, and the drift of each raw decode of a block."""
+    """Generate all variants of one scene.
+
+    Args:
+        pipeline: Pipeline.
+        request: Options of inpainting.
+        scene: Given scene.
+        number: Number of the scene in the run.
+
+    Returns:
+        Variants, and the drift of each raw decode of a block.
+
+    Raises:
+        ValueError: The region contains no pixel of the scene, or the scene has no label and the request has none.
+    """
     scene, count = resample_to_model_resolution(scene, pipeline.spec), request.variants
     drifts: list[dict[str, float]] = []
     for step in inpaint_blocks(
@@ -138,7 +197,16 @@ def inpaint_one(
 
 
 def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: RegionConfig) -> np.ndarray:
-    """(rows, cols) pixels of a scene's region, extended to whole latent cells."""
+    """Return the pixels of a scene's region, extended to whole latent cells.
+
+    Args:
+        pipeline: Pipeline, which defines the latent grid.
+        scene: Scene in the resolution of the model.
+        where: Region to regenerate.
+
+    Returns:
+        (rows, cols) bool.
+    """
     region = where.region(scene)
     for window, part in split_region(pipeline, scene, region):
         region[scene.grid.intersect(window)[0]] |= part
@@ -146,7 +214,10 @@ def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: Regio
 
 
 class Inpainter:
-    """Actor. Row in: number of a scene. Row out: its drift. Generates its variants; writes shard and GLB files."""
+    """Actor that regenerates one scene per row and writes its shard and its GLB files.
+
+    The input row holds the number of a scene. The output row holds the number and the drift of the scene.
+    """
 
     def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
@@ -176,22 +247,24 @@ def inpaint_scenes(
     """Regenerate a region of the selected scenes; write tables, GLB files and a page. An interrupted run resumes.
 
     Args:
-        request: The region, what to regenerate in it, and how.
-        selection: The scenes.
-        num_actors: Number of pipelines that work concurrently.
+        request: Region, contents and options of the sampler.
+        selection: Scenes to inpaint.
+        num_actors: Number of pipelines that run concurrently.
         pictures: Maximum number of scenes on the page.
         on_scene: Called after each scene.
 
     Returns:
-        How far the decoders' output is off outside the region (`compute_drift_scores`).
+        Errors of the decoders in the known region, as `compute_drift_scores` defines them.
 
     Raises:
-        ValueError: The output holds a run made with other options, or a scene has no pixel in the region.
+        ValueError: The output holds a run of the same name with other options, or a scene has no pixel in the region.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
-    request.where.region(resample_to_model_resolution(first.scenes([row])[0], pipeline.spec))  # fails early
+    request.where.region(
+        resample_to_model_resolution(first.scenes([row])[0], pipeline.spec)
+    )  # Raises errors of the region before actors start.
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
     guard_generation_run(

@@ -1,4 +1,4 @@
-"""Extend scenes by blocks over Ray: an actor generates a block as soon as the blocks that it depends on are done."""
+"""Extend scenes by blocks with Ray. An actor generates a block as soon as the blocks that it depends on are done."""
 
 from __future__ import annotations
 
@@ -41,13 +41,25 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # share of ground in what a block knew beforehand
-MAX_RETRIES = 3  # of a block whose process died
+HARDLY_KNOWN = 0.1  # Below this fraction of known pixels with ground, the job prints a warning about a block.
+MAX_RETRIES = 3  # Retries of a block whose process died.
 
 
 @dataclass(frozen=True)
 class OutpaintRequest(Request):
-    """Options of outpainting. `label` None keeps each scene's label; `num_blocks` are ahead, behind, left, right."""
+    """Options of outpainting.
+
+    Attributes:
+        label: Label of the generated blocks; None keeps the label of each scene.
+        seed: Seed of the noise.
+        overlap: Overlap of neighbouring blocks as a fraction of a block.
+        mode: Outpainting mode of `generate_blocks`.
+        repaint: RePaint options.
+        guidance_scale: Scale of classifier-free guidance.
+        num_blocks: Number of blocks ahead, behind, left and right.
+        order: Order of the blocks, a key of RANKS.
+        batch_size: Blocks per batch.
+    """
 
     label: str | None
     seed: int
@@ -60,28 +72,70 @@ class OutpaintRequest(Request):
     batch_size: int = 4
 
     def scene_id(self, number: int) -> str:
+        """Return the id of an extended scene.
+
+        Args:
+            number: Number of the scene in the run.
+
+        Returns:
+            Scene id.
+        """
         return f"{self.source}-{self.seed}-{number:07d}"
 
     def blocks_directory(self, number: int) -> str:
-        """Return the directory of a scene's blocks; it is deleted once they are stitched together."""
+        """Return the directory of a scene's blocks. It is deleted after the blocks are stitched.
+
+        Args:
+            number: Number of the scene in the run.
+
+        Returns:
+            Path of the directory.
+        """
         return storage.join_uri(self.output, "blocks", self.run, f"{number:07d}")
 
     def make_block_grid(self, size: int) -> BlockGrid:
-        """Return the grid of blocks of `size` latent cells."""
+        """Return the block grid.
+
+        Args:
+            size: Side of a block in latent cells.
+
+        Returns:
+            Block grid.
+
+        Raises:
+            ValueError: The overlap is not a whole number of cells.
+        """
         return BlockGrid.from_overlap(size, self.overlap, rank=RANKS[self.order], num_blocks=self.num_blocks)
 
 
 @dataclass(frozen=True)
 class BlockBatch:
-    """Blocks of a scene to generate in one batch, and the blocks that they depend on."""
+    """Blocks of a scene that are generated in one batch.
 
-    number: int  # of the scene
+    Attributes:
+        number: Number of the scene in the run.
+        indices: Indices of the blocks.
+        needs: Indices of the blocks that the batch depends on.
+    """
+
+    number: int
     indices: tuple[BlockIndex, ...]
     needs: frozenset[BlockIndex]
 
 
 def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[BlockBatch]:
-    """List all blocks of a scene but the given one, in an order that respects dependencies; always the same batches."""
+    """List all blocks of a scene except the given one in batches, in an order that respects dependencies.
+
+    The batches depend on the arguments only, so that a resumed run has the same batches.
+
+    Args:
+        block_grid: Block grid.
+        number: Number of the scene in the run.
+        batch_size: Maximum number of blocks per batch.
+
+    Returns:
+        Batches.
+    """
     listed = []
     for group in block_grid.group_by_rank(index for index in block_grid.indices() if index != (0, 0)):
         for start in range(0, len(group), batch_size):
@@ -95,12 +149,25 @@ def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[Bl
 
 
 def make_block_path(directory: str, index: BlockIndex) -> str:
-    """Path of a block's file."""
+    """Return the path of a block's file.
+
+    Args:
+        directory: Directory of the scene's blocks.
+        index: Index of the block.
+
+    Returns:
+        Path of a .safetensors file.
+    """
     return storage.join_uri(directory, f"{index[0]:+05d}{index[1]:+05d}.safetensors")
 
 
 def write_block(block: SceneBlock, path: str) -> None:
-    """Write a block exactly, unlike the tables, so that a resumed run yields the same scene."""
+    """Write a block without loss, unlike the tables, so that a resumed run yields the same scene.
+
+    Args:
+        block: Block.
+        path: Path of the .safetensors file.
+    """
     arrays = {name: torch.from_numpy(getattr(block.scene, name).copy()) for name in ARRAYS}
     arrays |= {"latent": block.latent.cpu().contiguous()}
     arrays |= {"of_block": torch.tensor([block.datum_m, block.known_ground], dtype=torch.float64)}
@@ -109,11 +176,22 @@ def write_block(block: SceneBlock, path: str) -> None:
 
 
 def read_block(path: str, empty: Scene) -> SceneBlock:
-    """Read a block. Raises ValueError naming a file that is missing or damaged."""
+    """Read a block.
+
+    Args:
+        path: Path of the .safetensors file.
+        empty: Empty scene that provides the grid and the ids.
+
+    Returns:
+        Block.
+
+    Raises:
+        ValueError: The file is damaged. The message names the file.
+    """
     try:
         arrays = load(storage.read_bytes(path))
     except SafetensorError as error:
-        raise ValueError(f"{path}: not a whole block ({error}); delete it and run the job again") from error
+        raise ValueError(f"{path}: not a complete block ({error}); delete the file and run the job again") from error
     latent, (datum_m, known_ground) = arrays.pop("latent"), arrays.pop("of_block").tolist()
     scene = replace(
         empty,
@@ -126,7 +204,7 @@ def read_block(path: str, empty: Scene) -> SceneBlock:
 
 
 class Outpainter:
-    """Actor with a pipeline that generates blocks and stitches a scene's blocks together."""
+    """Actor with a pipeline that generates blocks and stitches the blocks of a scene."""
 
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
@@ -134,17 +212,33 @@ class Outpainter:
 
     @cached_property
     def block_grid(self) -> BlockGrid:
+        """Return the block grid of the model's latent size."""
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
     def load_scene(self, number: int) -> Scene:
-        """Return the given scene on the model's grid."""
+        """Return a given scene on the model's grid.
+
+        Args:
+            number: Number of the scene in the run.
+
+        Returns:
+            Scene.
+        """
         shard, row = self.chosen[number]
         return resample_to_model_grid(shard.scenes([row])[0], self.pipeline.spec)
 
     def load_blocks(
         self, number: int, indices: Sequence[BlockIndex]
     ) -> tuple[BlockComposer, Scene, dict[BlockIndex, SceneBlock]]:
-        """Return a scene's composer, the given scene, and its generated blocks `indices` with the given block."""
+        """Load the given scene and generated blocks of it.
+
+        Args:
+            number: Number of the scene in the run.
+            indices: Indices of generated blocks.
+
+        Returns:
+            Composer, given scene, and blocks by index, including the given scene as block (0, 0).
+        """
         given = self.load_scene(number)
         empty = make_empty_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
         directory = self.request.blocks_directory(number)
@@ -156,7 +250,11 @@ class Outpainter:
         return composer, given, blocks
 
     def generate(self, batch: BlockBatch) -> None:
-        """Generate the blocks of a batch and write each."""
+        """Generate the blocks of a batch and write each to a file.
+
+        Args:
+            batch: Blocks to generate.
+        """
         request = self.request
         composer, given, known = self.load_blocks(batch.number, sorted(batch.needs))
         blocks = generate_blocks(
@@ -176,7 +274,11 @@ class Outpainter:
             write_block(block, make_block_path(request.blocks_directory(batch.number), index))
 
     def finish(self, number: int) -> None:
-        """Write a scene's tables and GLB from its blocks, and a table of the blocks; delete their files."""
+        """Write the tables and the GLB of a scene from its blocks, and a table of the blocks. Delete the block files.
+
+        Args:
+            number: Number of the scene in the run.
+        """
         request = self.request
         composer, given, blocks = self.load_blocks(
             number, [index for index in self.block_grid.indices() if index != (0, 0)]
@@ -197,6 +299,15 @@ class Outpainter:
 
 
 def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
+    """Return the path of the table of a scene's blocks.
+
+    Args:
+        request: Options of outpainting.
+        number: Number of the scene in the run.
+
+    Returns:
+        Path of a Parquet file.
+    """
     return storage.join_uri(request.output, "block_tables", request.run, f"{number:07d}.parquet")
 
 
@@ -209,19 +320,19 @@ def outpaint_scenes(
     num_actors: int = 1,
     on_blocks: Callable[[int], None] | None = None,
 ) -> pa.Table:
-    """Extend the selected scenes; an interrupted run resumes.
+    """Extend the selected scenes. An interrupted run resumes.
 
     Args:
-        request: How to extend them.
-        selection: The scenes.
-        num_actors: Number of pipelines that generate concurrently.
-        on_blocks: Called with the number of blocks finished since the last call.
+        request: Options of outpainting.
+        selection: Scenes to extend.
+        num_actors: Number of pipelines that run concurrently.
+        on_blocks: Called with the number of blocks that finished after the last call.
 
     Returns:
-        A table with a row per block.
+        Table with a row per block.
 
     Raises:
-        ValueError: The output holds a run made with other options.
+        ValueError: The output holds a run of the same name with other options.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
@@ -255,16 +366,26 @@ def run_batches(
     num_actors: int,
     on_blocks: Callable[[int], None] | None,
 ) -> None:
-    """Start actors and give them batches as soon as the blocks that they depend on are done."""
+    """Start actors and assign batches to them as soon as the blocks that a batch depends on are done.
+
+    Args:
+        request: Options of outpainting.
+        chosen: Shard and row of each selected scene.
+        waiting: Batches to generate.
+        done: Finished blocks by scene number.
+        num_actors: Maximum number of actors.
+        on_blocks: Called with the number of blocks of each finished batch.
+    """
     actor = ray.remote(Outpainter).options(
         num_cpus=1, num_gpus=count_gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
     room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
-    count = min(num_actors, max(len(waiting), len(done)), max(1, room))  # one without room would take a killed one's
+    # An actor without a free CPU or GPU would take that of a killed actor, which then could not restart.
+    count = min(num_actors, max(len(waiting), len(done)), max(1, room))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
-    finally:  # an error's traceback would keep them, and their CPUs, alive
+    finally:  # The traceback of an error holds references to the actors, which would keep their CPUs in use.
         for worker in workers:
             ray.kill(worker)
 
@@ -272,9 +393,15 @@ def run_batches(
 def schedule_batches(
     workers: list, waiting: list[BlockBatch], done: dict[int, set[BlockIndex]], on_blocks: Callable[[int], None] | None
 ) -> None:
-    """Give each idle actor a batch, or a scene to stitch, until nothing is left.
+    """Give each idle actor a batch, or a scene to stitch, until all work is done.
 
-    An actor takes part from the moment it is ready: others may have taken its CPU.
+    An actor takes part as soon as it is ready, because other work may occupy its CPU at first.
+
+    Args:
+        workers: Actor handles.
+        waiting: Batches to generate; the function empties the list.
+        done: Finished blocks by scene number; the function adds to it.
+        on_blocks: Called with the number of blocks of each finished batch.
     """
     idle: list = []
     running: dict[ray.ObjectRef, tuple] = {worker.__ray_ready__.remote(): (None, worker) for worker in workers}
@@ -301,7 +428,16 @@ def schedule_batches(
 def pop_ready_task(
     waiting: list[BlockBatch], whole: list[int], done: Mapping[int, set[BlockIndex]]
 ) -> BlockBatch | int | None:
-    """Remove and return the first task whose dependencies are done."""
+    """Remove and return the first task whose dependencies are done.
+
+    Args:
+        waiting: Batches to generate.
+        whole: Numbers of scenes whose blocks are all done; these are stitched first.
+        done: Finished blocks by scene number.
+
+    Returns:
+        A batch, the number of a scene to stitch, or None if no task is ready.
+    """
     if whole:
         return whole.pop(0)
     for position, batch in enumerate(waiting):

@@ -1,4 +1,4 @@
-"""Generate scenes from labels and seeds: one Ray Data graph, a pipeline per actor, one output shard per task."""
+"""Generate scenes from labels and seeds: one Ray Data graph, one pipeline per actor, one output shard per task."""
 
 from __future__ import annotations
 
@@ -27,23 +27,51 @@ from pipelines.training.latents import digest_weights
 
 @dataclass(frozen=True)
 class Request:
-    """A run of a pipeline; its scenes become source generated-<run> of a dataset directory."""
+    """Run of a pipeline, whose scenes become source generated-<run> of a dataset directory.
 
-    model: str  # directory of a PrITTIPipeline
+    Attributes:
+        model: Directory of a PrITTIPipeline.
+        output: Dataset directory.
+        run: Run name.
+    """
+
+    model: str
     output: str
     run: str
 
     @property
     def source(self) -> str:
+        """Return the source of the generated scenes."""
         return f"generated-{self.run}"
 
     def shard(self, number: int) -> Shard:
+        """Return a shard of the run.
+
+        Args:
+            number: Number of the shard.
+
+        Returns:
+            Shard of split "generated".
+        """
         return Shard(self.output, self.source, "generated", number)
 
 
 @dataclass(frozen=True)
 class SampleRequest(Request):
-    """Scenes to generate. Scene i has label labels[i mod len(labels)] and depends on (seed, i) only."""
+    """Scenes to generate. Scene i depends on the seed, i and the options only.
+
+    Attributes:
+        num_scenes: Number of scenes.
+        labels: Labels; scene i has label labels[i mod len(labels)].
+        seed: Seed of the noise.
+        num_inference_steps: Steps of the sampler.
+        guidance_scale: Scale of classifier-free guidance.
+        sampler: Name of the sampler.
+        noise_scaling: Noise scaling; None uses the value of the model.
+        existence_threshold: Minimum existence probability; None uses the value of the model.
+        repair: Whether to move primitives to the ground and apart, without removing any (pipelines/editing/edit.py).
+        shard_scenes: Scenes per shard.
+    """
 
     num_scenes: int
     labels: tuple[str, ...]
@@ -51,21 +79,40 @@ class SampleRequest(Request):
     num_inference_steps: int
     guidance_scale: float
     sampler: str = "ddpm"
-    noise_scaling: float | None = None  # None: the model's own
-    existence_threshold: float | None = None  # None: the model's own
-    repair: bool = False  # onto the ground and apart, nothing taken out (pipelines/editing/edit.py)
+    noise_scaling: float | None = None
+    existence_threshold: float | None = None
+    repair: bool = False
     shard_scenes: int = 64
 
     def shards(self) -> list[Shard]:
+        """Return all shards of the run."""
         return [self.shard(k) for k in range(-(-self.num_scenes // self.shard_scenes))]
 
     def indices(self, shard: Shard) -> range:
+        """Return the scene numbers of a shard.
+
+        Args:
+            shard: Shard of the run.
+
+        Returns:
+            Range of scene numbers.
+        """
         start = shard.number * self.shard_scenes
         return range(start, min(start + self.shard_scenes, self.num_scenes))
 
 
 def load_pipeline(directory: str) -> PrITTIPipeline:
-    """Load a pipeline. Raises ValueError if the directory holds no complete one."""
+    """Load a pipeline onto the GPU, or onto the CPU if there is no GPU.
+
+    Args:
+        directory: Directory of a PrITTIPipeline.
+
+    Returns:
+        Pipeline without progress bar.
+
+    Raises:
+        ValueError: The directory holds no complete pipeline.
+    """
     try:
         pipeline = PrITTIPipeline.from_pretrained(directory)
     except (OSError, ValueError, TypeError, AttributeError) as error:
@@ -75,29 +122,58 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
-    """Bind source generated-<run> of a directory to one request and to the weights of its model (run_guard.py)."""
+    """Bind source generated-<run> of a dataset directory to one request and to the weights of its model (run_guard.py).
+
+    Args:
+        request: Request of the run.
+        pipeline: Loaded model.
+        parts: Further directories of the run.
+        **also: Further options of the run.
+
+    Raises:
+        ValueError: The directory holds a run of the same name with other options or other weights.
+    """
     options: dict[str, Any] = asdict(request) | also
     options["weights"] = f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"
-    del options["model"]  # the same weights in another directory are the same model
+    del options["model"]  # The digests identify the model, so that its directory may change.
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
-    if not options.get("repair"):  # absent in the records of earlier versions
+    if not options.get("repair"):  # Records of earlier versions lack this option.
         options.pop("repair", None)
-    if "repaint" in options and options["repaint"]["eta"] != 1:  # the noise scaling is used
+    if (
+        "repaint" in options and options["repaint"]["eta"] != 1
+    ):  # With eta other than 1, the sampler uses the noise scaling.
         options["noise_scaling"] = pipeline.config.noise_scaling
     guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 
 def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
-    """Resample a scene to the model's ground classes and grid, or to another grid of the same area."""
+    """Resample a scene to the model's ground classes and grid.
+
+    Args:
+        scene: Scene.
+        spec: Layout of the model.
+        grid: Other grid of the same area; None uses the grid of the model.
+
+    Returns:
+        Scene with resampled rasters; primitives are unchanged.
+    """
     grid = grid or spec.grid
     height, occupied = resample_scene_ground(scene, spec.ground_classes, grid)
     return replace(scene, ground_classes=spec.ground_classes, grid=grid, height_m=height, occupied=occupied)
 
 
 def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
-    """Resample a scene to the model's ground classes and resolution, over its whole area.
+    """Resample a scene to the model's ground classes and resolution, over the whole area of the scene.
 
-    Raises ValueError if neither of the two resolutions is a multiple of the other.
+    Args:
+        scene: Scene.
+        spec: Layout of the model.
+
+    Returns:
+        Scene with resampled rasters; primitives are unchanged.
+
+    Raises:
+        ValueError: Neither of the two resolutions is a multiple of the other.
     """
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
@@ -105,7 +181,18 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
 
 
 def find_scene_label(scene: Scene, kind: str) -> str:
-    """Return a scene's label for a model conditioned on `kind`. Raises ValueError if the scene has none."""
+    """Return the label of a scene for a model that is conditioned on a kind of label.
+
+    Args:
+        scene: Scene.
+        kind: Kind of label, a key of LABELS.
+
+    Returns:
+        Label.
+
+    Raises:
+        ValueError: The scene has no such label.
+    """
     label = compose_label(kind, scene.vegetation_density, scene.vehicle_density)
     if label is None or label not in LABELS[kind]:
         raise ValueError(
@@ -115,7 +202,11 @@ def find_scene_label(scene: Scene, kind: str) -> str:
 
 
 class Sampler:
-    """Actor. Row in: number of a shard. Row out: number, scenes, seconds. Generates and writes the shard's scenes."""
+    """Actor that generates and writes the scenes of one shard per row.
+
+    The input row holds the number of a shard. The output row holds the number, the number of scenes and the time in
+    seconds.
+    """
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
         self.request, self.batch_size = request, batch_size
@@ -149,19 +240,19 @@ class Sampler:
 def sample_scenes(
     request: SampleRequest, num_actors: int = 1, batch_size: int = 8, on_shard: Callable[[dict], None] | None = None
 ) -> int:
-    """Generate the requested scenes and write them as tables. Another call resumes an interrupted one.
+    """Generate the requested scenes and write them as tables. Another call resumes an interrupted run.
 
     Args:
-        request: Scenes to generate, and where they go.
+        request: Scenes to generate, and the dataset directory.
         num_actors: Maximum number of actors, each with a pipeline.
         batch_size: Scenes per batch.
-        on_shard: Receives the row of each finished shard.
+        on_shard: Called with the row of each finished shard.
 
     Returns:
         Number of scenes.
 
     Raises:
-        ValueError: The model does not know a label, or the output holds a run with other options.
+        ValueError: The model does not know a label, or the output holds a run of the same name with other options.
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)
