@@ -1,4 +1,4 @@
-"""Ablation jobs on Ray: tables and figures, resuming, the variants that are trained."""
+"""Tests of the ablation jobs on Ray: tables, figures, resuming and trained variants."""
 
 import json
 import xml.etree.ElementTree as ElementTree
@@ -21,7 +21,7 @@ from pipelines.evaluation.ablation import (
 
 @pytest.fixture(scope="module")
 def empty_home(cluster, tmp_path_factory):
-    """An empty $PRITTI_HOME: the encoding study needs no data, and the smoke preset creates its own."""
+    """An empty $PRITTI_HOME: the encoding study needs no data, and the smoke preset creates its dataset."""
     with pytest.MonkeyPatch.context() as patch:
         path = tmp_path_factory.mktemp("ablation")
         patch.setenv("PRITTI_HOME", str(path))
