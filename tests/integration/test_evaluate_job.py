@@ -1,4 +1,4 @@
-"""jobs/evaluate_scenes.py with random Inception weights and with images instead of tables."""
+"""Tests of jobs/evaluate_scenes.py with random Inception weights, on tables and on images."""
 
 import json
 
@@ -19,7 +19,7 @@ from pipelines.rendering.render import render_bev
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 
-SAMPLES = 5  # the network takes a second per image
+SAMPLES = 5  # the network needs one second per image
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def weights(tmp_path_factory) -> str:
 
 
 def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_path):
-    """Scores real training scenes against real test scenes, as tables and as ADM's .npz of their images."""
+    """The test scores training scenes against test scenes twice: from tables and from ADM's .npz of their images."""
     data = str(smoke / "datasets/smoke")
     test = load_scenes(SceneSubset(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([render_bev(scene)]) for scene in test), SAMPLES)
@@ -46,7 +46,7 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
     for name in ("fid", "sfid", "kid", "inception_score", "precision_k1", "recall_k3", "density_k3", "coverage_k1"):
         assert as_pictures[name]["value"] == pytest.approx(as_tables[name]["value"], rel=1e-5), (
             name
-        )  # batches round differently
+        )  # rounding depends on the batch
         assert as_tables[name]["low"] <= as_tables[name]["high"]
     assert as_tables["fid"]["value"] > 0 and as_tables["inception_score"]["value"] >= 1
     assert "validity" in as_tables and "validity" not in as_pictures
@@ -66,7 +66,7 @@ def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
 
 
 def test_describe_is_unchanged_by_worker_kill(smoke, tmp_path):
-    """The worker is killed as soon as the first part is written."""
+    """The test kills the worker as soon as the job has written the first part."""
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     chosen = SceneSubset(dataset.root, "town", "train")
     whole = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "whole"))
@@ -81,7 +81,7 @@ def test_describe_is_unchanged_by_worker_kill(smoke, tmp_path):
     assert all(np.array_equal(whole[name], again[name], equal_nan=name == "statistics") for name in whole)
 
 
-def scores_of(real: np.ndarray, generated: np.ndarray) -> dict:
+def compare_features(real: np.ndarray, generated: np.ndarray) -> dict:
     sides = [{"scene_id": np.arange(len(side)), "random": side} for side in (real, generated)]
     return compare_datasets(*sides)
 
@@ -89,19 +89,19 @@ def scores_of(real: np.ndarray, generated: np.ndarray) -> dict:
 def test_compare_handles_degenerate_features(cluster):
     rng = np.random.default_rng(0)
     some, constant = rng.normal(size=(20, 6)), np.ones((20, 6))
-    same = scores_of(constant, constant)
+    same = compare_features(constant, constant)
     assert same["random_frechet"].value == 0 and same["random_precision_k3"].value == 1
-    apart = scores_of(constant, constant + 1)
+    apart = compare_features(constant, constant + 1)
     assert apart["random_frechet"].value == pytest.approx(6) and apart["random_recall_k3"].value == 0
-    twice = scores_of(some, np.concatenate([some, some]))  # unequal numbers, each scene twice
+    twice = compare_features(some, np.concatenate([some, some]))  # the second side contains each scene twice
     assert twice["random_precision_k3"].value == 1 and twice["random_recall_k3"].value == 1
     assert twice["random_frechet"].value < 0.2
     for values in (same, apart, twice):
         assert all(np.isfinite(score).all() for score in values.values() if isinstance(score, Estimate))
     with pytest.raises(ValueError, match=r"generated features hold NaN .* first 4"):
-        scores_of(some, np.where(np.arange(20)[:, None] == 4, np.nan, some))
+        compare_features(some, np.where(np.arange(20)[:, None] == 4, np.nan, some))
     with pytest.raises(ValueError, match="--k 3 needs more than 3 scenes on each side, got 20 and 3"):
-        scores_of(some, some[:3])
+        compare_features(some, some[:3])
     found = compute_memorisation(some, np.concatenate([some[:5], some[5:] + 9]))
     assert found["copies"].value == 0.25 and found["memorised"].value == 0.25 and found["nearest"][3, 0] == 3
 
