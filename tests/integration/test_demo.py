@@ -1,4 +1,4 @@
-"""The demo from its first stage to its report, and a second call."""
+"""Tests of jobs/run_demo.py, from the first stage to the report."""
 
 import os
 import subprocess
@@ -30,13 +30,13 @@ def run_demo(output: Path) -> str:
 
 
 def read_times(output: Path) -> dict[str, int]:
-    """When each checkpoint, table and scene was written."""
+    """Return the modification times of all checkpoints and Parquet files in ns, by path."""
     paths = [path for folder in ("runs", "datasets", "generated") for path in (output / folder).rglob("*")]
     return {str(path): path.stat().st_mtime_ns for path in paths if path.suffix in (".safetensors", ".parquet")}
 
 
 @pytest.mark.slow
-def test_demo_writes_report_and_second_call_makes_nothing_again(tmp_path):
+def test_demo_writes_report_and_second_call_changes_no_file(tmp_path):
     assert "[9/9] write the report" in run_demo(tmp_path)
     assert len(list(read_scenes(str(tmp_path / "generated")))) == 4
     assert (tmp_path / "report.html").read_text().count("data:image/png") > 5
