@@ -1,4 +1,4 @@
-"""Publishing a model: it requires an evaluation and training records, and the model is found by every name."""
+"""Tests of jobs/publish_model.py: required evaluation and training records, and names of published models."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ from models.pretrained import CHECKSUMS_NAME, compute_checksums
 
 
 @pytest.fixture(scope="module")
-def evaluated(smoke) -> Path:
-    """Scores of scenes and reconstructions of the smoke model."""
+def evaluation_directory(smoke) -> Path:
+    """Folder of an evaluation with scores of scenes and reconstructions of the smoke model."""
     from jobs import evaluate_scenes, sample_scenes
     from jobs.implementation.evaluate_scenes import evaluate
     from jobs.implementation.sample_scenes import sample
@@ -33,24 +33,24 @@ def evaluated(smoke) -> Path:
     return smoke / "evaluations/judged"
 
 
-def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
+def test_publish_writes_model_with_card_and_finds_it(smoke, evaluation_directory):
     from jobs.implementation.publish_model import publish
     from jobs.publish_model import Config
     from jobs.support.model_directories import find_pipeline_directory
     from pipelines.generation.sample import load_pipeline
 
-    output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluated)))
+    output, reference, run_id = publish(Config(name="tiny", evaluation=str(evaluation_directory)))
     entry = Path(output)
     assert reference == "models:/tiny/1" and entry == smoke / "zoo/tiny"
     assert json.loads((entry / CHECKSUMS_NAME).read_text()) == compute_checksums(entry)
-    card, scores = (entry / "README.md").read_text(), json.loads((evaluated / "metrics.json").read_text())
+    card, scores = (entry / "README.md").read_text(), json.loads((evaluation_directory / "metrics.json").read_text())
     assert f"| {scores['generation']['random_frechet']['value']:.3g}"[:8] in card
     assert "| steps done | 8 |" in card and "learning_rate 0.001" in card and "options" in card
-    for path in entry.rglob("*"):  # no path of this machine
+    for path in entry.rglob("*"):  # no file contains a path of this machine
         assert path.is_dir() or b"/tmp/" not in path.read_bytes()
     for picture in ("samples.png", "failures.png"):
         assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
-    pipeline = load_pipeline(output)  # samples with the evaluated settings
+    pipeline = load_pipeline(output)  # has the settings of the evaluated scenes
     assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
     trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
     for name in ("tiny", reference, run_id):
@@ -61,23 +61,25 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluated):
         json.loads((kept / CHECKSUMS_NAME).read_text()) == compute_checksums(kept)
         and len(list(kept.parent.iterdir())) == 1
     )
-    second = publish(Config(name="tiny", evaluation=str(evaluated)))
+    second = publish(Config(name="tiny", evaluation=str(evaluation_directory)))
     assert second[1] == "models:/tiny/2"
     (damaged,) = smoke.glob(f"mlartifacts/**/{second[2]}/**/dit/config.json")
     damaged.write_text(damaged.read_text() + " ")
     with pytest.raises(ValueError, match=r"models:/tiny/2: its files do not match its checksums.json"):
         find_pipeline_directory(second[1])
     assert not (smoke / "registry" / second[2]).exists()
-    assert publish(Config(name="tiny", evaluation=str(evaluated), register=False)) == [output]
+    assert publish(Config(name="tiny", evaluation=str(evaluation_directory), register=False)) == [output]
 
 
-def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path):
+def test_publish_rejects_model_without_own_evaluation(smoke, evaluation_directory, tmp_path):
     from jobs.implementation.publish_model import publish
     from jobs.publish_model import Config
 
     with pytest.raises(ValueError, match=r"no evaluation here; run jobs/sample_scenes.py"):
         publish(Config(name="none", evaluation=str(tmp_path)))
-    about, scores = (json.loads((evaluated / f"{name}.json").read_text()) for name in ("evaluation", "metrics"))
+    about, scores = (
+        json.loads((evaluation_directory / f"{name}.json").read_text()) for name in ("evaluation", "metrics")
+    )
     other = about | {"sampling": about["sampling"] | {"weights": "aa-bb"}}
     elsewhere = tmp_path / "town"
     elsewhere.mkdir()
@@ -103,23 +105,25 @@ def test_publish_rejects_model_without_own_evaluation(smoke, evaluated, tmp_path
     assert not (smoke / "zoo/none").exists()
 
 
-def test_publish_rejects_weights_without_provenance(smoke, evaluated, monkeypatch, tmp_path):
+def test_publish_rejects_weights_without_provenance(smoke, evaluation_directory, monkeypatch, tmp_path):
     from jobs.implementation.publish_model import publish
     from jobs.publish_model import Config
 
-    first = Path(publish(Config(evaluation=str(evaluated), output=str(tmp_path / "first"), register=False))[0])
+    first = Path(
+        publish(Config(evaluation=str(evaluation_directory), output=str(tmp_path / "first"), register=False))[0]
+    )
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/other.db")
     monkeypatch.setattr("jobs.implementation.publish_model.home_path", lambda *parts: str(tmp_path.joinpath(*parts)))
     config = Config(
         model=str(smoke / "models/pritti-smoke"),
-        evaluation=str(evaluated),
+        evaluation=str(evaluation_directory),
         output=str(tmp_path / "second"),
         register=False,
     )  # fmt: skip
     with pytest.raises(ValueError, match="trained these weights"):
         publish(config)
     (tmp_path / "zoo").mkdir()
-    first.rename(tmp_path / "zoo/first")  # without access to MLflow, training.json of the entry is used
+    first.rename(tmp_path / "zoo/first")  # publish() reads training.json of this folder because MLflow has no run
     publish(config)
     cards = [tmp_path / place / "README.md" for place in ("zoo/first", "second")]
     assert cards[0].read_text() == cards[1].read_text()
@@ -149,15 +153,17 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     for batch in iterate_batches(run.stream, run.reader, 0, run.settings.steps):
         trainer.step(convert_to_tensors(batch), range(run.stream.batch_size))
     tag_weights(run.tracker, trainer.ema_model(), trainer.steps_done)
-    told = read_history("pritti-dit", "Transformer", trainer.ema_model())
-    assert [(run.name, run.stage, run.steps) for run in told] == [
+    history = read_history("pritti-dit", "Transformer", trainer.ema_model())
+    assert [(run.name, run.stage, run.steps) for run in history] == [
         ("dit", "Transformer", 8),
         ("dit-2", "Transformer, run 2", 2),
     ]
-    assert told[1].options["start_from"] == told[0].weights == digest_weights(first)
+    assert history[1].options["start_from"] == history[0].weights == digest_weights(first)
     first.save_pretrained(more / "dit")
     sampling = load_pipeline(complete(str(more))).config
-    assert sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25  # equal to the initial weights
+    assert (
+        sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25
+    )  # the settings of the initial pipeline
     with pytest.raises(ValueError, match=r"its label is vegetation, but that of this run is vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
