@@ -1,4 +1,4 @@
-"""Imported meshes and voxels become tables and are scored, on Ray."""
+"""Tests of the jobs that import and score meshes and voxels, on Ray."""
 
 import json
 from dataclasses import replace
@@ -46,14 +46,16 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
     for scene, k in zip(got, (1, 3, 5, 0, 2), strict=True):
         want = town_scenes[k]
         assert np.array_equal(scene.category, want.category) and np.array_equal(scene.center_m, want.center_m)
-        assert np.abs(scene.surface()[0] - want.surface()[0]).max() <= 0.005 + 1e-6  # the tables' step is 1 cm
+        assert (
+            np.abs(scene.surface()[0] - want.surface()[0]).max() <= 0.005 + 1e-6
+        )  # tables store heights in steps of 1 cm
         assert np.array_equal(scene.surface()[1], want.surface()[1])
     ((reject,),) = (duckdb.sql(f"select reason from '{output}/rejects/**/*.parquet'").fetchall(),)
     assert "night/4.glb" in reject[0] and "expected a whole file" in reject[0]
 
     kept = Path(find_shards(str(output))[0].path("scenes"))
     stamp = kept.stat().st_mtime_ns
-    (meshes / "night/4.glb").write_bytes(good)  # repaired: the same command reads only this file
+    (meshes / "night/4.glb").write_bytes(good)  # after this repair, the same command reads only this file
     assert import_scenes(config)[1]["rejects"] == 0
     assert len(list(read_scenes(str(output)))) == 6 and not list((output / "rejects").rglob("*.parquet"))
     assert kept.stat().st_mtime_ns == stamp
@@ -78,7 +80,7 @@ def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     )
     generation = scores["generation"]
     assert generation["scenes"] == {"real": len(scenes), "generated": len(scenes)}
-    assert generation["random_frechet"]["value"] < 1e-4  # identical images
+    assert generation["random_frechet"]["value"] < 1e-4  # both sides have identical images
     assert all(found["between"]["value"] < 1e-9 for found in generation["count_distance"].values())
 
 
@@ -130,7 +132,10 @@ def test_import_rejects_input_without_scenes(cluster, tmp_path):
 
 @pytest.fixture(scope="module")
 def voxel_files(tmp_path_factory, town_scenes):
-    """Truths, and reconstructions with a tenth of the voxels emptied and some classes changed."""
+    """Folders of true and reconstructed voxels.
+
+    In the reconstructions, a tenth of the voxels is empty and some classes are changed.
+    """
     root, rng, voxels = tmp_path_factory.mktemp("voxels"), np.random.default_rng(0), []
     for k, scene in enumerate(town_scenes[:4]):
         truth = voxelize(scene, VoxelGrid())
