@@ -1,4 +1,4 @@
-"""Scores of reconstructions, computed by Ray tasks, and their page."""
+"""Tests of reconstruction scores from Ray tasks, and of their page."""
 
 from pathlib import Path
 
@@ -14,51 +14,51 @@ from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.schema.scene_subset import SceneSubset
 
 
-def selection(root: Path) -> SceneSubset:
+def select_scenes(root: Path) -> SceneSubset:
     return SceneSubset(str(root), "town", "test")
 
 
 @pytest.fixture(scope="module")
-def rebuilt(reconstruction_dataset, cluster) -> Reconstruction:
-    return evaluate_reconstruction(selection(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
+def reconstruction(reconstruction_dataset, cluster) -> Reconstruction:
+    return evaluate_reconstruction(select_scenes(reconstruction_dataset), str(reconstruction_dataset / "lvae"))
 
 
-def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, rebuilt):
+def test_reconstruction_is_independent_of_chunks_and_workers(reconstruction_dataset, reconstruction):
     done = []
     again = evaluate_reconstruction(
-        selection(reconstruction_dataset),
+        select_scenes(reconstruction_dataset),
         str(reconstruction_dataset / "lvae"),
         2,
         batch_size=3,
         on_scene=lambda: done.append(1),
     )
-    assert len(done) == rebuilt.scores["scenes"] == len(rebuilt.scenes) == 11
-    first, second = flatten_scores(rebuilt.scores), flatten_scores(again.scores)
+    assert len(done) == reconstruction.scores["scenes"] == len(reconstruction.scenes) == 11
+    first, second = flatten_scores(reconstruction.scores), flatten_scores(again.scores)
     different = [name for name in first if first[name] != pytest.approx(second[name], rel=1e-3, abs=1e-6)]
     assert first.keys() == second.keys() and not different
 
 
-def test_reconstruction_lists_best_scene_first(reconstruction_dataset, rebuilt):
-    scenes = rebuilt.scenes
+def test_reconstruction_lists_best_scene_first(reconstruction_dataset, reconstruction):
+    scenes = reconstruction.scenes
     miou = scenes["voxel_miou"].to_pylist()
     assert miou == sorted(miou, reverse=True)
-    ids = [shard.scenes(rows)[0].scene_id for shard, rows in rebuilt.places]
+    ids = [shard.scenes(rows)[0].scene_id for shard, rows in reconstruction.places]
     assert scenes["scene_id"].to_pylist() == ids and len(set(ids)) == 11
     assert set(scenes["primitives"].to_pylist()) == {25}
     assert min(scenes["ground_iou"].to_pylist()) >= 0 and max(scenes["found"].to_pylist()) <= 1
 
 
-def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_dataset, rebuilt):
-    drawn = draw_scenes([rebuilt.places[0], rebuilt.places[-1]], str(reconstruction_dataset / "lvae"))
-    assert [row["scene_id"] for row in drawn] == rebuilt.scenes["scene_id"].take([0, 10]).to_pylist()
+def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_dataset, reconstruction):
+    drawn = draw_scenes([reconstruction.places[0], reconstruction.places[-1]], str(reconstruction_dataset / "lvae"))
+    assert [row["scene_id"] for row in drawn] == reconstruction.scenes["scene_id"].take([0, 10]).to_pylist()
     for row in drawn:
         for view in ("above", "oblique"):
             truth, again = row[f"truth_{view}"], row[f"rebuilt_{view}"]
             differs = bool((truth != again).any())
             assert truth.shape == again.shape == (480, 480, 3) and differs
-    html = render_reconstruction_html(rebuilt.scores, rebuilt.scenes, drawn[:1], drawn[1:])
+    html = render_reconstruction_html(reconstruction.scores, reconstruction.scenes, drawn[:1], drawn[1:])
     counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
-    assert counts == (8, 8, 0)  # self-contained
+    assert counts == (8, 8, 0)  # the page has no external links
     wanted = ("AP3D@50", "voxel mIoU", "Memory", "What the voxels leave out", "vegetation ellipsoid")
     missing = [words for words in (*wanted, *(row["scene_id"] for row in drawn)) if words not in html]
     assert not missing
