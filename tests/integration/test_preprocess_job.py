@@ -1,4 +1,4 @@
-"""Preprocessing of raw drives to tables on Ray: real excerpts, town files, broken input, resuming."""
+"""Tests of preprocessing on Ray: real excerpts, town files, broken input and resuming."""
 
 import json
 import shutil
@@ -20,7 +20,7 @@ from pipelines.schema.density_labels import classify_density, compute_density_th
 from pipelines.schema.tables import find_shards, read_scenes
 
 
-def table(root: Path, query: str, name: str = "scenes") -> list[tuple]:
+def query_table(root: Path, query: str, name: str = "scenes") -> list[tuple]:
     return duckdb.sql(query.replace("TABLE", f"'{root}/{name}/**/*.parquet'")).fetchall()
 
 
@@ -36,10 +36,10 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     for shard in find_shards(str(town)):
         ids = [shard.read(name, ["scene_id"])["scene_id"].to_pylist() for name in ("scenes", "rasters")]
         assert ids[0] == ids[1]
-        counts = dict(table(town, f"select scene_id, num_primitives from TABLE where split = '{shard.split}'"))
+        counts = dict(query_table(town, f"select scene_id, num_primitives from TABLE where split = '{shard.split}'"))
         assert {s.scene_id: len(s) for s in shard.scenes()}.items() <= counts.items()
     dataset = Dataset.open(str(town))
-    rows = table(
+    rows = query_table(
         town,
         "select split, num_vegetation_cuboid + num_vegetation_ellipsoid, vegetation_volume_m3, vegetation_density "
         "from TABLE",
@@ -52,7 +52,7 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
     p95 = np.percentile(
         [
             [row[k] for k in range(11)]
-            for row in table(
+            for row in query_table(
                 town, f"select {', '.join(f'num_{c}' for c in CATEGORIES)} from TABLE where split = 'train'"
             )
         ],
@@ -65,7 +65,7 @@ def test_preprocess_aligns_shards_and_labels_by_training_split(town):
 
 
 def test_preprocess_tables_equal_drive(town):
-    (seed,) = table(town, "select min(sequence) from TABLE where split = 'train'")[0]
+    (seed,) = query_table(town, "select min(sequence) from TABLE where split = 'train'")[0]
     drive = generate_town(int(seed))
     stored = {s.frame: s for s in read_scenes(str(town), "town", "train") if s.sequence == seed}
     frames = drive.frame[select_poses(len(drive), len(stored))]
@@ -101,7 +101,7 @@ def test_preprocess_resumes_interrupted_run_to_same_tables(cluster, town, tmp_pa
             sorted(str(p.relative_to(root)) for p in (root / name).rglob("*.parquet")) for root in (town, tmp_path)
         ]
         assert paths[0] == paths[1] and len(paths[0]) > 1
-        rows = [table(root, "select * from TABLE order by all", name) for root in (town, tmp_path)]
+        rows = [query_table(root, "select * from TABLE order by all", name) for root in (town, tmp_path)]
         assert rows[0] == rows[1] and len(rows[0]) >= 32
     assert json.loads((town / "dataset.json").read_text()) == json.loads((tmp_path / "dataset.json").read_text())
 
@@ -110,15 +110,17 @@ def test_preprocess_reads_real_kitti360_excerpt(cluster, real_data, tmp_path):
     result = ingest.ingest_drives(plan_kitti360(str(real_data / "kitti360")), str(tmp_path), {"source": "kitti360"})
     assert sum(result.scenes.values()) + sum(result.rejects.values()) == 500 and result.duplicates == 133
     assert set(result.scenes) == {"train", "test", "unused"}
-    rows = table(tmp_path, "select count(*), count(distinct scene_id), max(crossing_area_m2), min(x_m) from TABLE")
+    rows = query_table(
+        tmp_path, "select count(*), count(distinct scene_id), max(crossing_area_m2), min(x_m) from TABLE"
+    )
     assert rows[0][:3] == (sum(result.scenes.values()),) * 2 + (None,)
-    cars = table(
+    cars = query_table(
         tmp_path,
         "select median(length_m), median(width_m), median(height_m) from TABLE where label = 'car'",
         "primitives",
     )[0]
     assert np.allclose(cars, (4.4, 2.0, 1.5), atol=0.9)
-    ellipsoids = table(tmp_path, "select distinct category from TABLE where kind = 'ellipsoid'", "primitives")
+    ellipsoids = query_table(tmp_path, "select distinct category from TABLE where kind = 'ellipsoid'", "primitives")
     assert ellipsoids == [("vegetation_ellipsoid",)]
 
 
@@ -127,7 +129,7 @@ def test_preprocess_reads_real_argoverse2_logs(cluster, real_data, tmp_path):
     assert set(result.scenes) == {"train", "test"} and min(result.scenes.values()) > 150
     dataset = Dataset.open(str(tmp_path))
     assert dataset.spec.ground_classes == ("road", "crossing") and len(dataset.spec.categories) <= 7
-    road, crossing, sidewalk = table(
+    road, crossing, sidewalk = query_table(
         tmp_path, "select avg(road_area_m2), avg(crossing_area_m2), max(sidewalk_area_m2) from TABLE"
     )[0]
     assert road > 300 and crossing > 0 and sidewalk is None
@@ -165,7 +167,7 @@ def test_preprocess_stops_at_broken_drive_and_keeps_finished(cluster, real_data,
         plan_argoverse2(str(raw)), str(tmp_path / "skip"), {"source": "av2"}, skip_unreadable=True
     )
     assert set(skipped.scenes) == {"test", "train"} and skipped.scenes["test"] == 0
-    reasons = table(tmp_path / "skip", "select scene_id, reason from TABLE", "rejects")
+    reasons = query_table(tmp_path / "skip", "select scene_id, reason from TABLE", "rejects")
     assert len(reasons) == 1 and "annotations.feather" in reasons[0][1]
     broken.write_bytes(whole)
     assert ingest.ingest_drives(plan_argoverse2(str(raw)), out, {"source": "av2"}).scenes["test"] > 150
