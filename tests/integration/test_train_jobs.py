@@ -1,4 +1,4 @@
-"""Training jobs on Ray with the smoke presets: the chain of jobs, resuming, two workers, bad input."""
+"""Tests of the training jobs on Ray with the smoke presets: job order, resuming, two workers and bad input."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from pipelines.schema.tables import find_shards
 
 
-def weights(directory: Path) -> dict:
+def load_weights(directory: Path) -> dict:
     return load_file(directory / "diffusion_pytorch_model.safetensors")
 
 
@@ -62,16 +62,16 @@ def test_train_lvae_leaves_finished_run_unchanged(home):
     from jobs.implementation.train_lvae import train
     from jobs.train_lvae import Config
 
-    before = weights(home / "models/lvae-smoke")
+    before = load_weights(home / "models/lvae-smoke")
     train(Config(preset="smoke"))
-    after = weights(home / "models/lvae-smoke")
+    after = load_weights(home / "models/lvae-smoke")
     assert all((before[k] == after[k]).all() for k in before)
     with pytest.raises(ValueError, match=r"run 'lvae-smoke' was started with learning_rate=0.001, asked for 0.5"):
         train(Config(preset="smoke", learning_rate=0.5))
 
 
 def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
-    """A worker is killed during training; Ray Train starts another from the last checkpoint."""
+    """A worker dies during training, and Ray Train starts another worker from the last checkpoint."""
     from jobs.implementation.train_lvae import prepare
     from jobs.support.trainer import fit
     from jobs.train_lvae import Config
@@ -90,8 +90,8 @@ def test_train_lvae_resumes_after_worker_kill(home, tmp_path):
             return {}, {}
 
     output = fit(replace(run, validate=DieOnce(), reader=first), 1, str(home / "models/lvae-killed"))
-    assert seen.read_text().split() == ["3", "6", "6", "8"]  # killed at step 6, resumes from the checkpoint at step 3
-    whole, resumed = weights(home / "models/lvae-smoke"), weights(Path(output))
+    assert seen.read_text().split() == ["3", "6", "6", "8"]  # the worker dies at step 6; training resumes at step 3
+    whole, resumed = load_weights(home / "models/lvae-smoke"), load_weights(Path(output))
     assert all((whole[k] == resumed[k]).all() for k in whole)
 
 
@@ -103,7 +103,7 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
 
     seen = tmp_path / "validated"
 
-    def note(trainer):
+    def record_step(trainer):
         with seen.open("a") as file:
             print(trainer.steps_done, file=file)
         return {}, {}
@@ -118,9 +118,13 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
     assert run.stream.batch_size == 8
     with pytest.raises(Exception, match="stopped"):
         fit(replace(run, validate=stop_at_four), 2, str(home / "models/two"))
-    fit(replace(run, validate=note), 2, str(home / "models/two"))
-    assert seen.read_text().split() == ["4", "6", "8"]  # from the checkpoint at step 2, not from the start
-    one, two = weights(home / "models/pritti-smoke/dit"), weights(home / "models/two")
+    fit(replace(run, validate=record_step), 2, str(home / "models/two"))
+    assert seen.read_text().split() == [
+        "4",
+        "6",
+        "8",
+    ]  # training resumes at step 2, and the hook runs at steps 4, 6 and 8
+    one, two = load_weights(home / "models/pritti-smoke/dit"), load_weights(home / "models/two")
     for name in one:
         assert np.allclose(one[name], two[name], atol=1e-4), name
     assert not list((home / "runs").rglob("*.pkl"))
@@ -135,7 +139,7 @@ def test_train_lvae_with_two_workers_matches_one(home):
     from jobs.train_lvae import Config
 
     output = train(Config(preset="smoke", name="lvae-two", num_workers=2))
-    one, two = weights(home / "models/lvae-smoke"), weights(Path(output))
+    one, two = load_weights(home / "models/lvae-smoke"), load_weights(Path(output))
     distance = max(np.abs(one[name] - two[name]).max() for name in one)
     assert distance < 1e-2, distance
 
@@ -146,10 +150,12 @@ def test_train_lvae_retrains_object_decoder_for_kept_latents(home):
 
     kept, output = home / "models/pritti-smoke", home / "models/pritti-decoder"
     assert train(Config(preset="smoke", name="decoder", train_object_decoder_of=str(kept))) == str(output)
-    old, new = weights(kept / "lvae"), weights(output / "lvae")
+    old, new = load_weights(kept / "lvae"), load_weights(output / "lvae")
     changed = {name for name in old if (old[name] != new[name]).any()}
     assert len(changed) > 20 and all(name.startswith("object_decoder.") for name in changed)
-    assert all((value == weights(output / "dit")[name]).all() for name, value in weights(kept / "dit").items())
+    assert all(
+        (value == load_weights(output / "dit")[name]).all() for name, value in load_weights(kept / "dit").items()
+    )
     with pytest.raises(ValueError, match=r"--name smoke: .*/pritti-smoke holds a pipeline that would be replaced"):
         train(Config(preset="smoke", name="smoke", train_object_decoder_of=str(kept)))
     with pytest.raises(
@@ -190,7 +196,7 @@ def test_train_lvae_names_truncated_shard(home, tmp_path):
 
 
 def test_encode_reports_worker_error_in_one_line(home, tmp_path):
-    """An actor in another process finds a truncated shard: no traceback, exit code 2."""
+    """For a truncated shard that an actor reads, the job prints no traceback and exits with code 2."""
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
     (tmp_path / "data/latents.json").unlink()
     path = Path(find_shards(str(tmp_path / "data"))[-1].path("rasters"))
