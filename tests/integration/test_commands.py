@@ -1,4 +1,4 @@
-"""Jobs on the command line: `--help` and error messages."""
+"""Tests of jobs on the command line: `--help` and error messages."""
 
 import os
 import subprocess
@@ -33,7 +33,10 @@ MISTAKES = {
 
 @pytest.fixture(scope="module")
 def mistakes(tmp_path_factory) -> dict[tuple, subprocess.CompletedProcess]:
-    """The completed commands; two run concurrently, as each takes seconds to start."""
+    """Completed process of each command with a mistake.
+
+    Two commands run concurrently because each needs several seconds to start.
+    """
     empty = str(tmp_path_factory.mktemp("empty"))
     with ThreadPoolExecutor(2) as pool:
         done = pool.map(lambda words: run_command(f"jobs/{words[0]}", *words[1:], PRITTI_HOME=empty), MISTAKES)
