@@ -1,4 +1,4 @@
-"""The wheel holds all that the package needs: built, installed and used outside the repository."""
+"""Tests of the wheel: it is built, installed and used outside the repository."""
 
 import os
 import re
@@ -23,8 +23,8 @@ print(len(scene), "primitives")
 PACKAGES = ("pritti", "models", "pipelines", "jobs")
 
 
-def run(*words: str | Path, cwd: Path, **environment: str) -> str:
-    """Run a command with neither the repository nor this process's settings on its path; return its output."""
+def run_program(*words: str | Path, cwd: Path, **environment: str) -> str:
+    """Run a command without the Python path and settings of this process and return its output."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PRITTI"))}
     done = subprocess.run(words, cwd=cwd, env=kept | environment, text=True, capture_output=True, timeout=1500)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
@@ -33,13 +33,16 @@ def run(*words: str | Path, cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """The wheel, built without a network from a copy of the files: setuptools writes build/ next to its sources."""
+    """Path of a wheel that is built without network access.
+
+    The build uses a copy of the sources because setuptools writes the folder build/ next to them.
+    """
     source, output = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in PACKAGES:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", output, cwd=source)
+    run_program(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", output, cwd=source)
     (path,) = output.glob("*.whl")
     return path
 
@@ -57,23 +60,26 @@ def test_wheel_holds_weights_web_files_and_type_markers(wheel):
 def test_wheel_generates_scene_outside_repository(wheel, tmp_path):
     site = tmp_path / "site"
     words = ("install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-compile", "--target", site, wheel)
-    run(sys.executable, "-m", "pip", *words, cwd=tmp_path)
-    python = (sys.executable, "-P")  # -P: the working directory is not on sys.path
+    run_program(sys.executable, "-m", "pip", *words, cwd=tmp_path)
+    python = (sys.executable, "-P")  # -P keeps the working directory off sys.path
     assert re.search(
-        r"\d+ primitives", run(*python, "-c", GENERATE.format(site=str(site)), cwd=tmp_path, PYTHONPATH=str(site))
+        r"\d+ primitives",
+        run_program(*python, "-c", GENERATE.format(site=str(site)), cwd=tmp_path, PYTHONPATH=str(site)),
     )
-    usage = run(*python, "-m", "pritti.cli", "--help", cwd=tmp_path, PYTHONPATH=str(site))
+    usage = run_program(*python, "-m", "pritti.cli", "--help", cwd=tmp_path, PYTHONPATH=str(site))
     assert "sample-scenes" in usage
 
 
 @pytest.mark.slow
 def test_wheel_with_dependencies_runs_console_script(wheel, tmp_path):
-    """In an empty environment: no dependency may be missing in pyproject.toml."""
+    """The test uses an empty environment, so each dependency must stand in pyproject.toml."""
     bin_ = tmp_path / "venv/bin"
-    run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
+    run_program(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     words = ("install", "--quiet", "--disable-pip-version-check", "--no-compile", wheel)
-    run(bin_ / "pip", *words, cwd=tmp_path, PIP_CONSTRAINT=str(ROOT / "infra/constraints.txt"))
-    assert "--num-scenes" in run(bin_ / "pritti", "sample-scenes", "--help", cwd=tmp_path)
+    run_program(bin_ / "pip", *words, cwd=tmp_path, PIP_CONSTRAINT=str(ROOT / "infra/constraints.txt"))
+    assert "--num-scenes" in run_program(bin_ / "pritti", "sample-scenes", "--help", cwd=tmp_path)
     words = ("--model", "town", "--num-scenes", "1", "--num-inference-steps", "2", "--output", "scenes")
-    run(bin_ / "pritti", "sample-scenes", *words, cwd=tmp_path, RAY_AUTH_MODE="disabled", PRITTI_HOME=str(tmp_path))
+    run_program(
+        bin_ / "pritti", "sample-scenes", *words, cwd=tmp_path, RAY_AUTH_MODE="disabled", PRITTI_HOME=str(tmp_path)
+    )
     assert list(tmp_path.glob("scenes/scenes/source=generated-samples/split=generated/*.parquet"))
