@@ -1,4 +1,4 @@
-"""Edits over a table of scenes, on Ray."""
+"""Tests of jobs/edit_scenes.py on Ray."""
 
 import numpy as np
 import pyarrow.parquet as pq
