@@ -1,4 +1,4 @@
-"""The data loader reads ahead in a Ray task."""
+"""Tests of the data loader, which prefetches batches in a Ray task."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from pipelines.training.data_loader import LayoutReader, Stream, iterate_batches
 
 
 def test_batches_are_prefetched_in_order(layout_shards, cluster, monkeypatch):
-    monkeypatch.setattr(data_loader, "SAMPLES_PER_TASK", 8)  # two steps a task
+    monkeypatch.setattr(data_loader, "SAMPLES_PER_TASK", 8)  # one task reads two steps
     reader, stream = LayoutReader(small_spec(32)), Stream(layout_shards, SHARD_SIZES, 4, seed=0)
     got = list(iterate_batches(stream, reader, start_step=3, stop_step=14, rank=1, world=2))
     assert len(got) == 11
