@@ -1,4 +1,4 @@
-"""Pictures and the dataset report, drawn by Ray tasks."""
+"""Tests of pictures and of the dataset report from Ray tasks."""
 
 import base64
 import io
@@ -34,7 +34,9 @@ def test_paint_tasks_equal_direct_rendering(cluster, town_dataset, tmp_path):
         scenes[Catalogue.read(town_dataset, split="train").column("scene_id")[order[0]]], 96, supersample=2
     )
     inside = np.lib.stride_tricks.sliding_window_view(sheet[:, :, 0], (94, 94))[:200, :60]
-    assert (inside == picture[1:-1, 1:-1, 0]).all(axis=(2, 3)).any()  # first on the sheet, framed by a line
+    assert (
+        (inside == picture[1:-1, 1:-1, 0]).all(axis=(2, 3)).any()
+    )  # the first picture of the sheet, without its frame
 
 
 def test_report_job_shows_scenes(cluster, town_dataset, tmp_path):
