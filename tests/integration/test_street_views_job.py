@@ -1,4 +1,4 @@
-"""Street views and exports of a table of scenes, on Ray."""
+"""Tests of the jobs for street views and exports, on Ray."""
 
 import json
 from dataclasses import replace
