@@ -1,4 +1,4 @@
-"""The sweep over reference sets and neighbour counts, on Ray."""
+"""Tests of the sweep over reference sets and numbers of neighbours, on Ray."""
 
 import numpy as np
 
@@ -14,6 +14,8 @@ def test_reference_sweep_has_row_per_reference_and_k(cluster):
     rows = sweep_references(real, generated, labels, chosen, (3, 5), lambda: done.append(1))
     assert [(row["samples"], row["k"]) for row in rows] == [(20, 3), (20, 5), (200, 3), (200, 5)]
     assert len(done) == 2 and all(0 < row["precision"] <= 1 for row in rows)
-    assert all(a["precision"] <= b["precision"] for a, b in zip(rows[::2], rows[1::2], strict=True))  # larger balls
+    assert all(
+        a["precision"] <= b["precision"] for a, b in zip(rows[::2], rows[1::2], strict=True)
+    )  # a larger k has larger balls
     assert draw_sweep_charts(rows)[1].series["precision, k = 3"][0] == [20, 200]
     assert "farthest" in render_sweep_html(rows, ["how"])
