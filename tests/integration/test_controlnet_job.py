@@ -1,4 +1,4 @@
-"""Street photos of a drive, painted by Ray actors."""
+"""Tests of jobs/paint_streets.py, whose Ray actors generate street photos of a drive."""
 
 import pytest
 from helpers import street_class_ids
