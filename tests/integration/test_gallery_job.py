@@ -1,4 +1,4 @@
-"""The gallery page holds every scene that it shows."""
+"""Tests of the gallery page, which contains the data of all its scenes."""
 
 import base64
 import gzip
