@@ -1,4 +1,4 @@
-"""Generation jobs on Ray with the smoke presets: resuming, numbers of actors, killed processes, scores."""
+"""Tests of the generation jobs on Ray with the smoke presets: resuming, actors, killed processes and scores."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +40,7 @@ def test_sample_is_independent_of_actors_and_batch_size(smoke, samples, tmp_path
         assert (one.occupied == other.occupied).mean() > 0.999
 
 
-def test_sample_resumes_where_it_stopped(smoke, samples):
+def test_sample_resumes_interrupted_run(smoke, samples):
     from jobs.implementation.sample_scenes import sample
     from jobs.sample_scenes import Config
 
@@ -71,11 +71,11 @@ def test_sample_passes_repair_option(smoke, tmp_path, monkeypatch):
     from jobs.implementation.sample_scenes import sample
     from jobs.sample_scenes import Config
 
-    asked = []
-    monkeypatch.setattr("jobs.implementation.sample_scenes.sample_scenes", lambda request, *_: asked.append(request))
+    requests = []
+    monkeypatch.setattr("jobs.implementation.sample_scenes.sample_scenes", lambda request, *_: requests.append(request))
     for repair in (False, True):
         sample(Config(str(smoke / "models/pritti-smoke"), output=str(tmp_path), num_scenes=1, num_glb=0, repair=repair))
-    assert [request.repair for request in asked] == [False, True]
+    assert [request.repair for request in requests] == [False, True]
 
 
 def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
@@ -97,7 +97,7 @@ def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
     assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
     assert (tmp_path / "samplers.html").read_text().count("<img") == 4
     assert "<svg" in (tmp_path / "samplers-layout_frechet.svg").read_text()
-    assert sweep_samplers(config) == rows  # nothing is sampled or timed again
+    assert sweep_samplers(config) == rows  # the second call samples no scenes
     found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
     assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
     with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
@@ -141,8 +141,8 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert (tmp_path / "glb/outpainted").is_dir()
 
     real = str(smoke / "datasets/smoke")
-    looked = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), num_actors=1)
-    seams = evaluate_seams(looked)
+    seams_config = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), num_actors=1)
+    seams = evaluate_seams(seams_config)
     assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
     query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
@@ -291,7 +291,7 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
         inpaint(replace(config, seed=1))
     with pytest.raises(ValueError, match="the region contains no pixel"):
         inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
-    Path(find_shards(str(samples))[0].path("scenes")).touch()  # it may hold other scenes now
+    Path(find_shards(str(samples))[0].path("scenes")).touch()  # the file may contain other scenes after this change
     with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):
         inpaint(config)
 
@@ -308,14 +308,14 @@ def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
         pipeline.register_to_config(noise_scaling=1.0)
         guard_generation_run(request, pipeline, [str(smoke)])
         pipeline.register_to_config(noise_scaling=1.01)
-        if run == "paper":  # does not scale the noise
+        if run == "paper":  # RePaint ignores noise_scaling
             guard_generation_run(request, pipeline, [str(smoke)])
     with pytest.raises(ValueError, match=r"holds a run 'guided' with noise_scaling=1.0, asked for 1.01"):
         guard_generation_run(request, pipeline, [str(smoke)])
 
 
 def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
-    """Training scenes scored against themselves give the noise floor of the evaluator."""
+    """The scores of training scenes against themselves are the noise floor of the evaluator."""
     from pipelines.evaluation.evaluate import compare_datasets
     from pipelines.evaluation.features import FeatureConfig, compute_scene_features
     from pipelines.schema.dataset import Dataset
@@ -333,24 +333,24 @@ def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
     assert all(found["between"].value == 0 for found in scores["distance"].values())
 
 
-def test_describe_resumes_where_it_stopped(smoke, tmp_path, monkeypatch):
-    """Existing parts are kept, missing ones recomputed; other options or scenes start again."""
+def test_describe_resumes_interrupted_run(smoke, tmp_path, monkeypatch):
+    """The second call keeps existing parts and computes missing parts. With other options, all parts are recomputed."""
     from pipelines.evaluation import features as module
     from pipelines.schema.dataset import Dataset
     from pipelines.schema.scene_subset import SceneSubset
 
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
-    chosen, looks, directory = (
+    chosen, config, directory = (
         SceneSubset(dataset.root, "town", "train"),
         module.FeatureConfig(),
         tmp_path / "described",
     )
-    first = module.compute_scene_features(chosen, dataset, looks, str(directory))
+    first = module.compute_scene_features(chosen, dataset, config, str(directory))
     parts = sorted(directory.glob("part-*.parquet"))
     assert len(parts) == len(chosen.shards()) > 1
     kept, times = parts[1:], [part.stat().st_mtime_ns for part in parts[1:]]
     parts[0].unlink()
-    again = module.compute_scene_features(chosen, dataset, looks, str(directory))
+    again = module.compute_scene_features(chosen, dataset, config, str(directory))
     assert [part.stat().st_mtime_ns for part in kept] == times
     assert all(np.array_equal(first[name], again[name], equal_nan=name == "statistics") for name in first)
     module.compute_scene_features(chosen, dataset, module.FeatureConfig(supersample=2), str(directory))
