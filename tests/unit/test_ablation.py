@@ -1,4 +1,4 @@
-"""Ablations: box encodings, the small autoencoder and the switches of the layout VAE."""
+"""Tests of the ablations: box encodings, the small autoencoder and the switches of the layout VAE."""
 
 import itertools
 import re
@@ -37,23 +37,26 @@ CUBE_SYMMETRIES = [
     np.diag(signs)[:, list(order)]
     for order in itertools.permutations(range(3))
     for signs in itertools.product((-1.0, 1.0), repeat=3)
-]  # 48 with the mirror images, which leave a box unchanged
+]  # 48 rotations and reflections that map a cube to itself
 
 
-def corners(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """(..., 8, 3) corners of boxes centred at zero."""
+def compute_corners(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+    """Return the corners (..., 8, 3) of boxes that are centred at zero."""
     signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     return np.einsum("...ij,...kj->...ki", rotation, signs * np.asarray(size_m)[..., None, :])
 
 
-def box_distance(a: tuple, b: tuple) -> np.ndarray:
-    """(...) Hausdorff distance of the corner sets: exactly 0 for two descriptions of one box."""
-    gaps = np.linalg.norm(corners(*a)[..., :, None, :] - corners(*b)[..., None, :, :], axis=-1)
+def compute_box_distance(a: tuple, b: tuple) -> np.ndarray:
+    """Return the Hausdorff distance (...) of the corners: 0 for two descriptions of the same box."""
+    gaps = np.linalg.norm(compute_corners(*a)[..., :, None, :] - compute_corners(*b)[..., None, :, :], axis=-1)
     return np.maximum(gaps.min(axis=-1).max(axis=-1), gaps.min(axis=-2).max(axis=-1))
 
 
-def any_boxes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes with random rotations: a third with three extents, a third with two equal extents, a third cubes."""
+def draw_boxes_of_any_size(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return n boxes with random rotations and sizes.
+
+    A third of the boxes has three different extents, a third has two equal extents, and a third are cubes.
+    """
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.3, 5.0, (n, 3))
     size[n // 3 :, 1] = size[n // 3 :, 0]
@@ -66,20 +69,20 @@ def any_boxes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_encoding_round_trip_keeps_corners(name):
-    rotation, size = any_boxes(3000)
-    if name == "cholesky":  # ambiguous where extents are equal
+    rotation, size = draw_boxes_of_any_size(3000)
+    if name == "cholesky":  # this encoding is ambiguous for equal extents
         rotation, size = rotation[:1000], size[:1000]
     code = ENCODINGS[name].encode(rotation, size)
     assert code.shape == (len(size), ENCODINGS[name].entries)
     decoded = ENCODINGS[name].decode(code)
     assert np.allclose(np.linalg.det(decoded[0]), 1)
-    assert box_distance((rotation, size), decoded).max() < 1e-6
-    batched = ENCODINGS[name].decode(code[:6].reshape(2, 3, -1))  # any leading shape
+    assert compute_box_distance((rotation, size), decoded).max() < 1e-6
+    batched = ENCODINGS[name].decode(code[:6].reshape(2, 3, -1))  # batch dimensions are arbitrary
     assert np.allclose(batched[0].reshape(6, 3, 3), decoded[0][:6])
 
 
 def test_encoding_is_unique_per_box_except_quaternion():
-    rotation, size = any_boxes(60)
+    rotation, size = draw_boxes_of_any_size(60)
     codes = {
         name: np.stack([e.encode(rotation @ s, size @ np.abs(s)) for s in CUBE_SYMMETRIES if np.linalg.det(s) > 0])
         for name, e in ENCODINGS.items()
@@ -90,26 +93,29 @@ def test_encoding_is_unique_per_box_except_quaternion():
 
 
 def test_encoding_is_bi_lipschitz_only_if_octahedral():
-    """Bounds the ratio of corner displacement in metres to code change from both sides, for near and far pairs."""
+    """For near and far pairs, the test bounds the ratio of code change to corner distance from both sides."""
     rng = np.random.default_rng(1)
-    rotation, size = any_boxes(6000)
+    rotation, size = draw_boxes_of_any_size(6000)
     step = 10 ** rng.uniform(-4, 0, (6000, 1))
     turn = Rotation.from_rotvec(step * rng.standard_normal((6000, 3))).as_matrix()
     grown = np.maximum(size + rng.integers(0, 2, (6000, 1)) * step * rng.standard_normal((6000, 3)), 0.3)
-    other = canonicalize_boxes(turn @ rotation, grown)  # canonical boxes, as in a dataset
-    distance = box_distance((rotation, size), other) / size.max(axis=1)
+    other = canonicalize_boxes(turn @ rotation, grown)  # datasets contain canonical boxes
+    distance = compute_box_distance((rotation, size), other) / size.max(axis=1)
     ratio = {
         name: np.linalg.norm(e.encode(*other) - e.encode(*canonicalize_boxes(rotation, size)), axis=1) / distance
         for name, e in ENCODINGS.items()
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
-    assert ratio["cholesky"].min() < 1e-6  # a rotated cube
-    assert ratio["quaternion"].max() > 1000  # length and width, or -pi/2 and pi/2, are swapped
+    assert ratio["cholesky"].min() < 1e-6  # rotating a cube does not change its code
+    assert ratio["quaternion"].max() > 1000  # length and width swap, or yaw jumps between -pi/2 and pi/2
 
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
 def test_encoding_is_continuous_where_length_equals_width(name):
-    """A closed path turns by 180 degrees, tilts and passes through l = w; finer steps give smaller code changes."""
+    """On a path of boxes through length = width, finer steps change the code by smaller amounts.
+
+    The path turns the box by 180 degrees, tilts it and returns to the same box.
+    """
     largest = []
     for count in (501, 5001):
         t = np.linspace(0, 1, count)
@@ -137,7 +143,9 @@ def test_harmonics_are_degree_four_and_equivariant_to_yaw():
     code = ENCODINGS["octahedral"].encode(make_yaw_rotation(yaw), np.ones((50, 3)))[:, 6:]
     turning = np.stack([np.cos(4 * yaw), np.sin(4 * yaw)], axis=1) / np.sqrt(2)
     assert np.allclose(code[:, :2], turning) and np.allclose(code[:, 2:], code[0, 2:])
-    assert np.isfinite(find_nearest_frame(np.zeros((1, 9)))).all()  # a network may predict any values
+    assert np.isfinite(
+        find_nearest_frame(np.zeros((1, 9)))
+    ).all()  # the decoder accepts all values that a network predicts
 
 
 # ----------------------------------------------------------------------------------------------------- lost yaw
@@ -153,12 +161,12 @@ def test_cholesky_error_of_square_equals_closed_form():
 
 
 def test_cholesky_loses_yaw_of_squares_and_octahedral_keeps_it():
-    def lost(encoding, share):
+    def compute_loss(encoding, share):
         return compute_yaw_loss({"encoding": encoding, "width_share": share, "noise": 1e-3}, 400)["iou3d_lost_with_yaw"]
 
-    assert abs(lost("cholesky", 1.0) - (1 - LOST_YAW_IOU3D)) < 0.02
-    assert lost("cholesky", 0.9) > 4 * lost("cholesky", 0.5)
-    assert all(lost("octahedral", share) < 1e-3 for share in (0.5, 0.9, 1.0))
+    assert abs(compute_loss("cholesky", 1.0) - (1 - LOST_YAW_IOU3D)) < 0.02
+    assert compute_loss("cholesky", 0.9) > 4 * compute_loss("cholesky", 0.5)
+    assert all(compute_loss("octahedral", share) < 1e-3 for share in (0.5, 0.9, 1.0))
 
 
 # -------------------------------------------------------------------------------------------------- autoencoder
@@ -175,7 +183,7 @@ def test_autoencoder_bodies_are_equal_and_small():
         bodies.append({n: p for n, p in model.state_dict().items() if not n.startswith(ends)})
     for body in bodies[1:]:
         assert body.keys() == bodies[0].keys()
-        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # with the same initial weights
+        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # the initial weights are equal, too
 
 
 def test_trial_training_sets_are_nested_and_differ_by_seed():
@@ -200,7 +208,7 @@ def test_trial_learns_with_tiny_settings(name):
         rebuilt, _ = fitted.rebuild(truth)
         iou.append(compute_mean_iou3d(truth, rebuilt).mean())
     assert fitted.kept.sum() == {"cholesky": 4, "quaternion": 5, "octahedral": 6}[name]
-    assert np.allclose(np.abs(rebuilt.rotation[:, 2]).max(axis=1), 1)  # an omitted angle stays zero
+    assert np.allclose(np.abs(rebuilt.rotation[:, 2]).max(axis=1), 1)  # an angle that the autoencoder omits is 0
     assert iou[1] > iou[0] + 0.05
 
 
@@ -234,7 +242,7 @@ def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
     assert all(scene.occupied.any() == ground for scene in rebuilt)
     if not objects:
         assert not any(len(scene) for scene in rebuilt)
-    if ground and objects:  # both decoders read both halves; only the ground's half of the linear start is not zero
+    if ground and objects:  # both decoders read both halves of the latent; the linear ground start reads only its half
         own, other = lvae.ground_decoder.shortcut.weight.split(16)
         assert (own != 0).any() and not other.any()
         assert (lvae.ground_decoder.shortcut.weight.grad[16:] != 0).any()
