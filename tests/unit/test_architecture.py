@@ -1,4 +1,4 @@
-"""Imports point one way: pritti -> jobs -> pipelines -> models, without cycles. models runs without Ray."""
+"""Tests of the imports: they point from pritti to jobs, pipelines and models and have no cycles."""
 
 import ast
 import subprocess
@@ -17,8 +17,8 @@ FORBIDDEN = {
 }
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level packages that a file imports, anywhere in it."""
+def find_packages(path: Path) -> set[str]:
+    """Return the top-level packages that a file imports, including imports in functions."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -29,13 +29,13 @@ def imported(path: Path) -> set[str]:
 
 
 def list_modules(root: Path) -> dict[str, Path]:
-    """Dotted names and files of all modules of our packages below a directory."""
+    """Return the dotted names and files of all modules of PrITTI packages below a directory."""
     files = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
     return {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
 
 
 def find_imports(root: Path) -> dict[str, set[str]]:
-    """Modules of our packages that each module imports, anywhere in its file; also for type checkers only."""
+    """Return the PrITTI modules that each module imports, including imports in functions and under TYPE_CHECKING."""
     modules = list_modules(root)
     graph: dict[str, set[str]] = {}
     for name, path in modules.items():
@@ -50,8 +50,8 @@ def find_imports(root: Path) -> dict[str, set[str]]:
     return graph
 
 
-def collapse(graph: dict[str, set[str]], package: str) -> dict[str, dict[str, str]]:
-    """Imports between the direct children of a package, modules or folders, each with one import as an example."""
+def group_imports(graph: dict[str, set[str]], package: str) -> dict[str, dict[str, str]]:
+    """Return the imports between the direct children of a package, with one example for each pair of children."""
     edges: dict[str, dict[str, str]] = {}
     for module, targets in graph.items():
         for target in targets:
@@ -63,22 +63,22 @@ def collapse(graph: dict[str, set[str]], package: str) -> dict[str, dict[str, st
 
 
 def find_cycle(graph: dict[str, dict[str, str]]) -> list[str]:
-    """The imports of one cycle of a graph, in order; empty if there is none."""
+    """Return the imports of one cycle of a graph in order, or an empty list if the graph has no cycle."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
-        nodes = error.args[1][::-1]  # the sorter lists predecessors
+        nodes = error.args[1][::-1]  # CycleError lists predecessors first
         return [graph[here][there] for here, there in pairwise(nodes)]
     return []
 
 
 def find_cycles(root: Path) -> list[str]:
-    """Cycles of imports between modules, and between the children of any package; each as lines with its imports."""
+    """Return the import cycles between modules and between the children of a package, as lines with imports."""
     graph = find_imports(root)
     modules = {name: {target: f"{name} imports {target}" for target in targets} for name, targets in graph.items()}
     found = [find_cycle(modules)]
     packages = {name[:end] for name in graph for end, character in enumerate(name) if character == "."}
-    found += [find_cycle(collapse(graph, package)) for package in sorted(packages)]
+    found += [find_cycle(group_imports(graph, package)) for package in sorted(packages)]
     return ["\n".join(lines) for lines in found if lines]
 
 
@@ -101,7 +101,7 @@ def test_architecture_names_edges_of_planted_cycles(tmp_path):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(source)
-    (folders,) = find_cycles(tmp_path)  # no module cycle, but one of folders
+    (folders,) = find_cycles(tmp_path)  # a cycle between folders, without a cycle between modules
     assert "pipelines.a.one imports pipelines.b.two" in folders
     assert "pipelines.b.three imports pipelines.a.four" in folders
     (tmp_path / "pipelines/b/two.py").write_text("import pipelines.a.one")
@@ -116,12 +116,12 @@ def test_pipelines_modules_lie_in_folders():
 def test_architecture_imports_point_one_way(package):
     files = list((ROOT / package).rglob("*.py"))
     assert len(files) > 5
-    wrong = {str(p.relative_to(ROOT)): imported(p) & FORBIDDEN[package] for p in files}
+    wrong = {str(p.relative_to(ROOT)): find_packages(p) & FORBIDDEN[package] for p in files}
     assert not {name: found for name, found in wrong.items() if found}
 
 
 def test_ingest_imports_no_torch():
-    """Importing torch would cost every preprocessing process one to two seconds."""
+    """An import of torch would delay each preprocessing process by one to two seconds."""
     code = "import sys, pipelines.preprocess.ingest; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
@@ -139,7 +139,7 @@ def test_models_import_without_ray_or_pyarrow():
 
 
 def test_architecture_has_no_pickle_or_unsafe_load():
-    """Nothing unpickles: safetensors, JSON and Parquet only."""
+    """No module reads pickles: weights and data are safetensors, JSON and Parquet."""
     for path in [p for folder in ("models", "pipelines", "jobs") for p in (ROOT / folder).rglob("*.py")]:
         text = path.read_text()
         assert "import pickle" not in text and "allow_pickle=True" not in text, path
