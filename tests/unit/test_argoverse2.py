@@ -1,4 +1,4 @@
-"""The Argoverse 2 reader: physical checks on two real logs, frames on a synthetic log, and broken files."""
+"""Tests of the Argoverse 2 reader: plausibility on two real logs, frames on a synthetic log, and broken files."""
 
 import hashlib
 import json
@@ -15,20 +15,20 @@ from pipelines.preprocess.sources.argoverse2 import CATEGORY_OF, list_logs, read
 
 LOG = "00000000-aaaa-bbbb-cccc-000000000001"
 SWEEPS = np.array([315969904359876000, 315969904459712000, 315969904559845000])
-ORIGIN = np.array([1000.25, -2000.5, 12.0])  # of the ego vehicle at the first sweep, city frame
+ORIGIN = np.array([1000.25, -2000.5, 12.0])  # pose of the ego vehicle at the first sweep, city frame
 YAW = 0.6
 
 
-def quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
+def make_quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
     return np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)
 
 
-def pose_table() -> pa.Table:
-    """The ego vehicle drives 1 m per sweep straight ahead; some poses lie between the sweeps."""
+def make_pose_table() -> pa.Table:
+    """Return poses of an ego vehicle that drives 1 m per sweep straight ahead, with poses between the sweeps."""
     time = np.sort(np.concatenate([SWEEPS, SWEEPS + 50_000_000]))
     ahead = np.array([np.cos(YAW), np.sin(YAW), 0.0])
     at = ORIGIN + ((time - SWEEPS[0]) / 1e8).round(1)[:, None] * ahead
-    q = np.tile(quaternion(YAW), (len(time), 1))
+    q = np.tile(make_quaternion(YAW), (len(time), 1))
     names = ["qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
     return pa.table({"timestamp_ns": time} | dict(zip(names, np.hstack([q, at]).T, strict=True)))
 
@@ -43,9 +43,9 @@ ROWS = [
 ]
 
 
-def annotation_table(rows=ROWS) -> pa.Table:
+def make_annotation_table(rows=ROWS) -> pa.Table:
     track, category, sweep, x, y, z, yaw, length, width, height = zip(*rows, strict=True)
-    q = np.array([quaternion(v) for v in yaw])
+    q = np.array([make_quaternion(v) for v in yaw])
     floats = [length, width, height, *q.T, x, y, z]
     names = ["length_m", "width_m", "height_m", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"]
     columns = {"timestamp_ns": SWEEPS[list(sweep)], "track_uuid": list(track), "category": list(category)}
@@ -53,27 +53,33 @@ def annotation_table(rows=ROWS) -> pa.Table:
     return pa.table(columns | {"num_interior_pts": np.zeros(len(rows), np.int64)})
 
 
-def points(*xy: tuple[float, float]) -> list[dict]:
+def make_points(*xy: tuple[float, float]) -> list[dict]:
     return [{"x": float(ORIGIN[0] + x), "y": float(ORIGIN[1] + y), "z": 11.7} for x, y in xy]
 
 
-def map_json() -> dict:
-    """Road up to 40 m around the origin, and a crossing of 3 x 10 m with edges of opposite direction."""
+def make_map_json() -> dict:
+    """Return a map with road within 40 m of the origin and a crossing of 3 x 10 m.
+
+    The two edges of the crossing have opposite directions.
+    """
     return {
-        "drivable_areas": {"1": {"id": 1, "area_boundary": points((-40, -40), (40, -40), (40, 40), (-40, 40))}},
+        "drivable_areas": {"1": {"id": 1, "area_boundary": make_points((-40, -40), (40, -40), (40, 40), (-40, 40))}},
         "lane_segments": {},
         "pedestrian_crossings": {
-            "2": {"id": 2, "edge1": points((10, 0), (10, 10)), "edge2": points((13, 10), (13, 0))}
+            "2": {"id": 2, "edge1": make_points((10, 0), (10, 10)), "edge2": make_points((13, 10), (13, 0))}
         },
     }
 
 
-def sim2_json() -> dict:
+def make_sim2_json() -> dict:
     return {"R": [1.0, 0.0, 0.0, 1.0], "t": [100 - ORIGIN[0], 100 - ORIGIN[1]], "s": 10 / 3}
 
 
-def heights() -> np.ndarray:
-    """(rows = y, cols = x) float16, .3 m pixels: rises 1 % eastward, unknown in the far south."""
+def make_heights() -> np.ndarray:
+    """Return float16 heights (rows = y, cols = x) in pixels of 0.3 m.
+
+    The heights rise by 1 % eastward and are unknown in the far south.
+    """
     height = np.tile(11.7 + 0.003 * (np.arange(667) - 333), (667, 1)).astype(np.float16)
     height[:200] = np.nan
     return height
@@ -83,11 +89,11 @@ def heights() -> np.ndarray:
 def root(tmp_path) -> Path:
     folder = tmp_path / "train" / LOG
     (folder / "map").mkdir(parents=True)
-    pyarrow.feather.write_feather(annotation_table(), folder / "annotations.feather")
-    pyarrow.feather.write_feather(pose_table(), folder / "city_SE3_egovehicle.feather")
-    (folder / "map" / f"log_map_archive_{LOG}____PIT_city_1.json").write_text(json.dumps(map_json()))
-    (folder / "map" / f"{LOG}___img_Sim2_city.json").write_text(json.dumps(sim2_json()))
-    np.save(folder / "map" / f"{LOG}_ground_height_surface____PIT.npy", heights())
+    pyarrow.feather.write_feather(make_annotation_table(), folder / "annotations.feather")
+    pyarrow.feather.write_feather(make_pose_table(), folder / "city_SE3_egovehicle.feather")
+    (folder / "map" / f"log_map_archive_{LOG}____PIT_city_1.json").write_text(json.dumps(make_map_json()))
+    (folder / "map" / f"{LOG}___img_Sim2_city.json").write_text(json.dumps(make_sim2_json()))
+    np.save(folder / "map" / f"{LOG}_ground_height_surface____PIT.npy", make_heights())
     return tmp_path
 
 
@@ -100,7 +106,7 @@ def test_argoverse2_places_boxes_in_city_frame(root):
     assert drive.label.tolist() == ["REGULAR_VEHICLE"] * 2 + ["CONSTRUCTION_CONE"] * 2
     turn = np.array([[np.cos(YAW), -np.sin(YAW), 0], [np.sin(YAW), np.cos(YAW), 0], [0, 0, 1]])
     assert np.allclose(drive.center_m[0], ORIGIN + turn @ [20, 4, 0.5], atol=1e-9)
-    assert np.allclose(drive.center_m[2], drive.center_m[3], atol=1e-9)  # the cone stands still
+    assert np.allclose(drive.center_m[2], drive.center_m[3], atol=1e-9)  # the cone is static
     assert np.allclose(drive.heading_rad[:2], YAW + 0.3)
     assert drive.size_m[0].tolist() == [4.5, 2.0, 1.6]
 
@@ -109,14 +115,14 @@ def test_argoverse2_scene_has_boxes_of_its_sweep_in_ego_frame(root):
     drive = read_drive(root, "train", LOG)
     assert drive.frame.tolist() == SWEEPS.tolist()
     scenes = [drive.scene(k) for k in range(3)]
-    assert [len(scene) for scene in scenes] == [2, 2, 0]  # the ego vehicle's own box is dropped
+    assert [len(scene) for scene in scenes] == [2, 2, 0]  # the reader drops the box of the ego vehicle
     assert np.allclose(scenes[1].center_m, [[21, 4, 0.5], [29, -5, 0.1]], atol=1e-4)
     assert np.allclose(scenes[1].heading_rad[0], 0.3, atol=1e-6)
     assert scenes[2].scene_id == f"av2-{LOG}-{SWEEPS[2]}"
 
 
 def test_argoverse2_reads_log_with_only_ego_box(root):
-    ego_only = annotation_table(ROWS[-1:])
+    ego_only = make_annotation_table(ROWS[-1:])
     pyarrow.feather.write_feather(ego_only, root / "train" / LOG / "annotations.feather")
     drive = read_drive(root, "train", LOG)
     assert len(drive) == 1 and len(drive.scene(0)) == 0
@@ -133,7 +139,7 @@ def test_argoverse2_ground_lies_on_height_raster(root):
     drive = read_drive(root, "train", LOG)
     scene = drive.scene(0)
     assert scene.ground_classes == ("road", "crossing")
-    assert abs(scene.ground_area_m2()[1] - 30) < 1.5  # a whole quad, not a bow tie
+    assert abs(scene.ground_area_m2()[1] - 30) < 1.5  # the crossing is a simple quadrilateral
     turn = np.array([[np.cos(YAW), -np.sin(YAW)], [np.sin(YAW), np.cos(YAW)]])
     for row, col in [(200, 128), (180, 90), (255, 10)]:
         east, north = turn @ [scene.grid.x_m()[row], scene.grid.y_m()[col]]
@@ -148,7 +154,7 @@ def test_argoverse2_groups_every_category_of_taxonomy(root):
     assert len(CATEGORY_OF) == 30
     folder = root / "train" / LOG
     rows = [(f"t{k}", label, 0, 20.0, k - 15.0, 0, 0, 1, 1, 1) for k, label in enumerate(sorted(CATEGORY_OF))]
-    pyarrow.feather.write_feather(annotation_table(rows), folder / "annotations.feather")
+    pyarrow.feather.write_feather(make_annotation_table(rows), folder / "annotations.feather")
     counts = read_drive(root, "train", LOG).scene(0).counts()
     assert {name: count for name, count in zip(CATEGORIES, counts.tolist(), strict=True) if count} == {
         "vehicle_big": 8,
@@ -170,8 +176,8 @@ def real(real_data, request):
     return read_drive(real_data / "av2", request.param, log)
 
 
-def surface_at(drive, points_m: np.ndarray) -> np.ndarray:
-    """Heights of the raster at world points, NaN where unknown."""
+def sample_surface(drive, points_m: np.ndarray) -> np.ndarray:
+    """Return the heights of the raster at world points in m, NaN where unknown."""
     ground = drive.ground
     col, row = (points_m[:, :2] @ ground.raster_from_world[:2, :2].T + ground.raster_from_world[:2, 2]).astype(int).T
     rows, cols = ground.raster_m.shape
@@ -181,19 +187,19 @@ def surface_at(drive, points_m: np.ndarray) -> np.ndarray:
 
 def test_argoverse2_real_ego_origin_is_wheel_radius_above_ground(real):
     position = real.world_from_imu[:, :, 3]
-    assert abs(np.nanmedian(position[:, 2] - surface_at(real, position)) - 0.31) < 0.05
+    assert abs(np.nanmedian(position[:, 2] - sample_surface(real, position)) - 0.31) < 0.05
 
 
 def test_argoverse2_real_cars_stand_on_ground(real):
     cars = real.category == CATEGORIES.index("vehicle_small")
     bottom = real.center_m[cars, 2] - real.size_m[cars, 2] / 2
-    above = bottom - surface_at(real, real.center_m[cars])
+    above = bottom - sample_surface(real, real.center_m[cars])
     assert np.isfinite(above).sum() > 1000
     assert abs(np.nanmedian(above)) < 0.05 and np.nanpercentile(np.abs(above), 90) < 0.2
 
 
 def test_argoverse2_real_bollards_do_not_move(real):
-    """Seen from a moving car, they are static only if the pose of every sweep is applied correctly."""
+    """Bollards are static only if the reader applies the pose of every sweep of the moving car."""
     bollards = real.label == "BOLLARD"
     for track in np.unique(real.instance_id[bollards]):
         places = real.center_m[real.instance_id == track]
@@ -229,7 +235,7 @@ def rewrite(table: pa.Table, **columns) -> pa.Table:
     return table
 
 
-def with_first(value):
+def replace_first_value(value):
     return lambda values: [value, *values[1:]]
 
 
@@ -238,20 +244,20 @@ BROKEN_ANNOTATIONS = {
     "text for number": (lambda t: rewrite(t, tx_m=["far"] * 5), "tx_m is string, expected float"),
     "number for text": (lambda t: rewrite(t, category=[1] * 5), "category is int64, expected text"),
     "float time": (lambda t: rewrite(t, timestamp_ns=[1.0] * 5), "timestamp_ns is double, expected int64"),
-    "nulls": (lambda t: rewrite(t, tx_m=with_first(None)), "tx_m has 1 nulls"),
-    "null track": (lambda t: rewrite(t, track_uuid=with_first(None)), "track_uuid has 1 nulls"),
-    "nan": (lambda t: rewrite(t, tz_m=with_first(float("nan"))), "tz_m of row 0 is nan"),
-    "inf": (lambda t: rewrite(t, length_m=with_first(float("inf"))), "length_m of row 0 is inf"),
-    "huge": (lambda t: rewrite(t, tx_m=with_first(1e30)), "tx_m of row 0 is 1e+30"),
-    "huge size": (lambda t: rewrite(t, width_m=with_first(1e6)), "width_m of row 0 is 1e+06"),
-    "negative size": (lambda t: rewrite(t, height_m=with_first(-1.0)), "height_m of row 0 is -1"),
+    "nulls": (lambda t: rewrite(t, tx_m=replace_first_value(None)), "tx_m has 1 nulls"),
+    "null track": (lambda t: rewrite(t, track_uuid=replace_first_value(None)), "track_uuid has 1 nulls"),
+    "nan": (lambda t: rewrite(t, tz_m=replace_first_value(float("nan"))), "tz_m of row 0 is nan"),
+    "inf": (lambda t: rewrite(t, length_m=replace_first_value(float("inf"))), "length_m of row 0 is inf"),
+    "huge": (lambda t: rewrite(t, tx_m=replace_first_value(1e30)), "tx_m of row 0 is 1e+30"),
+    "huge size": (lambda t: rewrite(t, width_m=replace_first_value(1e6)), "width_m of row 0 is 1e+06"),
+    "negative size": (lambda t: rewrite(t, height_m=replace_first_value(-1.0)), "height_m of row 0 is -1"),
     "zero quaternion": (lambda t: rewrite(t, qw=[0.0] * 5, qz=[0.0] * 5), "quaternion of row 0 has norm 0"),
     "unknown category": (
-        lambda t: rewrite(t, category=with_first("SPACESHIP")),
+        lambda t: rewrite(t, category=replace_first_value("SPACESHIP")),
         "unknown category 'SPACESHIP'",
     ),
     "unknown sweep": (
-        lambda t: rewrite(t, timestamp_ns=with_first(17)),
+        lambda t: rewrite(t, timestamp_ns=replace_first_value(17)),
         "no pose at the annotated timestamp 17",
     ),
     "no rows": (lambda t: t.slice(0, 0), "holds no box"),
@@ -261,54 +267,54 @@ BROKEN_ANNOTATIONS = {
 @pytest.mark.parametrize("name", BROKEN_ANNOTATIONS)
 def test_argoverse2_names_broken_annotations(root, name):
     breaks, reason = BROKEN_ANNOTATIONS[name]
-    pyarrow.feather.write_feather(breaks(annotation_table()), root / "train" / LOG / "annotations.feather")
+    pyarrow.feather.write_feather(breaks(make_annotation_table()), root / "train" / LOG / "annotations.feather")
     assert_refused(root, reason, LOG)
 
 
 BROKEN_POSES = {
     "no column": (lambda t: t.drop_columns(["tz_m"]), "column tz_m is missing"),
-    "nan": (lambda t: rewrite(t, tx_m=with_first(float("nan"))), "tx_m of row 0 is nan"),
-    "huge": (lambda t: rewrite(t, ty_m=with_first(1e9)), "ty_m of row 0 is 1e+09"),
+    "nan": (lambda t: rewrite(t, tx_m=replace_first_value(float("nan"))), "tx_m of row 0 is nan"),
+    "huge": (lambda t: rewrite(t, ty_m=replace_first_value(1e9)), "ty_m of row 0 is 1e+09"),
     "no rows": (lambda t: t.slice(0, 0), "no pose at the annotated timestamp"),
-    "quaternion": (lambda t: rewrite(t, qw=with_first(1.5)), "quaternion of row 0"),
-    "huge quaternion": (lambda t: rewrite(t, qw=with_first(1e300)), "qw of row 0 is 1e+300"),
+    "quaternion": (lambda t: rewrite(t, qw=replace_first_value(1.5)), "quaternion of row 0"),
+    "huge quaternion": (lambda t: rewrite(t, qw=replace_first_value(1e300)), "qw of row 0 is 1e+300"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN_POSES)
 def test_argoverse2_names_broken_poses(root, name):
     breaks, reason = BROKEN_POSES[name]
-    pyarrow.feather.write_feather(breaks(pose_table()), root / "train" / LOG / "city_SE3_egovehicle.feather")
+    pyarrow.feather.write_feather(breaks(make_pose_table()), root / "train" / LOG / "city_SE3_egovehicle.feather")
     assert_refused(root, reason, "city_SE3_egovehicle.feather")
 
 
-def edited(content: dict, **values) -> str:
+def edit_json(content: dict, **values) -> str:
     return json.dumps(content | values)
 
 
 EDGE = [(0, 0), (1, 1)]
 BROKEN_MAPS = {
     "empty": ("", "broken JSON"),
-    "truncated": (json.dumps(map_json())[:100], "broken JSON"),
+    "truncated": (json.dumps(make_map_json())[:100], "broken JSON"),
     "a list": ("[1, 2]", "holds a list"),
     "deep": ("[" * 100_000, "broken JSON"),
     "not utf-8": (b"\xff\xfe{", "broken JSON"),
-    "no areas": (edited(map_json(), drivable_areas=None), "drivable_areas is missing"),
-    "areas are a list": (edited(map_json(), drivable_areas=[1]), "drivable_areas is missing"),
-    "area is a number": (edited(map_json(), drivable_areas={"1": 1}), "drivable_areas is missing"),
+    "no areas": (edit_json(make_map_json(), drivable_areas=None), "drivable_areas is missing"),
+    "areas are a list": (edit_json(make_map_json(), drivable_areas=[1]), "drivable_areas is missing"),
+    "area is a number": (edit_json(make_map_json(), drivable_areas={"1": 1}), "drivable_areas is missing"),
     "two corners": (
-        edited(map_json(), drivable_areas={"1": {"area_boundary": points(*EDGE)}}),
+        edit_json(make_map_json(), drivable_areas={"1": {"area_boundary": make_points(*EDGE)}}),
         "area_boundary",
     ),
-    "no edge": (edited(map_json(), pedestrian_crossings={"1": {"edge1": points(*EDGE)}}), "edge2 of None"),
+    "no edge": (edit_json(make_map_json(), pedestrian_crossings={"1": {"edge1": make_points(*EDGE)}}), "edge2 of None"),
     "three points": (
-        edited(map_json(), pedestrian_crossings={"1": {"edge1": points(*EDGE, (2, 2)), "edge2": []}}),
+        edit_json(make_map_json(), pedestrian_crossings={"1": {"edge1": make_points(*EDGE, (2, 2)), "edge2": []}}),
         "edge1 of None",
     ),
-    "nan": (json.dumps(map_json()).replace("1040.25", "NaN"), "without valid x, y"),
-    "huge": (json.dumps(map_json()).replace("1040.25", "1e999"), "without valid x, y"),
-    "text": (json.dumps(map_json()).replace("1040.25", '"east"'), "without valid x, y"),
-    "true": (json.dumps(map_json()).replace("1040.25", "true"), "without valid x, y"),
+    "nan": (json.dumps(make_map_json()).replace("1040.25", "NaN"), "without valid x, y"),
+    "huge": (json.dumps(make_map_json()).replace("1040.25", "1e999"), "without valid x, y"),
+    "text": (json.dumps(make_map_json()).replace("1040.25", '"east"'), "without valid x, y"),
+    "true": (json.dumps(make_map_json()).replace("1040.25", "true"), "without valid x, y"),
 }
 
 
@@ -333,7 +339,7 @@ BROKEN_SIM2 = {
 @pytest.mark.parametrize("name", BROKEN_SIM2)
 def test_argoverse2_names_broken_sim2(root, name):
     path = root / "train" / LOG / "map" / f"{LOG}___img_Sim2_city.json"
-    path.write_text(edited(sim2_json(), **BROKEN_SIM2[name]))
+    path.write_text(edit_json(make_sim2_json(), **BROKEN_SIM2[name]))
     assert_refused(root, "download the log again", path.name)
 
 
