@@ -1,4 +1,4 @@
-"""Augmented scenes equal the scene seen in a mirror or from a moved vehicle."""
+"""Tests of augmentation: scenes are mirrored or seen from a displaced vehicle."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def test_mirror_reflects_boxes_and_is_an_involution():
     assert np.allclose(compute_scatter_matrix(seen.rotation, seen.size_m), want, atol=1e-4)
     assert np.allclose(np.linalg.det(seen.rotation), 1, atol=1e-5)
     x, y = np.meshgrid(scene.grid.x_m(), scene.grid.y_m(), indexing="ij")
-    for points in (x, y):  # the raster moves with the boxes
+    for points in (x, y):  # the raster and the boxes have the same motion
         mean = [(points[None] * s.occupied).sum() / s.occupied.sum() for s in (scene, seen)]
         assert np.isclose(mean[1], -mean[0] if points is y else mean[0], atol=1e-6)
     with pytest.raises(ValueError, match="not symmetric"):
