@@ -1,4 +1,4 @@
-"""The command line: options and their earlier names, `pritti`, the facade, and which modules import which."""
+"""Tests of the command line: options, renamed options, `pritti`, the facade and imports."""
 
 import ast
 import importlib
@@ -20,8 +20,8 @@ def run_python(*words: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=60)
 
 
-def option_types(job: str) -> dict[str, object]:
-    """Type of every option of a job, over all its subcommands."""
+def list_option_types(job: str) -> dict[str, object]:
+    """Return the type of each option of a job, including the options of its subcommands."""
     module = importlib.import_module(f"jobs.{job}")
     classes = [value for value in vars(module).values() if is_dataclass(value) and isinstance(value, type)]
     return {
@@ -34,7 +34,7 @@ def option_types(job: str) -> dict[str, object]:
 
 @pytest.mark.parametrize("job", JOBS)
 def test_renames_name_existing_options(job):
-    options = set(option_types(job))
+    options = set(list_option_types(job))
     assert not options & (set(OPTIONS) - set(JOB_OPTIONS.get(job, {})))
     for old, new in JOB_OPTIONS.get(job, {}).items():
         assert new.removeprefix("no-") in options
@@ -44,7 +44,7 @@ def test_renames_name_existing_options(job):
 
 @pytest.mark.parametrize(("job", "option"), VALUES, ids=lambda word: word)
 def test_renames_name_existing_values(job, option):
-    choices = option_types(job)[option]
+    choices = list_option_types(job)[option]
     literals = [choices] if get_origin(choices) is Literal else get_args(choices)
     values = {value for literal in literals for value in get_args(literal)}
     assert set(VALUES[job, option].values()) <= values and not set(VALUES[job, option]) & values
@@ -78,7 +78,7 @@ def test_job_exits_with_code_2_for_renamed_option():
 
 
 def test_option_modules_import_nothing_heavy():
-    """`--help` imports the option modules only."""
+    """The modules with options import no heavy packages because `--help` imports these modules."""
     names = ", ".join(f"jobs.{job}" for job in JOBS)
     done = run_python("-c", f"import sys, {names}, pritti.cli; print(*sorted(sys.modules))")
     heavy = {"torch", "ray", "numpy", "pyarrow", "mlflow", "diffusers", "trimesh", "models", "pipelines"}
@@ -127,8 +127,11 @@ def test_pritti_facade_is_lazy():
         _ = pritti.Nothing
 
 
-def imported_modules(path: Path) -> set[str]:
-    """Dotted names of modules, or of modules with a name in them, that a file imports anywhere."""
+def find_imported_names(path: Path) -> set[str]:
+    """Return the dotted names that a file imports, including imports in functions.
+
+    The statement `from a import b` adds the name `a.b`.
+    """
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -139,10 +142,12 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def test_jobs_import_one_way():
-    """Executables import jobs.support only; jobs.support imports neither executables nor implementations."""
+    """Executables import only jobs.support, which imports neither executables nor implementations."""
     support = tuple(f"jobs.support.{path.stem}" for path in (ROOT / "jobs/support").glob("*.py")) + ("jobs.support.",)
     for folder in ("jobs", "jobs/support"):
         for path in (ROOT / folder).glob("*.py"):
-            ours = {name for name in imported_modules(path) if name.split(".")[0] == "jobs"}
+            ours = {name for name in find_imported_names(path) if name.split(".")[0] == "jobs"}
             assert all(name.startswith(support) for name in ours), path
-            assert folder != "jobs" or not {n for n in imported_modules(path) if n.startswith(("models", "pipelines"))}
+            assert folder != "jobs" or not {
+                n for n in find_imported_names(path) if n.startswith(("models", "pipelines"))
+            }
