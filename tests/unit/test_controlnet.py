@@ -1,4 +1,4 @@
-"""The ControlNet step: a real diffusers pipeline with small random weights, saved and loaded."""
+"""Tests of the ControlNet step with a diffusers pipeline of small random weights."""
 
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def test_control_image_uses_palette_and_sky():
 def test_painter_depends_on_image_prompt_and_seed(controlnet_weights):
     painter = Painter(request(controlnet_weights))
     first = painter.paint(street_class_ids())
-    assert first.shape == (44, 60, 3) and first.dtype == np.uint8 and first.std() > 1  # 44 is no multiple of 8
+    assert first.shape == (44, 60, 3) and first.dtype == np.uint8 and first.std() > 1  # 44 is not a multiple of 8
     assert np.array_equal(first, painter.paint(street_class_ids()))
     assert not np.array_equal(first, painter.paint(street_class_ids()[::-1].copy()))
     for other in ({"seed": 1}, {"prompt": "xyz"}, {"control_scale": 0.0}):
