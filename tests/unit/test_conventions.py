@@ -1,4 +1,4 @@
-"""Conventions that the tests follow: where their modules lie and how test functions are named."""
+"""Tests of the conventions for the folders of test modules and the names of test functions."""
 
 import ast
 from collections import Counter
@@ -12,7 +12,7 @@ MODULES = sorted((ROOT / "tests").rglob("test_*.py"))
 
 def test_modules_lie_in_known_folders_with_unique_names():
     assert {path.parent.relative_to(ROOT / "tests").as_posix() for path in MODULES} == set(FOLDERS)
-    assert max(Counter(path.name for path in MODULES).values()) == 1  # pytest imports them by name
+    assert max(Counter(path.name for path in MODULES).values()) == 1  # pytest imports test modules by their name only
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
