@@ -1,4 +1,4 @@
-"""The convolutional networks of the ground branch against diffusers'."""
+"""Tests that compare the convolutional networks of the ground branch with diffusers."""
 
 import pytest
 import torch
