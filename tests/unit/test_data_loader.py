@@ -1,4 +1,4 @@
-"""The stream of training samples: each scene once per epoch, independent of the number of workers."""
+"""Tests of the stream of training samples: scenes per epoch, and independence of the number of workers."""
 
 import numpy as np
 import pytest
