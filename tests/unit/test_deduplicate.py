@@ -1,4 +1,4 @@
-"""Of two objects in nearly the same place the higher-confidence one is kept; neighbours are both kept."""
+"""Tests of the suppression of duplicate objects, which keeps the object with higher confidence."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from models.scene import CATEGORY_INDEX, Grid
 SMALL = Grid(rows=32, cols=32, resolution_m=2.0)
 
 
-def row_of_boxes(shift_m, existence, category="construction_small"):
-    """Upright boxes of 4 x 1 x 1 m in a row along x, at `shift_m` from the first."""
+def make_row_of_boxes(shift_m, existence, category="construction_small"):
+    """Return upright boxes of 4 x 1 x 1 m in a row along x, at distances `shift_m` from the first box."""
     n = len(shift_m)
     center = np.stack([20 + np.asarray(shift_m, np.float32), np.zeros(n), np.ones(n)], axis=1).astype(np.float32)
     return replace(
@@ -37,17 +37,19 @@ def test_find_duplicates_finds_known_object():
 
 
 def test_find_duplicates_finds_shifted_copy_but_no_neighbor():
-    known = row_of_boxes([0], [0.9], "vegetation_cuboid")
-    drawn_aside, beside = [2.5, 7], [0.2, 2.5]  # IoU 1.5 / 6.5 is small; at 2.5 it is the known one or its neighbour
-    for shift_m, again in ((drawn_aside, [True, False]), (beside, [True, False]), ([3.9, 7], [False, False])):
-        assert find_regenerated_objects(row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+    known = make_row_of_boxes([0], [0.9], "vegetation_cuboid")
+    # The IoU of boxes at 0 m and 2.5 m is 1.5 / 6.5. The box at 2.5 m is a copy of the known box unless another
+    # generated box is closer to the known box.
+    far_copy, near_copy = [2.5, 7], [0.2, 2.5]
+    for shift_m, again in ((far_copy, [True, False]), (near_copy, [True, False]), ([3.9, 7], [False, False])):
+        assert find_regenerated_objects(make_row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
 
 
 def test_find_duplicates_keeps_slightly_overlapping_neighbors():
-    known = row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
-    made = row_of_boxes(
+    known = make_row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
+    made = make_row_of_boxes(
         [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
-    )  # .053 and .039 with the two known; .046 with the first
+    )  # IoU 0.053 and 0.039 with the known boxes, 0.046 with the first box
     overlaps = compute_iou3d_matrix(extract_boxes(made), extract_boxes(known))
     assert (
         overlaps[0, 0] > REGENERATED_IOU3D > overlaps[1, 0] > 0
@@ -57,41 +59,41 @@ def test_find_duplicates_keeps_slightly_overlapping_neighbors():
 
 
 def test_suppress_duplicates_keeps_higher_confidence():
-    assert find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
-    assert find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
         False,
         True,
-    ]  # the first of two with equal confidence
-    assert find_lower_confidence_duplicates(row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [
+    ]  # the first of two boxes with equal confidence is kept
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [
         False,
         False,
-    ]  # 1 / 7: the next part of a fence
+    ]  # IoU 1 / 7: the next part of a fence
 
 
 def test_suppress_duplicates_uses_threshold_of_category():
     for category, both_stay in (("vehicle_small", False), ("vehicle_big", False), ("construction_big", True)):
-        assert find_lower_confidence_duplicates(row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [
+        assert find_lower_confidence_duplicates(make_row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [
             False,
             not both_stay,
-        ]  # 1 / 7
-        assert not find_lower_confidence_duplicates(row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # 1 / 79
-        assert find_lower_confidence_duplicates(row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [
+        ]  # IoU 1 / 7
+                assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # IoU 1 / 79
+        assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [
             False,
             True,
-        ]  # 1 / 3
-        made, known = row_of_boxes([0, 3], [0.9, 0.9], category), row_of_boxes([0], [0.6], category)
+        ]  # IoU 1 / 3
+                made, known = make_row_of_boxes([0, 3], [0.9, 0.9], category), make_row_of_boxes([0], [0.6], category)
         assert find_regenerated_objects(made, known).tolist() == [True, not both_stay]
 
 
 def test_suppress_duplicates_ignores_suppressed_objects():
-    # The middle one overlaps both others by 1 / 3; these two do not overlap.
-    assert find_lower_confidence_duplicates(row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
-    assert find_lower_confidence_duplicates(row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
+    # The middle box has an IoU of 1 / 3 with each outer box. The outer boxes do not overlap.
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
 
 
 def test_suppress_duplicates_lets_plants_and_categories_overlap():
-    assert not find_lower_confidence_duplicates(row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
-    pair = row_of_boxes([0, 1], [0.6, 0.9])
+    assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
+    pair = make_row_of_boxes([0, 1], [0.6, 0.9])
     mixed = replace(pair, category=np.array([pair.category[0], CATEGORY_INDEX["pole"]], np.int8))
     assert not find_lower_confidence_duplicates(mixed).any()
     assert find_lower_confidence_duplicates(pair.select(slice(0, 0))).shape == (0,)
