@@ -42,7 +42,10 @@ def test_find_duplicates_finds_shifted_copy_but_no_neighbor():
     # generated box is closer to the known box.
     far_copy, near_copy = [2.5, 7], [0.2, 2.5]
     for shift_m, again in ((far_copy, [True, False]), (near_copy, [True, False]), ([3.9, 7], [False, False])):
-        assert find_regenerated_objects(make_row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist() == again
+        assert (
+            find_regenerated_objects(make_row_of_boxes(shift_m, [0.9, 0.9], "vegetation_cuboid"), known).tolist()
+            == again
+        )
 
 
 def test_find_duplicates_keeps_slightly_overlapping_neighbors():
@@ -59,7 +62,10 @@ def test_find_duplicates_keeps_slightly_overlapping_neighbors():
 
 
 def test_suppress_duplicates_keeps_higher_confidence():
-    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [True, False]  # IoU 3 / 5
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [
+        True,
+        False,
+    ]  # IoU 3 / 5
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
         False,
         True,
@@ -76,19 +82,29 @@ def test_suppress_duplicates_uses_threshold_of_category():
             False,
             not both_stay,
         ]  # IoU 1 / 7
-                assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 3.9], [0.9, 0.6], category)).any()  # IoU 1 / 79
+        assert not find_lower_confidence_duplicates(
+            make_row_of_boxes([0, 3.9], [0.9, 0.6], category)
+        ).any()  # IoU 1 / 79
         assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [
             False,
             True,
         ]  # IoU 1 / 3
-                made, known = make_row_of_boxes([0, 3], [0.9, 0.9], category), make_row_of_boxes([0], [0.6], category)
+        made, known = make_row_of_boxes([0, 3], [0.9, 0.9], category), make_row_of_boxes([0], [0.6], category)
         assert find_regenerated_objects(made, known).tolist() == [True, not both_stay]
 
 
 def test_suppress_duplicates_ignores_suppressed_objects():
     # The middle box has an IoU of 1 / 3 with each outer box. The outer boxes do not overlap.
-    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [False, True, False]
-    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [True, False, True]
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.9, 0.8, 0.7])).tolist() == [
+        False,
+        True,
+        False,
+    ]
+    assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2, 4], [0.7, 0.9, 0.8])).tolist() == [
+        True,
+        False,
+        True,
+    ]
 
 
 def test_suppress_duplicates_lets_plants_and_categories_overlap():
