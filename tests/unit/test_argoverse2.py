@@ -15,7 +15,7 @@ from pipelines.preprocess.sources.argoverse2 import CATEGORY_OF, list_logs, read
 
 LOG = "00000000-aaaa-bbbb-cccc-000000000001"
 SWEEPS = np.array([315969904359876000, 315969904459712000, 315969904559845000])
-ORIGIN = np.array([1000.25, -2000.5, 12.0])  # pose of the ego vehicle at the first sweep, city frame
+ORIGIN = np.array([1000.25, -2000.5, 12.0])  # position of the ego vehicle at the first sweep, city frame (m)
 YAW = 0.6
 
 
