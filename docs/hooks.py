@@ -134,7 +134,8 @@ def execute_tutorials() -> dict[str, str | bytes]:
 
 def write_index(title: str, introduction: str, pages: dict[str, str]) -> str:
     """Return the Markdown of a page that lists others with their summaries."""
-    return "\n".join([f"# {title}\n\n{introduction}\n", *(f"* [{name}]({name}.md): {text}" for name, text in pages.items())])
+    entries = [f"* [{name}]({name}.md): {text}" for name, text in pages.items()]
+    return "\n".join([f"# {title}\n\n{introduction}\n", *entries])
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:

@@ -1,11 +1,12 @@
-"""docs/reference/tables.md: every block runs, every answer is right, the column lists are the schemas'; files explain themselves.
+"""docs/reference/tables.md: its blocks run, its answers are right, its column lists equal the schemas.
 
-python tests/unit/test_tables_docs.py      writes the lists of columns and categories into the page
+PYTHONPATH=tests python tests/unit/test_tables_docs.py      writes the lists of columns and categories into the page
 """
 
 import json
 import re
 import tempfile
+import textwrap
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +64,7 @@ def column_list(schema: pa.Schema) -> str:
     rows = ["| column | type | unit | meaning |", "|---|---|---|---|"]
     for row in json.loads(schema.metadata[b"pritti_columns"]):
         rows.append(f"| {row['name']} | {types[row['name']]} | {row['unit'] or ''} | {row['description']} |")
-    return "\n".join([schema.metadata[b"pritti_description"].decode(), "", *rows])
+    return "\n".join([textwrap.fill(schema.metadata[b"pritti_description"].decode(), 120), "", *rows])
 
 
 def category_list() -> str:

@@ -1,0 +1,79 @@
+"""Every command block and every Python block of README and docs runs, or is marked with what it needs."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from documents import PAGES, Block, list_blocks
+from helpers import ROOT
+
+# Pages whose blocks other tests run.
+TESTED_ELSEWHERE = {
+    "docs/reference/tables.md": "tests/unit/test_tables_docs.py",
+    "CONTRIBUTING.md": "only targets of make",
+}
+# Commands that a reader of a page has run before: pages of one topic assume scenes under $PRITTI_HOME/generated.
+SAMPLE = "jobs/sample_scenes.py --model town --num-scenes 2 --sampler dpm++ --num-inference-steps 10"
+BEFORE = dict.fromkeys(
+    ("docs/how_to/edit_scenes.md", "docs/how_to/street_views.md", "docs/how_to/import_scenes.md"), SAMPLE
+)
+RUN_PAGES = [
+    page
+    for page in PAGES
+    if page not in TESTED_ELSEWHERE and any(not block.needs for block in list_blocks(page, "sh", "python"))
+]
+
+
+def run_words(words: list[str]) -> None:
+    """Run one command of a shell block: a job in this process, a target of make as a dry run."""
+    from jobs.support.cli import run
+
+    if words[0] == "export":
+        os.environ.update(word.split("=", 1) for word in words[1:])
+    elif words[0] == "make":
+        subprocess.run(["make", "--dry-run", "-C", str(ROOT), *words[1:]], check=True, capture_output=True)
+    elif words[0] == "pritti":
+        run(words[1].replace("-", "_"), words[2:])
+    elif re.fullmatch(r"jobs/\w+\.py", words[0]):
+        run(Path(words[0]).stem, words[1:])
+    else:
+        raise ValueError(f"no test runs {words[0]!r}: add it here, or mark the block with '# Needs: ...'")
+
+
+def run_shell(code: str) -> None:
+    """Run the commands of a shell block in order, with variables of the environment expanded."""
+    for line in code.replace("\\\n", " ").splitlines():
+        if words := shlex.split(os.path.expandvars(line), comments=True):
+            run_words(words)
+
+
+def run_block(block: Block, names: dict) -> None:
+    if block.language == "sh":
+        run_shell(block.code_to_run)
+    else:
+        exec(compile(block.code_to_run, block.page, "exec"), names)
+
+
+@pytest.mark.parametrize("page", RUN_PAGES)
+def test_document_blocks_run(page, tmp_path, monkeypatch, cluster):
+    for name in ("models", "docs"):  # commands name released weights relative to the repository
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PWD", str(tmp_path))
+    names: dict = {"__name__": "document"}
+    run_shell(BEFORE.get(page, ""))
+    blocks = [block for block in list_blocks(page, "sh", "python") if not block.needs]
+    assert blocks
+    for block in blocks:
+        run_block(block, names)
+    shutil.rmtree(tmp_path / "home", ignore_errors=True)
+
+
+def test_block_without_command_of_ours_is_refused(monkeypatch):
+    with pytest.raises(ValueError, match="no test runs 'curl'"):
+        run_shell("curl http://localhost")
