@@ -1,4 +1,4 @@
-"""Custom drives: scenes equal the written tables, ground equals shapely, and errors name every mistake."""
+"""Tests of custom drives: content of scenes, ground compared with shapely, and errors for wrong files."""
 
 import hashlib
 import json
@@ -23,51 +23,57 @@ from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.schema.tables import Shard, read_scenes
 
 DOCUMENT = ROOT / "docs/how_to/own_drives.md"
-ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # a position in UTM
+ORIGIN = np.array([456_789.25, 5_432_100.5, 115.0])  # position in UTM (m)
 YAW = 0.7
 Tables = dict[str, list[dict]]
 
 
-def ahead(x: float, y: float, z: float = 0.0) -> np.ndarray:
-    """Returns the world point of a point in the ego frame of the first pose."""
+def transform_to_world(x: float, y: float, z: float = 0.0) -> np.ndarray:
+    """Transform a point from the ego frame of the first pose to the world frame."""
     return Pose(ORIGIN, YAW).to_world([x, y, z])
 
 
-def place(point_m: np.ndarray) -> dict:
+def make_position(point_m: np.ndarray) -> dict:
     return dict(zip(("x_m", "y_m", "z_m"), np.asarray(point_m).tolist(), strict=True))
 
 
-def box(category: str, x: float, y: float, z: float, size=(4.0, 2.0, 1.5), yaw: float = 0.0, **more) -> dict:
+def make_box(category: str, x: float, y: float, z: float, size=(4.0, 2.0, 1.5), yaw: float = 0.0, **more) -> dict:
     sizes = dict(zip(("length_m", "width_m", "height_m"), size, strict=True))
-    return {"category": category} | place(ahead(x, y, z)) | sizes | {"yaw_rad": YAW + yaw} | more
+    return {"category": category} | make_position(transform_to_world(x, y, z)) | sizes | {"yaw_rad": YAW + yaw} | more
 
 
-def outline(*xy: tuple[float, float], z: float = -1.0) -> list[list[float]]:
-    return [ahead(x, y, z).tolist() for x, y in xy]
+def make_outline(*xy: tuple[float, float], z: float = -1.0) -> list[list[float]]:
+    return [transform_to_world(x, y, z).tolist() for x, y in xy]
 
 
-def street() -> Tables:
-    """Two poses 2 m apart; a parked car, a tree, a pole, a house and a car that moves 3 m."""
+def make_street() -> Tables:
+    """Return the tables of a street with two poses that are 2 m apart.
+
+    The street contains a parked car, a tree, a pole, a house, a pedestrian and a truck that moves by 3 m.
+    """
     return {
         "boxes": [
-            box("vehicle_small", 20, -6, 0, yaw=3.0, label="Parked", instance_id=7),
-            box("vegetation_ellipsoid", 30, 9, 3, (5, 4, 8)),
-            box("pole", 12, 8, 2, (0.2, 0.2, 6), instance_id=None),
-            box("construction_big", 40, 20, 4, (8, 14, 9), heading_known=True),
-            box("vehicle_big", 25, 0, 0.5, (9, 2.5, 3), yaw=0.1, frame=10, instance_id=8),
-            box("vehicle_big", 28, 0, 0.5, (9, 2.5, 3), yaw=0.1, frame=20, instance_id=8),
-            box("human", 15, -9, 0, (0.5, 0.6, 1.8), heading_known=False, frame=20),
+            make_box("vehicle_small", 20, -6, 0, yaw=3.0, label="Parked", instance_id=7),
+            make_box("vegetation_ellipsoid", 30, 9, 3, (5, 4, 8)),
+            make_box("pole", 12, 8, 2, (0.2, 0.2, 6), instance_id=None),
+            make_box("construction_big", 40, 20, 4, (8, 14, 9), heading_known=True),
+            make_box("vehicle_big", 25, 0, 0.5, (9, 2.5, 3), yaw=0.1, frame=10, instance_id=8),
+            make_box("vehicle_big", 28, 0, 0.5, (9, 2.5, 3), yaw=0.1, frame=20, instance_id=8),
+            make_box("human", 15, -9, 0, (0.5, 0.6, 1.8), heading_known=False, frame=20),
         ],
         "polygons": [
-            {"class": "road", "outline": outline((-50, -4), (150, -4), (150, 4), (-50, 4))},
-            {"class": "sidewalk", "outline": outline((-50, 4), (150, 4), (150, 7), (-50, 7), (-50, 4), z=-0.9)},
+            {"class": "road", "outline": make_outline((-50, -4), (150, -4), (150, 4), (-50, 4))},
+            {"class": "sidewalk", "outline": make_outline((-50, 4), (150, 4), (150, 7), (-50, 7), (-50, 4), z=-0.9)},
         ],
-        "poses": [{"frame": frame, "yaw_rad": YAW} | place(ahead(x, 0)) for frame, x in ((10, 0.0), (20, 2.0))],
+        "poses": [
+            {"frame": frame, "yaw_rad": YAW} | make_position(transform_to_world(x, 0))
+            for frame, x in ((10, 0.0), (20, 2.0))
+        ],
     }
 
 
-def write(tables: Tables, root: Path, name: str = "street", parquet: bool = False) -> Path:
-    """Writes each table of ROOT/NAME as JSON or as Parquet; returns ROOT."""
+def write_drive(tables: Tables, root: Path, name: str = "street", parquet: bool = False) -> Path:
+    """Write each table to root/name as JSON or Parquet and return root."""
     folder = root / name
     folder.mkdir(parents=True, exist_ok=True)
     for table, rows in tables.items():
@@ -79,8 +85,8 @@ def write(tables: Tables, root: Path, name: str = "street", parquet: bool = Fals
     return root
 
 
-def written(tables: Tables, root: Path, **how) -> Drive:
-    return read_drive(write(tables, root, **how), how.get("name", "street"))
+def write_and_read_drive(tables: Tables, root: Path, **how) -> Drive:
+    return read_drive(write_drive(tables, root, **how), how.get("name", "street"))
 
 
 def assert_same_drive(a: Drive, b: Drive, tolerance: float = 0.0):
@@ -94,20 +100,23 @@ def assert_same_drive(a: Drive, b: Drive, tolerance: float = 0.0):
     assert np.array_equal(a.ground.triangle_class, b.ground.triangle_class)
 
 
-# ------------------------------------------------------------------------------------------------- ways to write
+# ------------------------------------------------------------------------------------------------- file formats
 
 
 def test_custom_source_reads_json_and_parquet_equally(tmp_path):
-    a, b = written(street(), tmp_path / "a"), written(street(), tmp_path / "b", parquet=True)
+    a, b = (
+        write_and_read_drive(make_street(), tmp_path / "a"),
+        write_and_read_drive(make_street(), tmp_path / "b", parquet=True),
+    )
     assert_same_drive(a, b)
     assert a.source == "own" and a.sequence == "street" and len(a) == 2 and len(a.category) == 7
 
 
 def test_custom_source_reads_pandas_frame_with_gaps_and_index(tmp_path):
-    """pandas converts integers next to a gap to floats and writes the index of a filtered frame."""
-    a = written(street(), tmp_path / "a")
-    folder = write(street(), tmp_path / "b", parquet=True) / "street"
-    rows = street()["boxes"]
+    """pandas converts an integer column with gaps to floats and writes the index of a filtered frame."""
+    a = write_and_read_drive(make_street(), tmp_path / "a")
+    folder = write_drive(make_street(), tmp_path / "b", parquet=True) / "street"
+    rows = make_street()["boxes"]
     frame = pandas.DataFrame([*rows[:2], {"category": "pole"}, *rows[2:]])
     frame[frame.x_m > 0].to_parquet(folder / "boxes.parquet")
     stored = pq.read_schema(folder / "boxes.parquet")
@@ -116,25 +125,27 @@ def test_custom_source_reads_pandas_frame_with_gaps_and_index(tmp_path):
 
 
 def test_custom_source_reads_yaw_quaternion_and_matrix_equally(tmp_path):
-    tables = street()
-    a = written(tables, tmp_path / "a")
+    tables = make_street()
+    a = write_and_read_drive(tables, tmp_path / "a")
     for row in [*tables["boxes"], *tables["poses"]]:
         q = Rotation.from_rotvec([0, 0, row.pop("yaw_rad")]).as_quat(scalar_first=True)
         row |= dict(zip(custom.QUATERNION, q.tolist(), strict=True))
-    assert_same_drive(a, written(tables, tmp_path / "b"), 1e-12)
+    assert_same_drive(a, write_and_read_drive(tables, tmp_path / "b"), 1e-12)
     tables["poses"] = [
         {"frame": int(frame), "world_from_ego": matrix.ravel().tolist()}
         for frame, matrix in zip(a.frame, a.world_from_imu, strict=True)
     ]
-    assert_same_drive(a, written(tables, tmp_path / "c"), 1e-12)
-    assert_same_drive(a, written(tables, tmp_path / "d", parquet=True), 1e-12)
+    assert_same_drive(a, write_and_read_drive(tables, tmp_path / "c"), 1e-12)
+    assert_same_drive(a, write_and_read_drive(tables, tmp_path / "d", parquet=True), 1e-12)
 
 
 def test_custom_source_ignores_winding_and_closure_of_outline(tmp_path):
-    shape = outline((5, -4), (40, -4), (40, 4), (20, 0), (5, 4))
+    shape = make_outline((5, -4), (40, -4), (40, 4), (20, 0), (5, 4))
     rasters = []
     for k, points in enumerate([shape, shape[::-1], [*shape, shape[0]], [*shape[2:], *shape[:2]], [shape[0], *shape]]):
-        drive = written(street() | {"polygons": [{"class": "road", "outline": points}]}, tmp_path / str(k))
+        drive = write_and_read_drive(
+            make_street() | {"polygons": [{"class": "road", "outline": points}]}, tmp_path / str(k)
+        )
         rasters.append(drive.scene(0))
     for scene in rasters[1:]:
         assert np.array_equal(scene.occupied, rasters[0].occupied)
@@ -142,12 +153,12 @@ def test_custom_source_ignores_winding_and_closure_of_outline(tmp_path):
 
 
 def test_custom_source_reads_drive_without_boxes_or_ground(tmp_path):
-    empty = written(street() | {"boxes": []}, tmp_path / "a")
+    empty = write_and_read_drive(make_street() | {"boxes": []}, tmp_path / "a")
     assert len(empty.category) == 0 and len(empty.scene(0)) == 0 and empty.scene(0).occupied.any()
-    bare = read_drive(write(street() | {"polygons": []}, tmp_path / "b"), "street", ("road", "terrain"))
+    bare = read_drive(write_drive(make_street() | {"polygons": []}, tmp_path / "b"), "street", ("road", "terrain"))
     assert len(bare.scene(0)) == 5 and bare.scene(0).occupied.shape == (2, 256, 256)
     assert not bare.scene(0).occupied.any()
-    folder = write(street(), tmp_path / "c") / "street"
+    folder = write_drive(make_street(), tmp_path / "c") / "street"
     (folder / "boxes.json").unlink()
     pandas.DataFrame({"category": []}).to_parquet(folder / "boxes.parquet")
     assert len(read_drive(tmp_path / "c", "street").category) == 0
@@ -157,7 +168,7 @@ def test_custom_source_reads_drive_without_boxes_or_ground(tmp_path):
 
 
 def test_custom_source_places_boxes_in_scene(tmp_path):
-    drive = written(street(), tmp_path)
+    drive = write_and_read_drive(make_street(), tmp_path)
     scene = drive.scene(0)
     assert scene.scene_id == "own-street-0000000010"
     assert [CATEGORIES[c] for c in scene.category] == [
@@ -170,7 +181,7 @@ def test_custom_source_places_boxes_in_scene(tmp_path):
     expected = [[20, -6, 0], [30, 9, 3], [12, 8, 2], [40, 20, 4], [25, 0, 0.5]]
     assert np.allclose(scene.center_m, expected, atol=1e-5)
     assert np.allclose(drive.scene(1).center_m[:4], np.array(expected)[:4] - [2, 0, 0], atol=1e-5)
-    assert np.allclose(scene.size_m[3], [14, 8, 9])  # length is the longer side
+    assert np.allclose(scene.size_m[3], [14, 8, 9])  # the longer side is the length
     assert np.allclose(scene.yaw_rad[[0, 4]], [3.0 - np.pi, 0.1], atol=1e-5)
     assert np.allclose(scene.heading_rad, [3.0, np.nan, np.nan, 0.0, 0.1], atol=1e-5, equal_nan=True)
     assert scene.label.tolist()[:2] == ["Parked", "vegetation_ellipsoid"]
@@ -178,7 +189,7 @@ def test_custom_source_places_boxes_in_scene(tmp_path):
 
 
 def test_custom_source_places_moving_box_in_its_frame_only(tmp_path):
-    drive = written(street(), tmp_path)
+    drive = write_and_read_drive(make_street(), tmp_path)
     moving = [scene.center_m[scene.instance_id == 8] for scene in (drive.scene(0), drive.scene(1))]
     assert np.allclose(moving, [[[25, 0, 0.5]], [[26, 0, 0.5]]], atol=1e-5)
     humans = [int((drive.scene(k).category == CATEGORY_INDEX["human"]).sum()) for k in range(2)]
@@ -188,48 +199,48 @@ def test_custom_source_places_moving_box_in_its_frame_only(tmp_path):
 
 def test_custom_source_keeps_lean_and_drops_upright_heading(tmp_path):
     turn = Rotation.from_euler("ZY", [[YAW + 0.4, 0.3], [YAW, np.pi / 2]])
-    tables = street()
+    tables = make_street()
     tables["boxes"] = [
-        {name: value for name, value in box("vehicle_small", 20, k, 0).items() if name != "yaw_rad"}
+        {name: value for name, value in make_box("vehicle_small", 20, k, 0).items() if name != "yaw_rad"}
         | dict(zip(custom.QUATERNION, q.tolist(), strict=True))
         for k, q in enumerate(turn.as_quat(scalar_first=True))
     ]
-    drive = written(tables, tmp_path)
+    drive = write_and_read_drive(tables, tmp_path)
     assert np.allclose(drive.rotation, turn.as_matrix(), atol=1e-12)
     assert np.allclose(drive.heading_rad, [YAW + 0.4, np.nan], equal_nan=True)
-    assert np.allclose(drive.scene(0).size_m[1], [2.0, 1.5, 4.0])  # upright, length along z
+    assert np.allclose(drive.scene(0).size_m[1], [2.0, 1.5, 4.0])  # the box stands upright: its length is along z
 
 
 def test_custom_source_accepts_nanosecond_frames(tmp_path):
-    tables, start = street(), 1_532_402_927_612_460_001
+    tables, start = make_street(), 1_532_402_927_612_460_001
     for row in [*tables["boxes"], *tables["poses"]]:
         row |= {"frame": start + row["frame"]} if "frame" in row else {}
     for parquet in (False, True):
-        drive = written(tables, tmp_path / str(parquet), parquet=parquet)
+        drive = write_and_read_drive(tables, tmp_path / str(parquet), parquet=parquet)
         assert drive.frame.tolist() == [start + 10, start + 20]
         assert drive.scene(1).scene_id == f"own-street-{start + 20}" and len(drive.scene(1)) == 6
 
 
 def test_custom_source_text_ids_are_deterministic(tmp_path):
-    tables = street()
+    tables = make_street()
     for row in tables["boxes"]:
         row["instance_id"] = "ab12"
     tables["boxes"][0]["instance_id"] = None
     expected = int.from_bytes(hashlib.blake2b(b"ab12", digest_size=8).digest(), "big") >> 1
-    assert written(tables, tmp_path).instance_id.tolist() == [-1] + [expected] * 6
+    assert write_and_read_drive(tables, tmp_path).instance_id.tolist() == [-1] + [expected] * 6
 
 
 # ------------------------------------------------------------------------------------------------------ ground
 
 
-def pixels(pose: Pose, grid: Grid) -> np.ndarray:
-    """(H, W, 3) world points of the pixel centres."""
+def compute_pixel_centers(pose: Pose, grid: Grid) -> np.ndarray:
+    """Return the world points (H, W, 3) of the pixel centres."""
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     return pose.to_world(np.stack([x, y, np.zeros_like(x)], axis=-1))
 
 
-def star(rng: np.random.Generator, points: int) -> list[tuple[float, float]]:
-    """A simple, mostly non-convex polygon, partly outside the crop."""
+def draw_polygon(rng: np.random.Generator, points: int) -> list[tuple[float, float]]:
+    """Return a random simple polygon, mostly non-convex and partly outside the crop."""
     angle = (np.arange(points) + rng.uniform(0, 0.9, points)) * 2 * np.pi / points
     radius = rng.uniform(3, 40, points)
     x, y = rng.uniform([5, -25], [60, 25])
@@ -260,10 +271,12 @@ SPIRAL = [
 @pytest.mark.parametrize("shape", ["comb", "spiral", *range(8)])
 def test_custom_source_ground_covers_pixel_centers_in_outline(tmp_path, shape):
     rng = np.random.default_rng([3, shape if isinstance(shape, int) else 99])
-    xy = {"comb": COMB, "spiral": SPIRAL}.get(shape) or star(rng, int(rng.integers(3, 40)))
-    points = np.array(outline(*xy))
+    xy = {"comb": COMB, "spiral": SPIRAL}.get(shape) or draw_polygon(rng, int(rng.integers(3, 40)))
+    points = np.array(make_outline(*xy))
     points[:, 2] = ORIGIN[2] + 0.02 * (points[:, 0] - ORIGIN[0]) - 0.03 * (points[:, 1] - ORIGIN[1])
-    drive = written(street() | {"polygons": [{"class": "terrain", "outline": points.tolist()}]}, tmp_path)
+    drive = write_and_read_drive(
+        make_street() | {"polygons": [{"class": "terrain", "outline": points.tolist()}]}, tmp_path
+    )
     triangles = drive.ground.triangles_m
     polygon = shapely.Polygon(points[:, :2] - ORIGIN[:2])
     assert len(triangles) == len(xy) - 2
@@ -271,7 +284,7 @@ def test_custom_source_ground_covers_pixel_centers_in_outline(tmp_path, shape):
 
     pose, grid = drive.pose(1), Grid()
     height, occupied = drive.ground.rasterise(pose, grid, 1)
-    at = pixels(pose, grid) - ORIGIN
+    at = compute_pixel_centers(pose, grid) - ORIGIN
     inside = shapely.contains_xy(polygon, at[..., 0], at[..., 1])
     on_edge = shapely.distance(polygon.boundary, shapely.points(at[..., :2])) < 1e-6
     assert inside.any() and np.array_equal(occupied[0] & ~on_edge, inside & ~on_edge)
@@ -280,17 +293,19 @@ def test_custom_source_ground_covers_pixel_centers_in_outline(tmp_path, shape):
 
 
 def test_custom_source_abutting_polygons_leave_no_gap(tmp_path):
-    """A 50 m square of hilly ground, cut by zigzag lines into strips."""
+    """Zigzag lines cut a hilly square of 50 m into strips."""
     rng = np.random.default_rng(5)
     along = np.linspace(5, 55, 12)
     cuts = [np.full(12, -25.0), *[y + rng.uniform(-3, 3, 12) for y in (-15, -5, 5, 15)], np.full(12, 25.0)]
     z = [rng.uniform(-1, 1, 12) for _ in cuts]
-    lines = [[ahead(*p).tolist() for p in zip(along, y, h, strict=True)] for y, h in zip(cuts, z, strict=True)]
+    lines = [
+        [transform_to_world(*p).tolist() for p in zip(along, y, h, strict=True)] for y, h in zip(cuts, z, strict=True)
+    ]
     polygons = [
         {"class": ("road", "sidewalk")[k % 2], "outline": [*low, *high[::-1]]}
         for k, (low, high) in enumerate(zip(lines[:-1], lines[1:], strict=True))
     ]
-    drive = written(street() | {"polygons": polygons}, tmp_path)
+    drive = write_and_read_drive(make_street() | {"polygons": polygons}, tmp_path)
     height, occupied = drive.ground.rasterise(drive.pose(0), Grid(), 2)
     x, y = np.meshgrid(Grid().x_m(), Grid().y_m(), indexing="ij")
     square = (x > 5) & (x < 55) & (abs(y) < 25)
@@ -300,7 +315,7 @@ def test_custom_source_abutting_polygons_leave_no_gap(tmp_path):
         for t in drive.ground.triangles_m.tolist()
         for e in zip(map(tuple, t), map(tuple, t[1:] + t[:1]), strict=True)
     }
-    for line in lines:  # both surfaces are linear between the points of their common line
+    for line in lines:  # the surfaces on both sides of a line share the edges of the line
         assert all(tuple(sorted((tuple(a), tuple(b)))) in edges for a, b in zip(line[:-1], line[1:], strict=True))
     seam = occupied[0][:, :-1] & occupied[1][:, 1:]
     step = np.abs(height[0][:, :-1] - height[1][:, 1:])[seam]
@@ -308,20 +323,20 @@ def test_custom_source_abutting_polygons_leave_no_gap(tmp_path):
 
 
 def test_custom_source_keeps_height_of_points_on_edge(tmp_path):
-    """A crest across a straight road with three points on each side."""
+    """The outline of a straight road with a crest has three points on each side."""
     side = [(10, 4, 0), (30, 4, 2), (50, 4, 0)]
-    points = [ahead(x, y, z).tolist() for x, y, z in [*side, *[(x, -y, z) for x, y, z in side[::-1]]]]
-    drive = written(street() | {"polygons": [{"class": "road", "outline": points}]}, tmp_path)
+    points = [transform_to_world(x, y, z).tolist() for x, y, z in [*side, *[(x, -y, z) for x, y, z in side[::-1]]]]
+    drive = write_and_read_drive(make_street() | {"polygons": [{"class": "road", "outline": points}]}, tmp_path)
     height, occupied = drive.ground.rasterise(drive.pose(0), Grid(), 1)
     expected = 2 - np.abs(Grid().x_m()[:, None] - 30) / 10
     assert occupied[0].sum() == 160 * 32 and np.abs(height[0] - expected)[occupied[0]].max() < 1e-4
 
 
 def test_custom_source_polygon_larger_than_crop_fills_it(tmp_path):
-    """None of its points lies in the crop; of a second polygon, only a few do."""
+    """One polygon has no point in the crop, and a second polygon has only a few."""
     huge = [[*(ORIGIN[:2] + 2000 * np.array(d)), 113.0] for d in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    polygons = [{"class": "terrain", "outline": huge}, street()["polygons"][0]]
-    drive = written(street() | {"polygons": polygons}, tmp_path)
+    polygons = [{"class": "terrain", "outline": huge}, make_street()["polygons"][0]]
+    drive = write_and_read_drive(make_street() | {"polygons": polygons}, tmp_path)
     scene = drive.scene(0)
     assert scene.ground_classes == ("road", "terrain") and scene.occupied[1].all()
     assert np.allclose(scene.height_m[1], -2, atol=1e-4)
@@ -329,19 +344,23 @@ def test_custom_source_polygon_larger_than_crop_fills_it(tmp_path):
 
 
 def test_custom_source_uses_upper_surface_of_class(tmp_path):
-    bridge = {"class": "road", "outline": outline((20, -20), (30, -20), (30, 20), (20, 20), z=5.0)}
-    scene = written(street() | {"polygons": [street()["polygons"][0], bridge]}, tmp_path).scene(0)
+    bridge = {"class": "road", "outline": make_outline((20, -20), (30, -20), (30, 20), (20, 20), z=5.0)}
+    scene = write_and_read_drive(make_street() | {"polygons": [make_street()["polygons"][0], bridge]}, tmp_path).scene(
+        0
+    )
     on = (Grid().x_m() > 20) & (Grid().x_m() < 30)
     assert np.allclose(scene.height_m[0, on, 128], 5.0, atol=1e-4)
     assert np.allclose(scene.height_m[0, ~on, 128], -1.0, atol=1e-4)
 
 
 def test_custom_source_drive_at_some_poses_has_same_scenes(tmp_path):
-    tables = street()
-    tables["poses"] = [{"frame": k, "yaw_rad": YAW + 0.1 * k} | place(ahead(15 * k, 0)) for k in range(8)]
+    tables = make_street()
+    tables["poses"] = [
+        {"frame": k, "yaw_rad": YAW + 0.1 * k} | make_position(transform_to_world(15 * k, 0)) for k in range(8)
+    ]
     for row in tables["boxes"]:
         row |= {"frame": 5} if "frame" in row else {}
-    drive = written(tables, tmp_path)
+    drive = write_and_read_drive(tables, tmp_path)
     for chosen in ([0], [5, 7]):
         for k, pose in enumerate(chosen):
             a, b = drive.scene(pose), drive.at(np.array(chosen)).scene(k)
@@ -349,11 +368,14 @@ def test_custom_source_drive_at_some_poses_has_same_scenes(tmp_path):
             assert np.array_equal(a.height_m, b.height_m) and np.array_equal(a.occupied, b.occupied)
 
 
-# ------------------------------------------------------------------------------------------- another source's drive
+# ------------------------------------------------------------------------------------------- a drive of another source
 
 
-def exported(drive: Drive) -> Tables:
-    """A town in the custom format: quaternions, matrices with y left and z up, slab tops as polygons."""
+def convert_drive(drive: Drive) -> Tables:
+    """Convert a town to the custom format.
+
+    The result has quaternions, pose matrices with y left and z up, and the tops of ground slabs as polygons.
+    """
     quaternion = Rotation.from_matrix(drive.rotation).as_quat(scalar_first=True)
     columns = {
         "category": [CATEGORIES[c] for c in drive.category],
@@ -383,7 +405,7 @@ def exported(drive: Drive) -> Tables:
 
 def test_custom_source_round_trips_town(tmp_path):
     town = generate_town(3)
-    mine = written(exported(town), tmp_path, parquet=True)
+    mine = write_and_read_drive(convert_drive(town), tmp_path, parquet=True)
     assert len(mine) == len(town) and (town.timestamp != STATIC).sum() > 10
     seen_moving = 0
     for k in range(0, len(town), 30):
@@ -394,37 +416,37 @@ def test_custom_source_round_trips_town(tmp_path):
             assert np.allclose(getattr(a, name), getattr(b, name), atol=1e-4), name
         assert np.array_equal(np.isnan(a.heading_rad), np.isnan(b.heading_rad))
         turned = (a.heading_rad - b.heading_rad + np.pi) % (2 * np.pi) - np.pi
-        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # boxes of the town lean with the slope
+        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # boxes of the town are tilted with the slope
         assert np.isclose(a.world_yaw_rad, b.world_yaw_rad) and np.allclose(a.world_xyz_m, b.world_xyz_m)
         seen_moving += int(np.isin(town.timestamp, town.frame[k]).sum())
         common = [a.ground_classes.index(name) for name in b.ground_classes]
-        assert (b.occupied | ~a.occupied[common]).all()  # slabs without a vertex in the crop are left out of a
+        assert (b.occupied | ~a.occupied[common]).all()  # the town drops slabs without a vertex in the crop
         difference = np.abs(a.height_m[common] - b.height_m)[a.occupied[common]]
-        assert difference.max() < 0.05 and np.median(difference) < 0.002  # other triangles between the same points
+        assert difference.max() < 0.05 and np.median(difference) < 0.002  # the triangulations of the same points differ
     assert seen_moving > 3
 
 
 # ----------------------------------------------------------------------------------------------------- document
 
 
-def blocks(language: str) -> list[str]:
+def find_code_blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
 
 
 @pytest.fixture(scope="module")
-def example(tmp_path_factory) -> dict:
-    """The folder that the document's Python code writes, run from top to bottom."""
+def document_variables(tmp_path_factory) -> dict:
+    """Variables after all Python blocks of the document ran in an empty folder."""
     folder = tmp_path_factory.mktemp("example")
     names = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for block in blocks("python"):
+        for block in find_code_blocks("python"):
             exec(block, names)
     return names
 
 
-def test_custom_source_document_example_writes_street(example, capsys):
-    root = example["folder"] / "my_drives"
+def test_custom_source_document_example_writes_street(document_variables, capsys):
+    root = document_variables["folder"] / "my_drives"
     assert list_drives(root) == ["first_street"] and read_splits(root) is None
     assert read_ground_classes(root) == ("road", "sidewalk", "terrain")
     drive = read_drive(root, "first_street")
@@ -436,25 +458,25 @@ def test_custom_source_document_example_writes_street(example, capsys):
         bottom = (scene.center_m - scene.size_m / 2)[:, 2]
         assert np.allclose(bottom, -0.3, atol=1e-5) and np.allclose(scene.height_m[0][scene.occupied[0]], -0.3)
         assert scene.occupied.any(axis=0)[:, 20:200].all()
-    assert (example["folder"] / "first_scene.png").stat().st_size > 500
+    assert (document_variables["folder"] / "first_scene.png").stat().st_size > 500
 
 
-def test_custom_source_document_query_runs(example):
-    drive = read_drive(example["folder"] / "my_drives", "first_street")
-    tables = example["folder"] / "my_scenes"
+def test_custom_source_document_query_runs(document_variables):
+    drive = read_drive(document_variables["folder"] / "my_drives", "first_street")
+    tables = document_variables["folder"] / "my_scenes"
     Shard(str(tables), "own", "train", 0).write([drive.scene(k, "train") for k in range(3)])
     assert [scene.source for scene in read_scenes(str(tables))] == ["own"] * 3
-    (query,) = blocks("sql")
+    (query,) = find_code_blocks("sql")
     found = {row[0]: row[1:] for row in duckdb.sql(query.replace("my_scenes", str(tables))).fetchall()}
     assert set(found) == {"vehicle_small", "vegetation_ellipsoid", "construction_big"}
     assert found["construction_big"][1] == pytest.approx(14)
 
 
-def test_custom_source_document_world_transform_is_right(example):
+def test_custom_source_document_world_transform_is_right(document_variables):
     seen = {"x_m": 20.0, "y_m": -6.0, "z_m": 0.5, "yaw_rad": 3.0}
-    pose = {"frame": 4, "yaw_rad": YAW} | place(ORIGIN)
-    there = example["to_world"](seen, pose)
-    assert np.allclose([there[axis] for axis in ("x_m", "y_m", "z_m")], ahead(20, -6, 0.5))
+    pose = {"frame": 4, "yaw_rad": YAW} | make_position(ORIGIN)
+    there = document_variables["to_world"](seen, pose)
+    assert np.allclose([there[axis] for axis in ("x_m", "y_m", "z_m")], transform_to_world(20, -6, 0.5))
     assert np.isclose(np.cos(there["yaw_rad"]), np.cos(YAW + 3)) and there["frame"] == 4
     assert -np.pi <= there["yaw_rad"] < np.pi
 
@@ -471,14 +493,14 @@ def test_custom_source_document_names_all_columns_and_classes():
     assert len(tables) == 3
 
 
-# ---------------------------------------------------------------------------------------------------- the root
+# ---------------------------------------------------------------------------------------------------- folder of drives
 
 
 def test_custom_source_ground_classes_cover_all_drives(tmp_path):
-    write(street(), tmp_path, "a")
-    crossing = [{"class": "crossing", "outline": outline((5, -4), (9, -4), (9, 4))}]
-    write(street() | {"polygons": crossing}, tmp_path, "b")
-    (tmp_path / "c").mkdir()  # broken: read_drive reports it
+    write_drive(make_street(), tmp_path, "a")
+    crossing = [{"class": "crossing", "outline": make_outline((5, -4), (9, -4), (9, 4))}]
+    write_drive(make_street() | {"polygons": crossing}, tmp_path, "b")
+    (tmp_path / "c").mkdir()  # read_drive reports this empty folder
     (tmp_path / ".cache").mkdir()
     assert list_drives(tmp_path) == ["a", "b", "c"]
     assert read_ground_classes(tmp_path) == ("road", "sidewalk", "crossing")
@@ -489,12 +511,12 @@ def test_custom_source_ground_classes_cover_all_drives(tmp_path):
     with pytest.raises(ValueError, match=r"broken/polygons.parquet and polygons.json are missing"):
         read_ground_classes(tmp_path / ".cache")
     with pytest.raises(ValueError, match="no drive has a ground polygon; add at least the road"):
-        read_ground_classes(write({"polygons": []}, tmp_path / ".bare"))
+        read_ground_classes(write_drive({"polygons": []}, tmp_path / ".bare"))
 
 
-def test_custom_source_splits_are_as_given(tmp_path):
+def test_custom_source_reads_splits_of_file(tmp_path):
     for name in ("a", "b"):
-        write(street(), tmp_path, name)
+        write_drive(make_street(), tmp_path, name)
     assert read_splits(tmp_path) is None
     sides = {"a": "train", "b": "test"}
     (tmp_path / "splits.json").write_text(json.dumps(sides))
@@ -514,7 +536,7 @@ BROKEN_SPLITS = {
 @pytest.mark.parametrize("name", BROKEN_SPLITS)
 def test_custom_source_names_broken_splits(tmp_path, name):
     text, reason = BROKEN_SPLITS[name]
-    write(street(), tmp_path, "a")
+    write_drive(make_street(), tmp_path, "a")
     (tmp_path / "splits.json").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)) as error:
         read_splits(tmp_path)
@@ -524,18 +546,21 @@ def test_custom_source_names_broken_splits(tmp_path, name):
 def test_custom_source_error_states_where_drives_belong(tmp_path):
     with pytest.raises(ValueError, match="holds no folder; --input must name the folder of all drives"):
         list_drives(tmp_path)
-    write(street(), tmp_path, "my street")
+    write_drive(make_street(), tmp_path, "my street")
     with pytest.raises(ValueError, match="rename the folder"):
         list_drives(tmp_path)
     with pytest.raises(ValueError, match=r"no such drive; the drives are b"):
-        read_drive(write(street(), tmp_path / "other", "b"), "a")
+        read_drive(write_drive(make_street(), tmp_path / "other", "b"), "a")
 
 
 # ------------------------------------------------------------------------------------------------------ mistakes
 
 
-def changed(table: str, row: int, **values):
-    """The street with some values of one row replaced; a value of ... removes the key."""
+def change_row(table: str, row: int, **values):
+    """Return a function that replaces values in one row of the street.
+
+    The value `...` removes the key.
+    """
 
     def change(tables: Tables) -> None:
         tables[table][row] |= values
@@ -545,191 +570,202 @@ def changed(table: str, row: int, **values):
     return change
 
 
-def everywhere(table: str, **values):
+def change_all_rows(table: str, **values):
     def change(tables: Tables) -> None:
         for row in range(len(tables[table])):
-            changed(table, row, **values)(tables)
+            change_row(table, row, **values)(tables)
 
     return change
 
 
-def with_outline(*points):
-    return changed("polygons", 1, outline=list(points))
+def replace_outline(*points):
+    return change_row("polygons", 1, outline=list(points))
 
 
-def corner(x: float, y: float, z: float = -1.0) -> list[float]:
-    return ahead(x, y, z).tolist()
+def make_corner(x: float, y: float, z: float = -1.0) -> list[float]:
+    return transform_to_world(x, y, z).tolist()
 
 
 LEVEL = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 115]
 NAN, INF = float("nan"), float("inf")
-# name -> (change of the street, file that the error names, message)
+# name -> (change of the street, file in the error, message)
 MISTAKES = {
     "category": (
-        changed("boxes", 2, category="tree"),
+        change_row("boxes", 2, category="tree"),
         "boxes",
         "category of row 2 is 'tree', expected one of vegetation_cuboid, ",
     ),
-    "category null": (changed("boxes", 2, category=None), "boxes", "category of row 2 is null, expected a text"),
-    "category number": (changed("boxes", 2, category=3), "boxes", "category of row 2 is 3, expected a text"),
-    "no category": (everywhere("boxes", category=...), "boxes", "column category is missing"),
-    "no size": (everywhere("boxes", width_m=...), "boxes", "column width_m is missing"),
+    "category null": (change_row("boxes", 2, category=None), "boxes", "category of row 2 is null, expected a text"),
+    "category number": (change_row("boxes", 2, category=3), "boxes", "category of row 2 is 3, expected a text"),
+    "no category": (change_all_rows("boxes", category=...), "boxes", "column category is missing"),
+    "no size": (change_all_rows("boxes", width_m=...), "boxes", "column width_m is missing"),
     "zero size": (
-        changed("boxes", 1, height_m=0),
+        change_row("boxes", 1, height_m=0),
         "boxes",
         "height_m of row 1 is 0, expected a number of 0.001..1000 m",
     ),
-    "negative size": (changed("boxes", 1, width_m=-2.0), "boxes", "width_m of row 1 is -2.0"),
-    "huge size": (changed("boxes", 1, length_m=5000), "boxes", "length_m of row 1 is 5000"),
-    "nan": (changed("boxes", 3, x_m=NAN), "boxes", "x_m of row 3 is nan"),
-    "inf": (changed("boxes", 3, z_m=-INF), "boxes", "z_m of row 3 is -inf"),
-    "null": (changed("boxes", 3, y_m=None), "boxes", "y_m of row 3 is null"),
-    "absent": (changed("boxes", 3, y_m=...), "boxes", "y_m of row 3 is null"),
-    "text": (changed("boxes", 3, y_m="3"), "boxes", "y_m of row 3 is '3', expected a number"),
-    "true": (changed("boxes", 3, y_m=True), "boxes", "y_m of row 3 is True"),
-    "far": (changed("boxes", 3, x_m=1e8), "boxes", "x_m of row 3 is 100000000.0, expected a number of -1e+07..1e+07 m"),
+    "negative size": (change_row("boxes", 1, width_m=-2.0), "boxes", "width_m of row 1 is -2.0"),
+    "huge size": (change_row("boxes", 1, length_m=5000), "boxes", "length_m of row 1 is 5000"),
+    "nan": (change_row("boxes", 3, x_m=NAN), "boxes", "x_m of row 3 is nan"),
+    "inf": (change_row("boxes", 3, z_m=-INF), "boxes", "z_m of row 3 is -inf"),
+    "null": (change_row("boxes", 3, y_m=None), "boxes", "y_m of row 3 is null"),
+    "absent": (change_row("boxes", 3, y_m=...), "boxes", "y_m of row 3 is null"),
+    "text": (change_row("boxes", 3, y_m="3"), "boxes", "y_m of row 3 is '3', expected a number"),
+    "true": (change_row("boxes", 3, y_m=True), "boxes", "y_m of row 3 is True"),
+    "far": (
+        change_row("boxes", 3, x_m=1e8),
+        "boxes",
+        "x_m of row 3 is 100000000.0, expected a number of -1e+07..1e+07 m",
+    ),
     "high": (
-        changed("boxes", 3, z_m=5e6),
+        change_row("boxes", 3, z_m=5e6),
         "boxes",
         "z_m of row 3 is 5000000.0, expected a number of -10000..10000 m (z up)",
     ),
-    "endless integer": (changed("boxes", 3, x_m=10**4000), "boxes", "x_m of row 3 is an integer of over 40 digits"),
+    "endless integer": (change_row("boxes", 3, x_m=10**4000), "boxes", "x_m of row 3 is an integer of over 40 digits"),
     "degrees": (
-        changed("boxes", 0, yaw_rad=90),
+        change_row("boxes", 0, yaw_rad=90),
         "boxes",
         "yaw_rad of row 0 is 90, expected a number of -6.2832..6.2832 (radians)",
     ),
     "no orientation": (
-        everywhere("boxes", yaw_rad=...),
+        change_all_rows("boxes", yaw_rad=...),
         "boxes",
         "no orientation; give either yaw_rad or qw, qx, qy, qz",
     ),
-    "two orientations": (changed("boxes", 0, qw=1.0), "boxes", "both yaw_rad and a quaternion"),
-    "half a quaternion": (everywhere("boxes", yaw_rad=..., qw=1.0, qz=0.0), "boxes", "column qx is missing"),
+    "two orientations": (change_row("boxes", 0, qw=1.0), "boxes", "both yaw_rad and a quaternion"),
+    "half a quaternion": (change_all_rows("boxes", yaw_rad=..., qw=1.0, qz=0.0), "boxes", "column qx is missing"),
     "quaternion in some rows": (
         lambda tables: [
-            everywhere("boxes", yaw_rad=..., qw=1, qx=0, qy=0, qz=0)(tables),
-            changed("boxes", 5, qy=...)(tables),
+            change_all_rows("boxes", yaw_rad=..., qw=1, qx=0, qy=0, qz=0)(tables),
+            change_row("boxes", 5, qy=...)(tables),
         ],
         "boxes",
         "qy of row 5 is null",
     ),
     "norm": (
-        everywhere("boxes", yaw_rad=..., qw=0.5, qx=0, qy=0, qz=0),
+        change_all_rows("boxes", yaw_rad=..., qw=0.5, qx=0, qy=0, qz=0),
         "boxes",
         "quaternion of row 0 has norm 0.5, expected 1; normalise it",
     ),
     "frame text": (
-        changed("boxes", 4, frame="10"),
+        change_row("boxes", 4, frame="10"),
         "boxes",
         "frame of row 4 is '10', expected a whole number of 0 or more; null means",
     ),
     "frame -1": (
-        changed("boxes", 4, frame=-1),
+        change_row("boxes", 4, frame=-1),
         "boxes",
         "frame of row 4 is -1, expected a whole number of 0 or more; null means that a box is static",
     ),
-    "frame 1.5": (changed("boxes", 4, frame=1.5), "boxes", "frame of row 4 is 1.5"),
-    "frame nan": (changed("boxes", 4, frame=NAN), "boxes", "frame of row 4 is nan"),
-    "frame true": (changed("boxes", 4, frame=True), "boxes", "frame of row 4 is True"),
-    "frame too large": (changed("boxes", 4, frame=2**63), "boxes", "frame of row 4 is 9223372036854775808"),
+    "frame 1.5": (change_row("boxes", 4, frame=1.5), "boxes", "frame of row 4 is 1.5"),
+    "frame nan": (change_row("boxes", 4, frame=NAN), "boxes", "frame of row 4 is nan"),
+    "frame true": (change_row("boxes", 4, frame=True), "boxes", "frame of row 4 is True"),
+    "frame too large": (change_row("boxes", 4, frame=2**63), "boxes", "frame of row 4 is 9223372036854775808"),
     "rounded time": (
-        changed("boxes", 4, frame=1.5e18),
+        change_row("boxes", 4, frame=1.5e18),
         "boxes",
         "frame of row 4 is 1.5e+18, a float that cannot hold all digits",
     ),
     "other frames": (
-        lambda tables: [changed("boxes", row, frame=1000 + row)(tables) for row in (4, 5, 6)],
+        lambda tables: [change_row("boxes", row, frame=1000 + row)(tables) for row in (4, 5, 6)],
         "boxes",
         "the frame of no moving box, such as 1004, is a frame of the poses (10..20)",
     ),
-    "id": (changed("boxes", 4, instance_id=-3), "boxes", "instance_id of row 4 is -3"),
+    "id": (change_row("boxes", 4, instance_id=-3), "boxes", "instance_id of row 4 is -3"),
     "id list": (
-        changed("boxes", 4, instance_id=[1]),
+        change_row("boxes", 4, instance_id=[1]),
         "boxes",
         "instance_id of row 4 is [1], expected a whole number of 0 or more, a text or null",
     ),
-    "label": (changed("boxes", 4, label=4), "boxes", "label of row 4 is 4, expected a text"),
+    "label": (change_row("boxes", 4, label=4), "boxes", "label of row 4 is 4, expected a text"),
     "heading": (
-        changed("boxes", 4, heading_known="yes"),
+        change_row("boxes", 4, heading_known="yes"),
         "boxes",
         "heading_known of row 4 is 'yes', expected true, false or null",
     ),
     "typing error": (
-        changed("boxes", 4, frames=3),
+        change_row("boxes", 4, frames=3),
         "boxes",
         "column 'frames' is unknown (meant frame?); drop it, or rename it to one of category, ",
     ),
     "boxes of elsewhere": (
-        lambda tables: [changed("boxes", row, x_m=row, y_m=0.0)(tables) for row in range(7)],
+        lambda tables: [change_row("boxes", row, x_m=row, y_m=0.0)(tables) for row in range(7)],
         "boxes",
         "lies more than 100 m from every pose",
     ),
     "class": (
-        changed("polygons", 0, **{"class": "grass"}),
+        change_row("polygons", 0, **{"class": "grass"}),
         "polygons",
         "class of row 0 is 'grass', expected one of road, sidewalk, parking, terrain, ground, crossing; map",
     ),
-    "no class": (everywhere("polygons", **{"class": ...}), "polygons", "column class is missing"),
+    "no class": (change_all_rows("polygons", **{"class": ...}), "polygons", "column class is missing"),
     "no outline": (
-        changed("polygons", 1, outline=None),
+        change_row("polygons", 1, outline=None),
         "polygons",
         "outline of row 1 is null, expected a list of points",
     ),
     "wkt": (
-        changed("polygons", 1, outline="POLYGON ((0 0, 1 1, 1 0))"),
+        change_row("polygons", 1, outline="POLYGON ((0 0, 1 1, 1 0))"),
         "polygons",
         "outline of row 1 is 'POLYGON ((0 0, 1 1, 1 0))'",
     ),
     "flat point": (
-        with_outline(corner(0, 0), corner(9, 0)[:2], corner(9, 9)),
+        replace_outline(make_corner(0, 0), make_corner(9, 0)[:2], make_corner(9, 9)),
         "polygons",
         "point 1 of the outline of row 1 is [45",
     ),
-    "no points": (with_outline(), "polygons", "outline of row 1 has 0 distinct points"),
+    "no points": (replace_outline(), "polygons", "outline of row 1 has 0 distinct points"),
     "two points": (
-        with_outline(corner(0, 0), corner(9, 0), corner(0, 0)),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), make_corner(0, 0)),
         "polygons",
         "outline of row 1 has 2 distinct points, expected at least 3",
     ),
-    "one point": (with_outline(*[corner(0, 0)] * 4), "polygons", "outline of row 1 has 0 distinct points"),
+    "one point": (replace_outline(*[make_corner(0, 0)] * 4), "polygons", "outline of row 1 has 0 distinct points"),
     "nan point": (
-        with_outline(corner(0, 0), corner(9, 0), [NAN, 0, 0]),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), [NAN, 0, 0]),
         "polygons",
         "point 2 of the outline of row 1 is [nan, 0, 0], expected [x, y, z]",
     ),
     "text point": (
-        with_outline(corner(0, 0), corner(9, 0), "far"),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), "far"),
         "polygons",
         "point 2 of the outline of row 1 is 'far'",
     ),
     "high point": (
-        with_outline(corner(0, 0), corner(9, 0), corner(9, 9, 2e4)),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), make_corner(9, 9, 2e4)),
         "polygons",
         "point 2 of the outline of row 1 is 20115 m high",
     ),
     "on a line": (
-        with_outline([0, 0, 115], [9, 9, 115], [4, 4, 115]),
+        replace_outline([0, 0, 115], [9, 9, 115], [4, 4, 115]),
         "polygons",
         "outline of row 1 is no simple polygon",
     ),
     "bow tie": (
-        with_outline(corner(0, 0), corner(9, 9), corner(9, 0), corner(0, 9)),
+        replace_outline(make_corner(0, 0), make_corner(9, 9), make_corner(9, 0), make_corner(0, 9)),
         "polygons",
         "outline of row 1 is no simple polygon, Self-intersection[",
     ),
     "touches itself": (
-        with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(4, 4), corner(0, 9), corner(4, 4)),
+        replace_outline(
+            make_corner(0, 0),
+            make_corner(9, 0),
+            make_corner(9, 9),
+            make_corner(4, 4),
+            make_corner(0, 9),
+            make_corner(4, 4),
+        ),
         "polygons",
         "no simple polygon",
     ),
     "cliff": (
-        with_outline(corner(0, 0), corner(9, 0), corner(9, 0, 4), corner(9, 9)),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), make_corner(9, 0, 4), make_corner(9, 9)),
         "polygons",
         "point 1 of the outline of row 1 lies directly above or below the next point",
     ),
     "open cliff": (
-        with_outline(corner(0, 0), corner(9, 0), corner(9, 9), corner(0, 0, 4)),
+        replace_outline(make_corner(0, 0), make_corner(9, 0), make_corner(9, 9), make_corner(0, 0, 4)),
         "polygons",
         "point 3 of the outline of row 1 lies directly above or below",
     ),
@@ -739,30 +775,30 @@ MISTAKES = {
         "lies more than 100 m from every pose; the first pose is",
     ),
     "no pose": (lambda tables: tables["poses"].clear(), "poses", "holds no pose"),
-    "no frame": (everywhere("poses", frame=...), "poses", "column frame is missing"),
+    "no frame": (change_all_rows("poses", frame=...), "poses", "column frame is missing"),
     "null frame": (
-        changed("poses", 1, frame=None),
+        change_row("poses", 1, frame=None),
         "poses",
         "frame of row 1 is null, expected a whole number of 0 or more",
     ),
     "frame twice": (
-        changed("poses", 1, frame=10),
+        change_row("poses", 1, frame=10),
         "poses",
         "frame of row 1 is 10 after 10; sort the poses by frame without repeated frames",
     ),
-    "unsorted": (changed("poses", 1, frame=3), "poses", "frame of row 1 is 3 after 10"),
-    "no place": (everywhere("poses", z_m=...), "poses", "column z_m is missing"),
-    "pose nan": (changed("poses", 1, yaw_rad=NAN), "poses", "yaw_rad of row 1 is nan"),
-    "pose unturned": (everywhere("poses", yaw_rad=...), "poses", "no orientation"),
+    "unsorted": (change_row("poses", 1, frame=3), "poses", "frame of row 1 is 3 after 10"),
+    "no place": (change_all_rows("poses", z_m=...), "poses", "column z_m is missing"),
+    "pose nan": (change_row("poses", 1, yaw_rad=NAN), "poses", "yaw_rad of row 1 is nan"),
+    "pose unturned": (change_all_rows("poses", yaw_rad=...), "poses", "no orientation"),
     "matrix and place": (
-        changed("poses", 1, world_from_ego=LEVEL),
+        change_row("poses", 1, world_from_ego=LEVEL),
         "poses",
         "has world_from_ego and x_m; keep only one form of the pose",
     ),
 }
 
 
-def matrix_of(values) -> list[dict]:
+def make_matrix_poses(values) -> list[dict]:
     return [{"frame": 10, "world_from_ego": values}]
 
 
@@ -793,15 +829,15 @@ def assert_refused(root: Path, file: str, reason: str) -> None:
 @pytest.mark.parametrize("name", MISTAKES)
 def test_custom_source_names_mistake(tmp_path, name):
     change, file, reason = MISTAKES[name]
-    tables = street()
+    tables = make_street()
     change(tables)
-    assert_refused(write(tables, tmp_path), f"{file}.json", reason)
+    assert_refused(write_drive(tables, tmp_path), f"{file}.json", reason)
 
 
 @pytest.mark.parametrize("name", BROKEN_MATRICES)
 def test_custom_source_names_broken_matrix(tmp_path, name):
     values, reason = BROKEN_MATRICES[name]
-    assert_refused(write(street() | {"poses": matrix_of(values)}, tmp_path), "poses.json", reason)
+    assert_refused(write_drive(make_street() | {"poses": make_matrix_poses(values)}, tmp_path), "poses.json", reason)
 
 
 BROKEN_FILES = {
@@ -820,7 +856,7 @@ BROKEN_FILES = {
 @pytest.mark.parametrize("name", BROKEN_FILES)
 def test_custom_source_names_broken_file(tmp_path, name):
     file, content, reason = BROKEN_FILES[name]
-    write(street(), tmp_path)
+    write_drive(make_street(), tmp_path)
     (tmp_path / "street" / "boxes.json").unlink()
     (tmp_path / "street" / file).write_bytes(content)
     assert_refused(tmp_path, file, reason)
@@ -828,8 +864,8 @@ def test_custom_source_names_broken_file(tmp_path, name):
 
 @pytest.mark.parametrize("table", ["boxes", "polygons", "poses"])
 def test_custom_source_names_missing_and_surplus_table(tmp_path, table):
-    folder = write(street(), tmp_path) / "street"
-    write({table: street()[table]}, tmp_path, parquet=True)
+    folder = write_drive(make_street(), tmp_path) / "street"
+    write_drive({table: make_street()[table]}, tmp_path, parquet=True)
     assert_refused(tmp_path, f"{table}.parquet", f"{table}.json both exist; keep one of the two")
     (folder / f"{table}.json").unlink()
     (folder / f"{table}.parquet").unlink()
@@ -849,7 +885,7 @@ BROKEN_COLUMNS = {
 @pytest.mark.parametrize("name", BROKEN_COLUMNS)
 def test_custom_source_names_parquet_column_of_wrong_type(tmp_path, name):
     columns, reason = BROKEN_COLUMNS[name]
-    root = write(street(), tmp_path, parquet=True)
+    root = write_drive(make_street(), tmp_path, parquet=True)
     path = root / "street" / "boxes.parquet"
     table = pq.read_table(path)
     for column, values in columns.items():
@@ -859,15 +895,15 @@ def test_custom_source_names_parquet_column_of_wrong_type(tmp_path, name):
 
 
 def test_custom_source_rejects_duplicate_column(tmp_path):
-    path = write(street(), tmp_path, parquet=True) / "street" / "boxes.parquet"
+    path = write_drive(make_street(), tmp_path, parquet=True) / "street" / "boxes.parquet"
     table = pq.read_table(path)
     pq.write_table(table.append_column("x_m", table["y_m"]), path)
     assert_refused(tmp_path, "boxes.parquet", "column 'x_m' occurs twice")
 
 
 def test_custom_source_reads_any_number_width_and_dictionaries(tmp_path):
-    a = written(street(), tmp_path / "a")
-    path = write(street(), tmp_path / "b", parquet=True) / "street" / "boxes.parquet"
+    a = write_and_read_drive(make_street(), tmp_path / "a")
+    path = write_drive(make_street(), tmp_path / "b", parquet=True) / "street" / "boxes.parquet"
     table = pq.read_table(path)
     for name, kind in (
         ("category", pa.dictionary(pa.int8(), pa.string())),
@@ -884,7 +920,7 @@ def test_custom_source_reads_any_number_width_and_dictionaries(tmp_path):
 
 def test_custom_source_raises_only_named_errors_for_mutations(tmp_path):
     rng = np.random.default_rng(0)
-    folder = write(street(), tmp_path, parquet=True) / "street"
+    folder = write_drive(make_street(), tmp_path, parquet=True) / "street"
     paths, refused = sorted(folder.iterdir()), 0
     for k in range(150):
         path = paths[k % len(paths)]
@@ -905,6 +941,6 @@ def test_custom_source_raises_only_named_errors_for_mutations(tmp_path):
 
 
 def test_custom_source_reads_poses_alone(tmp_path):
-    write({"poses": street()["poses"]}, tmp_path)
+    write_drive({"poses": make_street()["poses"]}, tmp_path)
     frame, world_from_ego = read_poses(tmp_path, "street")
     assert frame.tolist() == [10, 20] and np.allclose(world_from_ego[0, :, 3], ORIGIN)
