@@ -50,14 +50,14 @@ SCHEMAS = {
     "edits": EDITS,
     "latents": make_latents_schema((4, 8, 8)),
 }
-SETUP, COLUMNS = "Questions", "On disk"  # headings whose SQL block is no query
+SETUP, COLUMNS = "Questions", "On disk"  # headings of SQL blocks that answer no question
 
 
-# ------------------------------------------------------------------------------------------- what the page says
+# ------------------------------------------------------------------------------------------- content of the page
 
 
-def column_list(schema: pa.Schema) -> str:
-    """A schema as a Markdown table, with the types that DuckDB shows."""
+def render_column_list(schema: pa.Schema) -> str:
+    """Return a schema as a Markdown table with the types of DuckDB."""
     with tempfile.TemporaryDirectory() as folder:
         storage.write_parquet(schema.empty_table(), f"{folder}/x.parquet")
         types = {name: kind for name, kind, *_ in duckdb.sql(f"describe from '{folder}/x.parquet'").fetchall()}
@@ -67,21 +67,21 @@ def column_list(schema: pa.Schema) -> str:
     return "\n".join([textwrap.fill(schema.metadata[b"pritti_description"].decode(), 120), "", *rows])
 
 
-def category_list() -> str:
-    """The categories as a Markdown table, with the classes of each source."""
+def render_category_list() -> str:
+    """Return the categories as a Markdown table with the classes of each source."""
     rows = ["| category | holds | kitti360 | av2 |", "|---|---|---|---|"]
     for name, meaning in CATEGORY_MEANING.items():
-        # A label of vegetation becomes an ellipsoid where its mesh is a sphere.
+        # A vegetation label with a spherical mesh becomes an ellipsoid.
         theirs = kitti360.CATEGORY_LABELS.get(name) or kitti360.CATEGORY_LABELS["vegetation_cuboid"]
         others = argoverse2.CATEGORY_LABELS.get(name, ())
         rows.append(f"| {name} | {meaning} | {', '.join(theirs)} | {', '.join(others)} |")
     return "\n".join(rows)
 
 
-def with_lists(page: str) -> str:
-    """The page with its generated lists."""
-    blocks = {f"columns {name}": column_list(schema) for name, schema in SCHEMAS.items()}
-    for name, block in (blocks | {"categories": category_list()}).items():
+def update_lists(page: str) -> str:
+    """Return the page with current lists of columns and categories."""
+    blocks = {f"columns {name}": render_column_list(schema) for name, schema in SCHEMAS.items()}
+    for name, block in (blocks | {"categories": render_category_list()}).items():
         start, end = f"<!-- {name} -->\n", "<!-- end -->"
         assert page.count(start) == 1, name
         before, after = page.split(start)
@@ -89,8 +89,8 @@ def with_lists(page: str) -> str:
     return page
 
 
-def blocks(language: str) -> list[tuple[str, str]]:
-    """(heading, code) of every block of a language, in order."""
+def find_code_blocks(language: str) -> list[tuple[str, str]]:
+    """Return (heading, code) of each code block of a language, in the order of the page."""
     found, heading, page = [], "", PAGE.read_text()
     for match in re.finditer(rf"^#+ ([^\n]+)$|^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
         heading = match[1] or heading
@@ -98,14 +98,14 @@ def blocks(language: str) -> list[tuple[str, str]]:
     return found
 
 
-QUESTIONS = [heading for heading, _ in blocks("sql") if heading not in (SETUP, COLUMNS)]
+QUESTIONS = [heading for heading, _ in find_code_blocks("sql") if heading not in (SETUP, COLUMNS)]
 
 
 # -------------------------------------------------------------------------------------------------- a small town
 
 
-def labelled(scenes: list[Scene]) -> list[Scene]:
-    """The scenes with the labels that their training split determines."""
+def label_scenes_of_town(scenes: list[Scene]) -> list[Scene]:
+    """Return the scenes with density labels from the thresholds of their training split."""
     labels = {}
     for name, group in (("vegetation_density", VEGETATION), ("vehicle_density", VEHICLES)):
         count = np.array([np.isin(s.category, group).sum() for s in scenes])
@@ -117,8 +117,11 @@ def labelled(scenes: list[Scene]) -> list[Scene]:
     return [replace(s, **{name: labels[name][k] for name in labels}) for k, s in enumerate(scenes)]
 
 
-def invented(scene: Scene, index: int) -> Scene:
-    """A stand-in for a generated scene: a third of the primitives of a real one, a little smaller."""
+def make_generated_scene(scene: Scene, index: int) -> Scene:
+    """Return a substitute for a generated scene.
+
+    The scene has a third of the primitives of a real scene, at 0.8 times their size.
+    """
     some = scene.select(np.arange(index % 3, len(scene), 3))
     return replace(
         some,
@@ -141,15 +144,18 @@ def invented(scene: Scene, index: int) -> Scene:
 
 @pytest.fixture(scope="module")
 def town() -> list[Scene]:
-    """Two drives: the first has training and then test scenes, the second training scenes only."""
+    """Scenes of two drives.
+
+    The first drive has training and test scenes; the second drive has only training scenes.
+    """
     drives = [generate_town(seed) for seed in (0, 1)]
     plan = [(0, k, "train" if k < 10 else "test") for k in range(16)] + [(1, k, "train") for k in range(8)]
-    return labelled([drives[d].scene(k, split) for d, k, split in plan])
+    return label_scenes_of_town([drives[d].scene(k, split) for d, k, split in plan])
 
 
 @pytest.fixture(scope="module")
-def fake(town) -> list[Scene]:
-    return [invented(scene, k) for k, scene in enumerate(town[::4])]
+def generated(town) -> list[Scene]:
+    return [make_generated_scene(scene, k) for k, scene in enumerate(town[::4])]
 
 
 @pytest.fixture(scope="module")
@@ -159,14 +165,14 @@ def rejects() -> list[dict]:
 
 
 @pytest.fixture(scope="module")
-def root(town, fake, rejects, tmp_path_factory) -> Path:
-    """`DIR` and `GENERATED` of the page: folders real and generated."""
+def root(town, generated, rejects, tmp_path_factory) -> Path:
+    """Folder with `real` and `generated`, which replace `DIR` and `GENERATED` of the page."""
     path = tmp_path_factory.mktemp("tables")
     for split in ("train", "test"):
         for number, sequence in enumerate(sorted({s.sequence for s in town if s.split == split})):
             members = [s for s in town if (s.split, s.sequence) == (split, sequence)]
             Shard(f"{path}/real", "town", split, number).write(members)
-    Shard(f"{path}/generated", "generated-docs", "generated", 0).write(fake)
+    Shard(f"{path}/generated", "generated-docs", "generated", 0).write(generated)
     shard = Shard(f"{path}/real", "town", "train", 0)
     storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
     _, changes = edit_shard(town[0], EditRequest((Remove(Select(where="length_m > 3")),), "", "docs"))
@@ -177,23 +183,23 @@ def root(town, fake, rejects, tmp_path_factory) -> Path:
     return path
 
 
-def in_place(code: str, root: Path) -> str:
+def replace_folders(code: str, root: Path) -> str:
     return code.replace("GENERATED", f"{root}/generated").replace("DIR", f"{root}/real")
 
 
 @pytest.fixture(scope="module")
 def answers(root) -> dict[str, pd.DataFrame]:
-    """The result of DuckDB for each SQL block, by heading."""
+    """Result of DuckDB for each SQL block, by heading."""
     connection = duckdb.connect()
     found = {}
-    for heading, sql in blocks("sql"):
-        found[heading] = connection.execute(in_place(sql, root)).df()
+    for heading, sql in find_code_blocks("sql"):
+        found[heading] = connection.execute(replace_folders(sql, root)).df()
     return found
 
 
 def test_tables_page_lists_equal_schemas():
     page = PAGE.read_text()
-    assert page == with_lists(page), "run python tests/unit/test_tables_docs.py"
+    assert page == update_lists(page), "run python tests/unit/test_tables_docs.py"
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -202,67 +208,69 @@ def test_tables_page_queries_return_rows(answers, question):
     assert len(answer) and not answer.isna().all().any()
 
 
-# ---------------------------------------------------------------------------------------------- right answers
+# ---------------------------------------------------------------------------------------------- query results
 
 
-def asked(answers: dict[str, pd.DataFrame], words: str, *index: str) -> pd.DataFrame:
-    """The result of the one question with these words, indexed by these columns."""
+def select_answer(answers: dict[str, pd.DataFrame], words: str, *index: str) -> pd.DataFrame:
+    """Return the result of the question that contains `words`, indexed by the columns `index`."""
     (question,) = [q for q in QUESTIONS if words in q]
     return answers[question].set_index(list(index)).sort_index()
 
 
-def drives_of(scenes: list[Scene]) -> dict[str, list[Scene]]:
-    """sequence -> its scenes, in driving order."""
+def group_by_drive(scenes: list[Scene]) -> dict[str, list[Scene]]:
+    """Group scenes by sequence, in driving order."""
     ordered = sorted(scenes, key=lambda s: (s.sequence, s.frame))
     return {name: [s for s in ordered if s.sequence == name] for name in sorted({s.sequence for s in scenes})}
 
 
-def steps_m(drive: list[Scene]) -> np.ndarray:
+def compute_steps_m(drive: list[Scene]) -> np.ndarray:
     return np.linalg.norm(np.diff([s.world_xyz_m[:2] for s in drive], axis=0), axis=1)
 
 
-def world_m(scene: Scene) -> np.ndarray:
-    """(n, 3) centres in the world."""
+def compute_world_m(scene: Scene) -> np.ndarray:
+    """Return the centres (n, 3) of the primitives in the world frame (m)."""
     return scene.center_m.astype(float) @ make_yaw_rotation(scene.world_yaw_rad).T + scene.world_xyz_m
 
 
-def of(scene: Scene, *names: str) -> np.ndarray:
-    """(n,) bool: primitives of these categories."""
+def select_categories(scene: Scene, *names: str) -> np.ndarray:
+    """Return a mask (n,) of the primitives in the named categories."""
     return np.isin(scene.category, [CATEGORIES.index(name) for name in names])
 
 
 def test_tables_page_trees_per_kilometer(answers, town):
-    answer = asked(answers, "How many trees", "sequence")
-    for sequence, drive in drives_of(town).items():
+    answer = select_answer(answers, "How many trees", "sequence")
+    for sequence, drive in group_by_drive(town).items():
         trees = {i for s in drive for i in s.instance_id[np.isin(s.category, VEGETATION) & (s.size_m[:, 2] >= 3)]}
-        km = (np.minimum(steps_m(drive), 64).sum() + 64) / 1000
+        km = (np.minimum(compute_steps_m(drive), 64).sum() + 64) / 1000
         assert answer.trees[sequence] == len(trees) > 20
         assert abs(answer.trees_per_km[sequence] - len(trees) / km) <= 0.5
     assert len(answer) == 2
 
 
-def test_tables_page_ground_shares(answers, town, fake):
-    answer = asked(answers, "Which ground classes", "source", "vehicle_density")
+def test_tables_page_ground_shares(answers, town, generated):
+    answer = select_answer(answers, "Which ground classes", "source", "vehicle_density")
     for label in {s.vehicle_density for s in town}:
         share = np.mean([s.ground_area_m2() for s in town if s.vehicle_density == label], axis=0) / 64**2
         for name, expected in zip(town[0].ground_classes, share, strict=True):
             if name != "ground":
                 assert abs(answer[f"{name}_percent"]["town", label] - 100 * expected) <= 0.051
-    assert answer.scenes.sum() == len(town) + len(fake)
+    assert answer.scenes.sum() == len(town) + len(generated)
 
 
 def test_tables_page_cluttered_sidewalks(answers, town):
-    answer = asked(answers, "How cluttered", "sequence")
-    for sequence, drive in drives_of(town).items():
-        things = sum(of(s, "pole", "traffic_control", "object").sum() for s in drive)
+    answer = select_answer(answers, "How cluttered", "sequence")
+    for sequence, drive in group_by_drive(town).items():
+        things = sum(select_categories(s, "pole", "traffic_control", "object").sum() for s in drive)
         sidewalk_m2 = sum(s.ground_area_m2()[1] for s in drive)
         assert abs(answer.objects_per_1000_m2[sequence] - 1000 * things / sidewalk_m2) <= 0.051
 
 
 def test_tables_page_pole_heights(answers, town):
-    answer = asked(answers, "How high are poles", "label")
+    answer = select_answer(answers, "How high are poles", "label")
     heights = {
-        (s.label[k], s.sequence, s.instance_id[k]): s.size_m[k, 2] for s in town for k in np.flatnonzero(of(s, "pole"))
+        (s.label[k], s.sequence, s.instance_id[k]): s.size_m[k, 2]
+        for s in town
+        for k in np.flatnonzero(select_categories(s, "pole"))
     }
     for label in {key[0] for key in heights}:
         values = [height for key, height in heights.items() if key[0] == label]
@@ -272,9 +280,9 @@ def test_tables_page_pole_heights(answers, town):
 
 
 def test_tables_page_drive_lengths(answers, town):
-    answer = asked(answers, "How long are the drives", "sequence")
-    for sequence, drive in drives_of(town).items():
-        steps = steps_m(drive)
+    answer = select_answer(answers, "How long are the drives", "sequence")
+    for sequence, drive in group_by_drive(town).items():
+        steps = compute_steps_m(drive)
         expected = len(drive), steps.sum().round(), np.median(steps), steps.max()
         columns = ["scenes", "length_m", "step_p50_m", "longest_gap_m"]
         assert np.allclose(answer.loc[sequence, columns].astype(float), expected, atol=0.006)
@@ -282,16 +290,16 @@ def test_tables_page_drive_lengths(answers, town):
 
 def test_tables_page_parked_cars(answers, town):
     lateral_m = []
-    for drive in drives_of(town).values():
+    for drive in group_by_drive(town).values():
         seen: dict[int, list[tuple]] = {}
         for s in drive:
-            for k in np.flatnonzero(of(s, "vehicle_small")):
-                seen.setdefault(s.instance_id[k], []).append((*s.center_m[k, :2], *world_m(s)[k, :2]))
+            for k in np.flatnonzero(select_categories(s, "vehicle_small")):
+                seen.setdefault(s.instance_id[k], []).append((*s.center_m[k, :2], *compute_world_m(s)[k, :2]))
         for rows in map(np.array, seen.values()):
             if len(rows) > 1 and (np.ptp(rows[:, 2:], axis=0) < 0.5).all() and rows[:, 0].min() < 15:
                 lateral_m.append(rows[rows[:, 0].argmin(), 1])
     lateral_m = np.array(lateral_m)
-    answer = asked(answers, "parked cars", "side")
+    answer = select_answer(answers, "parked cars", "side")
     for side, sign in (("left", 1), ("right", -1)):
         offset_m = lateral_m[(lateral_m * sign > 0) & (np.abs(lateral_m) < 15)] * sign
         assert answer.cars[side] == len(offset_m) > 3
@@ -301,50 +309,50 @@ def test_tables_page_parked_cars(answers, town):
 
 def test_tables_page_objects_seen_again(answers, town):
     seen_again, moved, mistaken = Counter(), Counter(), Counter()
-    for drive in drives_of(town).values():
+    for drive in group_by_drive(town).values():
         for a, b in zip(drive, drive[1:], strict=False):
             same_object = (a.instance_id[:, None] == b.instance_id) & (a.label[:, None] == b.label)
             same_object &= a.category[:, None] == b.category
-            same_place = (np.abs(world_m(a)[:, None] - world_m(b)) < 0.1).all(axis=2)
+            same_place = (np.abs(compute_world_m(a)[:, None] - compute_world_m(b)) < 0.1).all(axis=2)
             same_place &= a.category[:, None] == b.category
             seen_again.update(a.category[np.nonzero(same_object)[0]].tolist())
             moved.update(a.category[np.nonzero(same_object & ~same_place)[0]].tolist())
             mistaken.update(a.category[np.nonzero(same_place & ~same_object)[0]].tolist())
-    answer = asked(answers, "visible from the next", "category")
+    answer = select_answer(answers, "visible from the next", "category")
     for k, name in enumerate(CATEGORIES):
         if name in answer.index:
             assert answer.loc[name].tolist() == [seen_again[k], moved[k], mistaken[k]]
     assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
 
 
-def test_tables_page_scene_contents(answers, town, fake):
-    answer = asked(answers, "What is in a scene", "source", "category")
+def test_tables_page_scene_contents(answers, town, generated):
+    answer = select_answer(answers, "What is in a scene", "source", "category")
     assert np.isclose(answer.per_scene["town"].sum(), np.mean([len(s) for s in town]), atol=0.06)
-    for source, scenes in (("town", town), ("generated-docs", fake)):
-        sizes = np.concatenate([s.size_m[of(s, "vehicle_small")] for s in scenes])
+    for source, scenes in (("town", town), ("generated-docs", generated)):
+        sizes = np.concatenate([s.size_m[select_categories(s, "vehicle_small")] for s in scenes])
         row = answer.loc[source, "vehicle_small"].astype(float)
         assert np.allclose(row, [len(sizes) / len(scenes), *np.median(sizes, axis=0)], atol=0.006)
 
 
-def test_tables_page_generated_next_to_real(answers, town, fake):
-    answer = asked(answers, "Do generated scenes", "category")
+def test_tables_page_generated_next_to_real(answers, town, generated):
+    answer = select_answer(answers, "Do generated scenes", "category")
     for name in answer.index:
-        for side, scenes in (("real", town), ("generated", fake)):
-            heights = np.concatenate([s.size_m[of(s, name), 2] for s in scenes])
+        for side, scenes in (("real", town), ("generated", generated)):
+            heights = np.concatenate([s.size_m[select_categories(s, name), 2] for s in scenes])
             assert np.isclose(answer[f"{side}_per_scene"][name], len(heights) / len(scenes), atol=0.006)
             if len(heights):
                 assert np.isclose(answer[f"{side}_height_m"][name], np.median(heights), atol=0.006)
 
 
 def test_tables_page_label_combinations(answers, town):
-    answer = asked(answers, "density labels", "source", "split", "vegetation_density", "vehicle_density")
+    answer = select_answer(answers, "density labels", "source", "split", "vegetation_density", "vehicle_density")
     training = Counter((s.vegetation_density, s.vehicle_density) for s in town if s.split == "train")
     assert {key[2:]: n for key, n in answer.scenes.items() if key[1] == "train"} == training
     assert np.isclose(answer.percent["town", "train"].sum(), 100, atol=0.5)
 
 
 def test_tables_page_nearest_training_pose(answers, town):
-    answer = asked(answers, "How close are test scenes", "sequence")
+    answer = select_answer(answers, "How close are test scenes", "sequence")
     place = {split: [s.world_xyz_m[:2] for s in town[:16] if s.split == split] for split in ("train", "test")}
     nearest_m = np.linalg.norm(np.array(place["test"])[:, None] - np.array(place["train"]), axis=2).min()
     assert answer.loc[town[0].sequence, ["test_scenes", "nearest_m"]].tolist() == pytest.approx(
@@ -354,7 +362,7 @@ def test_tables_page_nearest_training_pose(answers, town):
 
 
 def test_tables_page_reject_reasons(answers, rejects):
-    answer = asked(answers, "Which scenes were left out", "reason")
+    answer = select_answer(answers, "Which scenes were left out", "reason")
     assert answer.scenes.to_dict() == Counter(row["reason"] for row in rejects)
 
 
@@ -362,15 +370,15 @@ def test_tables_page_reject_reasons(answers, rejects):
 
 
 def test_tables_page_python_blocks_run(root, town, capsys):
-    decoder, script = (code for _, code in blocks("python"))
+    decoder, script = (code for _, code in find_code_blocks("python"))
     assert decoder.split("\n\n\n")[1].strip() in script
     names: dict = {}
-    exec(in_place(script, root), names)
+    exec(replace_folders(script, root), names)
     along = names["along"]
     assert "road_width_m" in capsys.readouterr().out
-    drive = max(drives_of(town).values(), key=len)
+    drive = max(group_by_drive(town).values(), key=len)
     assert along.index.tolist() == [s.scene_id for s in drive]
-    assert np.isclose(along.distance_m.iloc[-1], steps_m(drive).sum())
+    assert np.isclose(along.distance_m.iloc[-1], compute_steps_m(drive).sum())
     x_m = drive[0].grid.x_m()
     for scene, row in zip(drive, along.itertuples(), strict=True):
         road, height_m = scene.occupied[0], scene.height_m[0]
@@ -387,11 +395,11 @@ def test_tables_page_python_blocks_run(root, town, capsys):
         assert np.abs(height_m - scene.height_m).max() <= HEIGHT_STEP_M / 2 + 1e-5
 
 
-# ----------------------------------------------------------------------------------- files that explain themselves
+# ----------------------------------------------------------------------------------- descriptions in files
 
 
-def assert_explained(path: str, schema: pa.Schema):
-    """Every field has a description in Arrow and in the key-value metadata that DuckDB reads."""
+def assert_columns_are_described(path: str, schema: pa.Schema):
+    """Assert that each field has a description in Arrow and in the key-value metadata that DuckDB reads."""
     written = pq.read_schema(path)
     assert written.names == schema.names
     for field in written:
@@ -414,7 +422,7 @@ def assert_explained(path: str, schema: pa.Schema):
 @pytest.mark.parametrize("table", SCHEMAS)
 def test_table_files_describe_their_columns(root, table):
     path = Shard(f"{root}/real", "town", "train", 0).path(table)
-    assert_explained(path, SCHEMAS[table])
+    assert_columns_are_described(path, SCHEMAS[table])
     names = {name for (name,) in duckdb.sql(f"select name from parquet_schema('{path}')").fetchall()}
     assert names >= set(SCHEMAS[table].names)
 
@@ -428,14 +436,14 @@ def test_table_units_match_column_names():
 
 
 def test_label_scenes_keeps_column_descriptions(root, tmp_path):
-    """The last step of preprocessing rewrites the scenes tables."""
+    """label_scenes, the last step of preprocessing, rewrites the scenes tables."""
     from pipelines.schema.dataset import Statistics, label_scenes
 
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
     thresholds = compute_density_thresholds(np.arange(4), np.arange(4.0))
     final = str(tmp_path / "final.parquet")
     storage.write_parquet(label_scenes(staged, Statistics(thresholds, thresholds, LayoutSpec())), final)
-    assert_explained(final, SCENES)
+    assert_columns_are_described(final, SCENES)
 
 
 def test_duckdb_lists_table_columns(answers):
@@ -445,7 +453,7 @@ def test_duckdb_lists_table_columns(answers):
 
 
 def test_shard_reads_files_without_descriptions(tmp_path):
-    """Older files with the same names and types, alone or next to newer ones."""
+    """Files without descriptions have the same column names and types and mix with files with descriptions."""
     old, new = (Shard(str(tmp_path), "town", "train", k) for k in (0, 1))
     old.write([random_scene(0)])
     new.write([random_scene(1)])
@@ -459,4 +467,4 @@ def test_shard_reads_files_without_descriptions(tmp_path):
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_lists(PAGE.read_text()))
+    PAGE.write_text(update_lists(PAGE.read_text()))
