@@ -1,6 +1,7 @@
-"""docs/reference/tables.md: its blocks run, its answers are right, its column lists equal the schemas.
+"""Tests of docs/reference/tables.md and of the descriptions in table files.
 
-PYTHONPATH=tests python tests/unit/test_tables_docs.py      writes the lists of columns and categories into the page
+Every code block runs, query results equal results in Python, and the lists of columns equal the schemas.
+The command `python tests/unit/test_tables_docs.py` writes the lists of columns and categories to the page.
 """
 
 import json
