@@ -1,7 +1,8 @@
 """Tests of docs/reference/tables.md and of the descriptions in table files.
 
 Every code block runs, query results equal results in Python, and the lists of columns equal the schemas.
-The command `python tests/unit/test_tables_docs.py` writes the lists of columns and categories to the page.
+The command `PYTHONPATH=tests python tests/unit/test_tables_docs.py` writes the lists of columns and categories to the
+page.
 """
 
 import json
