@@ -1,4 +1,4 @@
-"""Edits are exact in the parameters and deterministic on replay."""
+"""Tests of edits: exact parameters, repair and deterministic replay."""
 
 import json
 from dataclasses import replace
@@ -132,7 +132,9 @@ def test_rotate_turns_every_corner(scene, about_m, by_deg):
     angle = np.deg2rad(by_deg)
     matrix = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     axis = scene.center_m * [1, 1, 0] if about_m is None else np.array([*about_m, 0.0])
-    for before, after, point in zip(corners(scene), corners(turned), np.broadcast_to(axis, (60, 3)), strict=True):
+    for before, after, point in zip(
+        compute_corners(scene), compute_corners(turned), np.broadcast_to(axis, (60, 3)), strict=True
+    ):
         expected = point + (before - point) @ matrix.T
         apart = np.linalg.norm(after[:, None] - expected[None], axis=2)
         assert apart.min(axis=0).max() < 1e-4
@@ -141,15 +143,15 @@ def test_rotate_turns_every_corner(scene, about_m, by_deg):
     off = turned.heading_rad[known] - scene.heading_rad[known] - angle
     assert np.abs(np.sin(off / 2)).max() < 1e-5 and np.abs(turned.heading_rad[known]).max() <= np.pi
     assert np.isnan(turned.heading_rad[~known]).all()
-    if by_deg == 30:  # about the vertical axis; at least one axis of a tilted box turns by less
+    if by_deg == 30:  # the vertical axis; at least one axis of a tilted box turns by less
         assert (done.turned_rad <= np.deg2rad(30.01)).all() and (done.turned_rad > np.deg2rad(25)).all()
 
 
-def corners(scene: Scene) -> np.ndarray:
+def compute_corners(scene: Scene) -> np.ndarray:
     return (SIGNS * scene.size_m[:, None].astype(float)) @ np.swapaxes(scene.rotation, 1, 2) + scene.center_m[:, None]
 
 
-def test_resized_is_largest_change_of_an_extent(scene):
+def test_edit_record_contains_largest_change_of_an_extent(scene):
     _, (done,) = replay_edits(scene, [edit.Scale(Select(primitives=(7, 9)), (1.2, 1.02, 0.9))])
     assert done.primitive.tolist() == [7, 9] and np.allclose(done.resized, 0.2, atol=1e-6) and not done.turned_rad.any()
 
@@ -211,8 +213,8 @@ def test_edit_rejects_degenerate_primitive(scene):
 # --------------------------------------------------------------------------------------------------------- repair
 
 
-def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Scene:
-    """Two cars in a row on flat ground with a gap of gap_m."""
+def make_two_cars(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Scene:
+    """Return two cars in a row on flat ground, with a gap of gap_m between them."""
     scene = random_scene(0, 2, tilt_rad=0)
     front, back = sizes_m
     center_m = np.array([[30, 0, 1], [30 + (front[0] + back[0]) / 2 + gap_m, 0.1, 1]], np.float32)
@@ -228,15 +230,15 @@ def two_boxes(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) -> Sce
 
 
 def test_repair_separates_overlap_by_shortest_move():
-    scene = two_boxes(-0.4)  # 0.4 of 7.6 m: an IoU3D of 0.0495 with the offset, or 0.0526 without
+    scene = make_two_cars(-0.4)  # the IoU3D is 0.0495 with the lateral offset and 0.4 / 7.6 = 0.0526 without
     scene = replace(scene, center_m=scene.center_m * np.array([1, 0, 1], np.float32))
     mended, (done,) = replay_edits(scene, [edit.Repair(ALL)])
-    assert overlap(scene) > 0.05 > overlap(mended) and len(mended) == 2
+    assert compute_overlap(scene) > 0.05 > compute_overlap(mended) and len(mended) == 2
     assert np.allclose(mended.center_m[:, 1:], scene.center_m[:, 1:]) and (done.moved_m <= 0.05).all()
     assert not done.turned_rad.any() and not done.resized.any()
 
 
-def overlap(scene: Scene) -> float:
+def compute_overlap(scene: Scene) -> float:
     boxes = extract_boxes(scene)
     return float(compute_iou3d_matrix(boxes, boxes)[0, 1])
 
@@ -256,39 +258,43 @@ def test_repair_rejects_impossible_options(options, message):
 
 
 def test_repair_shrinks_or_removes_unmovable_primitives():
-    deep = two_boxes(-2, existence=np.array([0.9, 0.6], np.float32))
+    deep = make_two_cars(-2, existence=np.array([0.9, 0.6], np.float32))
     mended, (done,) = replay_edits(deep, [edit.Repair(ALL)])
     assert len(mended) == 1 and mended.existence[0] == np.float32(0.9)
     assert done.primitive.tolist() == [1] and done.change.tolist() == ["removed"]
     kept, done = replay_edits(deep, [edit.Repair(ALL, drop=False)])
     assert_same_primitives(kept, deep)
     far, _ = replay_edits(deep, [edit.Repair(ALL, push_m=1.5)])
-    assert len(far) == 2 and overlap(far) < 0.05
-    other, _ = replay_edits(deep, [edit.Repair(Select(primitives=(0,)), push_m=3)])  # unselected primitives are kept
+    assert len(far) == 2 and compute_overlap(far) < 0.05
+    other, _ = replay_edits(
+        deep, [edit.Repair(Select(primitives=(0,)), push_m=3)]
+    )  # the edit changes only selected primitives
     assert_same_primitives(other.select(np.array([1])), deep.select(np.array([1])))
-    assert overlap(other) < 0.05
-    small = two_boxes(-0.8)
+    assert compute_overlap(other) < 0.05
+    small = make_two_cars(-0.8)
     shrunk, (done,) = replay_edits(small, [edit.Repair(ALL, push_m=0.2)])
-    assert len(shrunk) == 2 and overlap(shrunk) < 0.05 and (done.resized <= 0.0501).all() and done.resized.any()
+    assert len(shrunk) == 2 and compute_overlap(shrunk) < 0.05 and (done.resized <= 0.0501).all() and done.resized.any()
     assert (done.moved_m <= 0.2001).all()
 
 
-def test_repair_fixes_disturbed_town_and_keeps_the_rest(town_scenes):
-    """A fifth of the objects is lifted or sunk by 0.6 to 0.9 m, another fifth is shifted."""
+def test_repair_fixes_disturbed_town_and_keeps_valid_objects(town_scenes):
+    """The test moves a fifth of the objects up or down by 0.6 to 0.9 m and a fifth sideways by at most 1 m."""
     rng, overlapping = np.random.default_rng(1), []
     for scene in town_scenes:
         center_m = scene.center_m.copy()
         center_m[::5, 2] += rng.choice([-1, 1], len(center_m[::5])) * rng.uniform(0.6, 0.9, len(center_m[::5]))
         center_m[1::5, :2] += rng.uniform(-1, 1, (len(center_m[1::5]), 2))
-        spoilt = replace(scene, center_m=center_m.astype(np.float32))
-        mended, (done,) = replay_edits(spoilt, [edit.Repair(ALL)])
-        before, after = (compute_validity_rates(compute_scene_validity(s, SLAB_OFFSET_M)) for s in (spoilt, mended))
+        disturbed = replace(scene, center_m=center_m.astype(np.float32))
+        mended, (done,) = replay_edits(disturbed, [edit.Repair(ALL)])
+        before, after = (compute_validity_rates(compute_scene_validity(s, SLAB_OFFSET_M)) for s in (disturbed, mended))
         assert before["floating"] + before["sunken"] > 0.05 and after["floating"] == after["sunken"] == 0
         assert after["overlapping"] == 0
         overlapping.append(before["overlapping"])
-        wrong = np.any([bad for bad, _ in list(find_faults(spoilt, SLAB_OFFSET_M).values())[:3]], axis=0)
-        partners = (compute_iou3d_matrix(extract_boxes(spoilt), extract_boxes(spoilt)) > 0.05)[wrong].any(axis=0)
-        assert set(done.primitive) <= set(np.flatnonzero(wrong | partners))  # valid primitives are unchanged
+        wrong = np.any([bad for bad, _ in list(find_faults(disturbed, SLAB_OFFSET_M).values())[:3]], axis=0)
+        partners = (compute_iou3d_matrix(extract_boxes(disturbed), extract_boxes(disturbed)) > 0.05)[wrong].any(axis=0)
+        assert set(done.primitive) <= set(
+            np.flatnonzero(wrong | partners)
+        )  # repair changes only faulty primitives and their partners
         assert (done.change == "removed").mean() < 0.5
     assert np.mean(overlapping) > 0.02
 
