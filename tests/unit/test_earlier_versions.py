@@ -1,4 +1,4 @@
-"""Pipelines and tables that version 0.1 wrote load and mean the same (tests/golden/version_0_1)."""
+"""Tests of pipelines and tables from version 0.1, which stand in tests/golden/version_0_1."""
 
 import json
 
