@@ -1,4 +1,4 @@
-"""IoU3D compared with polytope volumes from manifold3d and, where these are inexact, from half-space intersection."""
+"""Tests of IoU3D against polytope volumes from manifold3d and from the intersection of half-spaces."""
 
 import manifold3d
 import numpy as np
@@ -14,18 +14,21 @@ from models.scene import make_yaw_rotation
 TOLERANCE = 1e-4
 
 
-def solid(center_m, rotation, size_m):
+def make_solid(center_m, rotation, size_m):
     return manifold3d.Manifold.cube(size_m.tolist(), True).transform(np.column_stack([rotation, center_m]))
 
 
-def manifold_iou(a: Boxes, b: Boxes) -> np.ndarray:
-    solids_a, solids_b = ([solid(*box) for box in zip(*side, strict=True)] for side in (a, b))
+def compute_manifold_iou(a: Boxes, b: Boxes) -> np.ndarray:
+    solids_a, solids_b = ([make_solid(*box) for box in zip(*side, strict=True)] for side in (a, b))
     common = np.array([(x ^ y).volume() for x, y in zip(solids_a, solids_b, strict=True)])
     return common / (a.volume_m3 + b.volume_m3 - common)
 
 
-def halfspace_iou(a: Boxes, b: Boxes, i: int) -> float:
-    """IoU of pair i from the hull of the vertices of twelve half-spaces; 0 if they hold no ball of radius 1e-9."""
+def compute_halfspace_iou(a: Boxes, b: Boxes, i: int) -> float:
+    """Return the IoU of pair i from the vertices of the intersection of twelve half-spaces.
+
+    The IoU is 0 if the intersection contains no ball of radius 1e-9 m.
+    """
     normals, offsets = [], []
     for box in (a, b):
         axes = box.rotation[i].T
@@ -49,31 +52,31 @@ def halfspace_iou(a: Boxes, b: Boxes, i: int) -> float:
     return common / (a.volume_m3[i] + b.volume_m3[i] - common)
 
 
-def random_boxes(rng, n, spread_m=1.0, low_m=0.05, high_m=20.0) -> Boxes:
+def draw_boxes(rng, n, spread_m=1.0, low_m=0.05, high_m=20.0) -> Boxes:
     size_m = np.exp(rng.uniform(np.log(low_m), np.log(high_m), (n, 3)))
     return make_boxes(rng.normal(0, spread_m, (n, 3)), Rotation.random(n, rng=rng).as_matrix(), size_m)
 
 
-def disturbed(rng, a: Boxes, noise: float) -> Boxes:
-    """The same boxes with centres and extents off by `noise` metres and axes by `noise` radians."""
+def disturb(rng, a: Boxes, noise: float) -> Boxes:
+    """Return the boxes with random errors: `noise` metres in centres and extents, `noise` radians in axes."""
     turn = Rotation.from_rotvec(noise * rng.normal(size=(len(a.size_m), 3))).as_matrix()
     center_m = a.center_m + noise * rng.normal(size=a.center_m.shape)
     return make_boxes(center_m, turn @ a.rotation, np.maximum(a.size_m + noise * rng.normal(size=a.size_m.shape), 0.01))
 
 
-def shifted(a: Boxes, share: float, axis: int) -> Boxes:
-    """The same boxes moved along one of their own axes by a fraction of their extent."""
+def shift(a: Boxes, share: float, axis: int) -> Boxes:
+    """Return the boxes after a shift along one of their axes by a fraction of their extent."""
     return a._replace(center_m=a.center_m + share * a.rotation[:, :, axis] * a.size_m[:, axis, None])
 
 
-def relabelled(a: Boxes, order: list[int]) -> Boxes:
-    """The same solids with permuted axes (turned by 90 degrees)."""
+def permute_axes(a: Boxes, order: list[int]) -> Boxes:
+    """Return the same solids with permuted axes, that is, with rotations by 90 degrees."""
     return make_boxes(a.center_m, a.rotation[:, :, order], a.size_m[:, order])
 
 
-def pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
+def draw_pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
     n = 800
-    a, upright = random_boxes(rng, n), random_boxes(rng, n)
+    a, upright = draw_boxes(rng, n), draw_boxes(rng, n)
     yaw = rng.uniform(-np.pi, np.pi, n)
     upright = make_boxes(upright.center_m, make_yaw_rotation(yaw), upright.size_m)
     square = a._replace(size_m=np.repeat(a.size_m[:, :1], 3, axis=1))
@@ -82,31 +85,31 @@ def pairs(rng) -> dict[str, tuple[Boxes, Boxes]]:
         a.center_m, Rotation.random(n, rng=rng).as_matrix(), a.size_m.min(axis=1)[:, None] * np.full(3, 0.5)
     )
     return {
-        "random": (a, random_boxes(rng, n)),
-        "random, alike in size": (random_boxes(rng, n, 0.5, 1, 4), random_boxes(rng, n, 0.5, 1, 4)),
-        "upright": (upright, disturbed(rng, upright, 0.3)),
-        **{f"noise {noise}": (a, disturbed(rng, a, noise)) for noise in (0, 1e-9, 1e-6, 1e-3, 0.01, 0.05)},
-        "upright noise 0.03": (upright, disturbed(rng, upright, 0.03)),
-        "axes renamed": (a, relabelled(a, [1, 2, 0])),
-        "mirrored axes": (a, relabelled(a, [1, 0, 2])),
+        "random": (a, draw_boxes(rng, n)),
+        "random, alike in size": (draw_boxes(rng, n, 0.5, 1, 4), draw_boxes(rng, n, 0.5, 1, 4)),
+        "upright": (upright, disturb(rng, upright, 0.3)),
+        **{f"noise {noise}": (a, disturb(rng, a, noise)) for noise in (0, 1e-9, 1e-6, 1e-3, 0.01, 0.05)},
+        "upright noise 0.03": (upright, disturb(rng, upright, 0.03)),
+        "axes renamed": (a, permute_axes(a, [1, 2, 0])),
+        "mirrored axes": (a, permute_axes(a, [1, 0, 2])),
         "cube turned by 90 degrees": (square, square._replace(rotation=quarter.rotation)),
         "turned by 90 degrees": (a, quarter),
-        "sharing four faces": (a, shifted(a, 0.4, 0)),
-        "touching": (a, shifted(a, 1.0, 1)),
+        "sharing four faces": (a, shift(a, 0.4, 0)),
+        "touching": (a, shift(a, 1.0, 1)),
         "contained": (a, inside),
-        "half the size, sharing three faces": (a, shifted(a._replace(size_m=a.size_m / [2, 1, 1]), 0.5, 0)),
+        "half the size, sharing three faces": (a, shift(a._replace(size_m=a.size_m / [2, 1, 1]), 0.5, 0)),
         "float32": (a, make_boxes(*(part.astype(np.float32) for part in a))),
     }
 
 
 def test_iou3d_of_10000_pairs_is_within_1e_4_of_oracle():
-    cases, total, off = pairs(np.random.default_rng(0)), 0, []
+    cases, total, off = draw_pairs(np.random.default_rng(0)), 0, []
     for name, (a, b) in cases.items():
-        ours, oracle = compute_iou3d_pairs(a, b), manifold_iou(a, b)
+        ours, oracle = compute_iou3d_pairs(a, b), compute_manifold_iou(a, b)
         assert (ours >= 0).all() and (ours <= 1).all(), name
         for i in np.flatnonzero(~(np.abs(ours - oracle) <= TOLERANCE)):
-            if not abs(ours[i] - halfspace_iou(a, b, i)) <= TOLERANCE:
-                off.append((name, i, ours[i], oracle[i], halfspace_iou(a, b, i)))
+            if not abs(ours[i] - compute_halfspace_iou(a, b, i)) <= TOLERANCE:
+                off.append((name, i, ours[i], oracle[i], compute_halfspace_iou(a, b, i)))
         total += len(ours)
     assert total >= 10_000
     assert not off, off
@@ -114,20 +117,22 @@ def test_iou3d_of_10000_pairs_is_within_1e_4_of_oracle():
 
 def test_iou3d_agrees_with_both_oracles_on_random_pairs():
     rng = np.random.default_rng(1)
-    a, b = random_boxes(rng, 60, 0.5, 0.5, 4), random_boxes(rng, 60, 0.5, 0.5, 4)
-    np.testing.assert_allclose(compute_iou3d_pairs(a, b), [halfspace_iou(a, b, i) for i in range(60)], atol=1e-7)
-    np.testing.assert_allclose(compute_iou3d_pairs(a, b), manifold_iou(a, b), atol=1e-7)
+    a, b = draw_boxes(rng, 60, 0.5, 0.5, 4), draw_boxes(rng, 60, 0.5, 0.5, 4)
+    np.testing.assert_allclose(
+        compute_iou3d_pairs(a, b), [compute_halfspace_iou(a, b, i) for i in range(60)], atol=1e-7
+    )
+    np.testing.assert_allclose(compute_iou3d_pairs(a, b), compute_manifold_iou(a, b), atol=1e-7)
 
 
 def test_iou3d_equals_hand_computed_cases():
     unit = make_boxes(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
     assert compute_iou3d_pairs(unit, unit) == pytest.approx(1, abs=1e-12)
-    assert compute_iou3d_pairs(unit, shifted(unit, 0.5, 0)) == pytest.approx(1 / 3, abs=1e-8)
-    assert compute_iou3d_pairs(unit, shifted(unit, 1.0, 0)) == pytest.approx(0, abs=1e-8)
-    assert compute_iou3d_pairs(unit, shifted(unit, 5.0, 2)) == 0
+    assert compute_iou3d_pairs(unit, shift(unit, 0.5, 0)) == pytest.approx(1 / 3, abs=1e-8)
+    assert compute_iou3d_pairs(unit, shift(unit, 1.0, 0)) == pytest.approx(0, abs=1e-8)
+    assert compute_iou3d_pairs(unit, shift(unit, 5.0, 2)) == 0
     assert compute_iou3d_pairs(unit, unit._replace(size_m=np.full((1, 3), 0.5))) == pytest.approx(1 / 8, abs=1e-8)
     diagonal = make_yaw_rotation(np.array([np.pi / 4]))
-    octagon = 2 * (np.sqrt(2) - 1)  # two unit squares, one turned by 45 degrees
+    octagon = 2 * (np.sqrt(2) - 1)  # two unit squares at an angle of 45 degrees
     assert compute_iou3d_pairs(unit, unit._replace(rotation=diagonal)) == pytest.approx(
         octagon / (2 - octagon), abs=1e-8
     )
@@ -135,7 +140,7 @@ def test_iou3d_equals_hand_computed_cases():
 
 def test_iou3d_is_symmetric_and_invariant_to_pose_and_chunks(monkeypatch):
     rng = np.random.default_rng(2)
-    a, b = random_boxes(rng, 300), random_boxes(rng, 300)
+    a, b = draw_boxes(rng, 300), draw_boxes(rng, 300)
     iou = compute_iou3d_pairs(a, b)
     np.testing.assert_allclose(iou, compute_iou3d_pairs(b, a), atol=1e-6)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 100, 3)
@@ -147,7 +152,7 @@ def test_iou3d_is_symmetric_and_invariant_to_pose_and_chunks(monkeypatch):
 
 def test_iou3d_matrix_equals_pairs_and_accepts_empty_sides():
     rng = np.random.default_rng(3)
-    a, b = random_boxes(rng, 40, 10), random_boxes(rng, 30, 10)
+    a, b = draw_boxes(rng, 40, 10), draw_boxes(rng, 30, 10)
     i, j = np.indices((40, 30)).reshape(2, -1)
     np.testing.assert_array_equal(compute_iou3d_matrix(a, b), compute_iou3d_pairs(a.take(i), b.take(j)).reshape(40, 30))
     wanted = rng.random((40, 30)) < 0.5
@@ -173,7 +178,7 @@ def test_iou3d_rejects_invalid_boxes(part, value, message):
 
 
 def test_ellipsoid_iou3d_keeps_stated_error():
-    """Oracles: closed form for spheres, and pairs after the linear map that turns one ellipsoid into a sphere."""
+    """The reference IoU is the closed form for two spheres, which a linear map of both spheres keeps."""
     rng = np.random.default_rng(4)
     n = 200
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
@@ -181,9 +186,9 @@ def test_ellipsoid_iou3d_keeps_stated_error():
     b = make_boxes(
         distance[:, None] * [0, 0.6, 0.8], Rotation.random(n, rng=rng).as_matrix(), 2 * radius[1][:, None] * np.ones(3)
     )
-    lens = sphere_lens(*radius, distance)
+    lens = compute_sphere_intersection(*radius, distance)
     exact = lens / (4 / 3 * np.pi * (radius**3).sum(axis=0) - lens)
-    stretch = np.array([4.0, 1.0, 0.5])  # preserves IoU; spheres become aligned ellipsoids
+    stretch = np.array([4.0, 1.0, 0.5])  # the map preserves the IoU and turns spheres into aligned ellipsoids
     stretched = [make_boxes(x.center_m * stretch, np.tile(np.eye(3), (n, 1, 1)), x.size_m * stretch) for x in (a, b)]
     for pair in ((a, b), stretched):
         error = iou3d.compute_ellipsoid_iou3d_pairs(*pair) - exact
@@ -192,8 +197,8 @@ def test_ellipsoid_iou3d_keeps_stated_error():
     assert (iou3d.compute_ellipsoid_iou3d_pairs(a, a) > 1 - 1e-9).all()
 
 
-def sphere_lens(r: np.ndarray, s: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Volume common to two spheres of radii r and s at distance d."""
+def compute_sphere_intersection(r: np.ndarray, s: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the volume of the intersection of two spheres with radii r and s at distance d."""
     small = np.minimum(r, s)
     d_safe = np.maximum(d, 1e-9)
     lens = np.pi * (r + s - d) ** 2 * (d**2 + 2 * d * (r + s) - 3 * (r - s) ** 2) / (12 * d_safe)
