@@ -1,4 +1,4 @@
-"""The KITTI-360 reader: geometry equals the vertices of the files; defects and broken files are reported."""
+"""Tests of the KITTI-360 reader: geometry against the vertices in files, defective objects and broken files."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ CUBE = np.array(
     [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1], [-1, -1, 1]]
 ) / 2  # fmt: skip
 CUBE_FACES = "0 2 1 2 3 1 4 6 5 6 7 5 4 5 1 5 0 1 7 6 2 6 3 2 5 7 0 7 2 0 1 3 4 3 6 4"
-# A prism over a non-convex outline (an L of 64 m2): 6 corners on top, then 6 below.
+# A prism with an L-shaped outline of 64 m2: 6 corners of the top, then 6 corners of the bottom.
 L_OUTLINE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], float)
 L_SLAB = np.concatenate([np.column_stack([L_OUTLINE, np.full(6, z)]) for z in (0.3, -0.3)])
 L_FACES = "0 1 2 0 2 3 0 3 4 0 4 5 8 7 6 9 8 6 10 9 6 11 10 6 " + " ".join(
@@ -26,14 +26,14 @@ L_FACES = "0 1 2 0 2 3 0 3 4 0 4 5 8 7 6 9 8 6 10 9 6 11 10 6 " + " ".join(
 IDENTITY_POSE = "1 0 0 100 0 -1 0 200 0 0 -1 117"  # x east, y right, z down
 
 
-def sphere() -> np.ndarray:
-    """(63, 3) 9 columns x 7 rows of radius 1, poles on local y."""
+def make_sphere() -> np.ndarray:
+    """Return the vertices (63, 3) of a unit sphere: 9 columns x 7 rows with poles on the local y axis."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, 7), np.linspace(0, 2 * np.pi, 9))
     x, y, z = np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
-def matrix(tag: str, values: np.ndarray | str, cols: int, kind: str = "f") -> str:
+def format_matrix(tag: str, values: np.ndarray | str, cols: int, kind: str = "f") -> str:
     words = values.split() if isinstance(values, str) else [f"{v:.9e}" for v in np.ravel(values)]
     return (
         f'<{tag} type_id="opencv-matrix">\n<rows>{len(words) // cols}</rows>\n<cols>{cols}</cols>\n'
@@ -41,38 +41,40 @@ def matrix(tag: str, values: np.ndarray | str, cols: int, kind: str = "f") -> st
     )
 
 
-def affine(linear: np.ndarray, at: tuple[float, float, float] = (130, 205, 117)) -> np.ndarray:
+def make_affine(linear: np.ndarray, at: tuple[float, float, float] = (130, 205, 117)) -> np.ndarray:
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = linear, at
     return out
 
 
-def an_object(label="car", transform=None, vertices=CUBE, faces=CUBE_FACES, index=1, **fields) -> str:
-    """One <objectN>; a field given as None is left out."""
-    transform = affine(np.diag([4.4, 2.0, 1.5])) if transform is None else transform
+def format_object(label="car", transform=None, vertices=CUBE, faces=CUBE_FACES, index=1, **fields) -> str:
+    """Return one <objectN> element without the fields that are None."""
+    transform = make_affine(np.diag([4.4, 2.0, 1.5])) if transform is None else transform
     texts = {
         "index": index, "label": label, "category": "instance", "level_min": "0.", "level_max": "10.",
         "dynamic": 0, "dynamicSeq": -1, "dynamicIdx": -1, "timestamp": -1, "start_frame": 0, "end_frame": 99,
     } | fields  # fmt: skip
     matrices = [
-        matrix("transform", transform, 4),
-        matrix("vertices", vertices, 3),
-        matrix("faces", faces, 3, "u"),
+        format_matrix("transform", transform, 4),
+        format_matrix("vertices", vertices, 3),
+        format_matrix("faces", faces, 3, "u"),
     ]
-    empty = [matrix(f"{tag}_plane", "", 3).replace("<cols>3", "<cols>0") for tag in ("transform", "vertices", "faces")]
+    empty = [
+        format_matrix(f"{tag}_plane", "", 3).replace("<cols>3", "<cols>0") for tag in ("transform", "vertices", "faces")
+    ]
     parts = [f"<{tag}>{text}</{tag}>\n" for tag, text in texts.items() if text is not None]
     return f"<object{index}>\n{''.join(parts + matrices + empty)}</object{index}>\n"
 
 
-def a_slab(label="road", at=(100.0, 190.0, 116.0), index=9, vertices=L_SLAB, faces=L_FACES) -> str:
-    return an_object(label, affine(np.eye(3), at), vertices, faces, index, category="stuff")
+def format_slab(label="road", at=(100.0, 190.0, 116.0), index=9, vertices=L_SLAB, faces=L_FACES) -> str:
+    return format_object(label, make_affine(np.eye(3), at), vertices, faces, index, category="stuff")
 
 
-def document(*objects: str) -> str:
+def format_document(*objects: str) -> str:
     return '<?xml version="1.0"?>\n<opencv_storage>\n' + "".join(objects) + "</opencv_storage>\n"
 
 
-def write(root: Path, xml: str | bytes, poses: str | bytes | None = None) -> Path:
+def write_drive(root: Path, xml: str | bytes, poses: str | bytes | None = None) -> Path:
     if poses is None:
         poses = "".join(f"{k} {IDENTITY_POSE.replace('100', str(100 + k), 1)}\n" for k in (0, 1, 2, 5))
     for path, content in (
@@ -84,21 +86,21 @@ def write(root: Path, xml: str | bytes, poses: str | bytes | None = None) -> Pat
     return root
 
 
-def read(root: Path, *objects: str):
-    return read_drive(write(root, document(*objects)), "0003")
+def read_objects(root: Path, *objects: str):
+    return read_drive(write_drive(root, format_document(*objects)), "0003")
 
 
-def corners(center: np.ndarray, rotation: np.ndarray, size: np.ndarray) -> np.ndarray:
+def compute_corners(center: np.ndarray, rotation: np.ndarray, size: np.ndarray) -> np.ndarray:
     return center + (CUBE * size) @ rotation.T
 
 
-def set_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Hausdorff distance of two point sets."""
+def compute_set_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the Hausdorff distance of two point sets."""
     distance = np.linalg.norm(a[:, None] - b[None], axis=2)
     return max(distance.min(axis=0).max(), distance.min(axis=1).max())
 
 
-# ------------------------------------------------------------------------------------------- the real excerpt
+# ------------------------------------------------------------------------------------------- real excerpt
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +137,7 @@ def test_kitti360_real_boxes_have_corners_of_file(real):
             ellipsoids += 1
         else:
             limit_m = 1e-3 if shear < 1e-3 else 0.05 * size.max()
-            assert set_distance(corners(center, rotation, size), world) < limit_m
+            assert compute_set_distance(compute_corners(center, rotation, size), world) < limit_m
             cuboids += 1
     assert (cuboids, ellipsoids) == (np.sum(drive.category != 1), np.sum(drive.category == 1))
 
@@ -171,7 +173,7 @@ def test_kitti360_real_cars_stand_half_a_slab_below_raster(real):
         near = ground_class[248:, 124:132] == KITTI_GROUND_CLASSES.index("road")
         road_below += list(height[248:, 124:132][near])
     assert abs(np.median(depth) - 0.3) < 0.1
-    # the IMU rides .93 m above the road, the raster lies .3 m above it
+    # the IMU is 0.93 m above the road, the raster 0.3 m above it
     assert abs(np.median(road_below) + 0.63) < 0.1
 
 
@@ -192,7 +194,7 @@ def test_kitti360_real_parked_cars_point_along_road(real):
     assert np.median(np.abs(np.sin(turn))) < 0.2
 
 
-# ------------------------------------------------------------------------------------------ traps and defects
+# ------------------------------------------------------------------------------------------ special cases
 
 
 LABELS = {
@@ -213,7 +215,7 @@ LABELS = {
     ("label", "category"), [(label, category) for category, labels in LABELS.items() for label in labels]
 )
 def test_kitti360_maps_every_object_label_to_category(tmp_path, label, category):
-    drive, report = read(tmp_path, an_object(label))
+    drive, report = read_objects(tmp_path, format_object(label))
     assert [CATEGORIES[c] for c in drive.category] == [category]
     assert drive.label.tolist() == [label]
     headed = category in ("vehicle_big", "vehicle_small", "two_wheelers") or label == "rider"
@@ -227,8 +229,8 @@ def test_kitti360_maps_every_object_label_to_category(tmp_path, label, category)
      ("ground", "terrain"), ("unknownGround", "ground")],
 )  # fmt: skip
 def test_kitti360_recognizes_ground_by_label_not_shape(tmp_path, label, ground_class):
-    flat = an_object(label, affine(np.diag([20.0, 10.0, 0.6])), category="stuff", index=2)
-    drive, report = read(tmp_path, a_slab(label), flat)
+    flat = format_object(label, make_affine(np.diag([20.0, 10.0, 0.6])), category="stuff", index=2)
+    drive, report = read_objects(tmp_path, format_slab(label), flat)
     assert (report.slabs, report.boxes) == (2, 0)
     assert [KITTI_GROUND_CLASSES[c] for c in drive.ground.slab_class] == [ground_class] * 2
     assert drive.scene(0).ground_area_m2()[KITTI_GROUND_CLASSES.index(ground_class)] > 100
@@ -238,7 +240,9 @@ def test_kitti360_recognizes_ground_by_label_not_shape(tmp_path, label, ground_c
     "label", ["tunnel", "bridge", "train", "stop", "caravan", "vendingmachine", "railtrack", "sky"]
 )
 def test_kitti360_counts_dropped_labels_without_category(tmp_path, label):
-    drive, report = read(tmp_path, an_object(label), an_object("spaceship", index=2), an_object(index=3))
+    drive, report = read_objects(
+        tmp_path, format_object(label), format_object("spaceship", index=2), format_object(index=3)
+    )
     assert (report.dropped, report.unknown, report.boxes) == ({label: 1}, {"spaceship": 1}, 1)
     assert len(drive.category) == 1
     assert "spaceship 1" in report.summary()
@@ -246,15 +250,17 @@ def test_kitti360_counts_dropped_labels_without_category(tmp_path, label):
 
 def test_kitti360_sphere_mesh_becomes_ellipsoid(tmp_path):
     turn = Rotation.from_euler("zyx", [0.5, 0.2, -0.1]).as_matrix()
-    drive, _ = read(tmp_path, an_object("vegetation", affine(turn @ np.diag([1.0, 2.0, 3.0])), sphere(), "0 1 2"))
+    drive, _ = read_objects(
+        tmp_path, format_object("vegetation", make_affine(turn @ np.diag([1.0, 2.0, 3.0])), make_sphere(), "0 1 2")
+    )
     assert CATEGORIES[drive.category[0]] == "vegetation_ellipsoid"
     assert np.allclose(drive.size_m, [[2, 4, 6]], atol=1e-6)
     assert np.allclose(drive.rotation[0], turn, atol=1e-6)
 
 
 def test_kitti360_slab_keeps_non_convex_outline_and_height(tmp_path):
-    drive, _ = read(tmp_path, a_slab(at=(110.0, 195.0, 116.0)))
-    scene = drive.scene(0)  # ego at (100, 200, 117), looking east
+    drive, _ = read_objects(tmp_path, format_slab(at=(110.0, 195.0, 116.0)))
+    scene = drive.scene(0)  # the ego vehicle at (100, 200, 117) faces east
     assert abs(scene.ground_area_m2()[0] - 64) < 1
     assert np.allclose(scene.height_m[0][scene.occupied[0]], 116.3 - 117)
 
@@ -264,18 +270,20 @@ def test_kitti360_mirrored_box_equals_box(tmp_path, axis):
     turn = Rotation.from_euler("z", 0.7).as_matrix()
     mirror = np.ones(3)
     mirror[axis] = -1
-    transform = affine(turn @ np.diag(mirror * [4.0, 2.0, 1.5]))
-    drive, _ = read(tmp_path, an_object("car", transform))
+    transform = make_affine(turn @ np.diag(mirror * [4.0, 2.0, 1.5]))
+    drive, _ = read_objects(tmp_path, format_object("car", transform))
     assert np.linalg.det(drive.rotation[0]) > 0
     world = CUBE @ transform[:3, :3].T + transform[:3, 3]
-    assert set_distance(corners(drive.center_m[0], drive.rotation[0], drive.size_m[0]), world) < 1e-6
+    assert compute_set_distance(compute_corners(drive.center_m[0], drive.rotation[0], drive.size_m[0]), world) < 1e-6
     assert abs(np.cos(drive.heading_rad[0] - 0.7) - (1 if axis else -1)) < 1e-6
 
 
 def test_kitti360_sheared_box_gets_nearest_rotation(tmp_path):
     turn = Rotation.from_euler("zyx", [1.0, 0.2, 0.1]).as_matrix()
     shear = np.array([[1, 0.04, 0], [0, 1, 0.02], [0, 0, 1]])
-    drive, report = read(tmp_path, an_object("building", affine(turn @ shear @ np.diag([8.0, 5.0, 3.0]))))
+    drive, report = read_objects(
+        tmp_path, format_object("building", make_affine(turn @ shear @ np.diag([8.0, 5.0, 3.0])))
+    )
     assert report.defects == ()
     assert np.allclose(drive.rotation[0].T @ drive.rotation[0], np.eye(3), atol=1e-12)
     assert Rotation.from_matrix(drive.rotation[0] @ turn.T).magnitude() < 0.03
@@ -284,31 +292,37 @@ def test_kitti360_sheared_box_gets_nearest_rotation(tmp_path):
 
 def test_kitti360_tilted_box_keeps_tilt(tmp_path):
     turn = Rotation.from_euler("zyx", np.radians([30, 20, -15])).as_matrix()
-    drive, _ = read(tmp_path, an_object("wall", affine(turn @ np.diag([3.0, 0.5, 1.5]))))
+    drive, _ = read_objects(tmp_path, format_object("wall", make_affine(turn @ np.diag([3.0, 0.5, 1.5]))))
     assert np.allclose(drive.rotation[0], turn, atol=1e-6)
 
 
 def test_kitti360_uses_vertices_of_non_unit_cube(tmp_path):
-    drive, _ = read(tmp_path, an_object("box", affine(np.eye(3), (120, 200, 117)), (CUBE + 0.5) * [2, 4, 6]))
+    drive, _ = read_objects(
+        tmp_path, format_object("box", make_affine(np.eye(3), (120, 200, 117)), (CUBE + 0.5) * [2, 4, 6])
+    )
     assert np.allclose(drive.size_m[0], [2, 4, 6])
     assert np.allclose(drive.center_m[0], [121, 202, 120])
 
 
 def test_kitti360_removes_duplicate_objects(tmp_path):
-    shifted = affine(np.diag([4.4, 2.0, 1.5]), (130.0004, 204.9997, 117))
-    drive, report = read(
+    shifted = make_affine(np.diag([4.4, 2.0, 1.5]), (130.0004, 204.9997, 117))
+    drive, report = read_objects(
         tmp_path,
-        an_object(index=1, start_frame=0, end_frame=99),
-        a_slab(index=2),
-        an_object(index=3, start_frame=90, end_frame=199),
-        an_object(index=4, transform=shifted),
-        a_slab(index=5),
-        an_object("truck", index=6),  # in the same place, but another object
-        an_object(index=7, transform=affine(np.diag([4.4, 2.0, 1.5]), (130.3, 205.1, 117))),  # another window's
-        an_object(index=8, transform=affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # another car
-        an_object(index=9, transform=affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # another size
-        an_object("smallPole", index=10, transform=affine(np.diag([0.3, 0.3, 4]), (140, 205, 117))),
-        an_object("smallPole", index=11, transform=affine(np.diag([0.3, 0.3, 4]), (140.2, 205, 117))),  # its neighbour
+        format_object(index=1, start_frame=0, end_frame=99),
+        format_slab(index=2),
+        format_object(index=3, start_frame=90, end_frame=199),
+        format_object(index=4, transform=shifted),
+        format_slab(index=5),
+        format_object("truck", index=6),  # another object at the same place
+        format_object(
+            index=7, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.3, 205.1, 117))
+        ),  # copy from another annotation window
+        format_object(index=8, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # a different car
+        format_object(index=9, transform=make_affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # a different size
+        format_object("smallPole", index=10, transform=make_affine(np.diag([0.3, 0.3, 4]), (140, 205, 117))),
+        format_object(
+            "smallPole", index=11, transform=make_affine(np.diag([0.3, 0.3, 4]), (140.2, 205, 117))
+        ),  # a neighbouring pole
     )
     assert drive.instance_id.tolist() == [1, 6, 8, 9, 10, 11]
     assert (report.duplicates, report.slabs) == (4, 1)
@@ -316,8 +330,8 @@ def test_kitti360_removes_duplicate_objects(tmp_path):
 
 def test_kitti360_places_moving_objects_by_frame(tmp_path):
     moving = [
-        an_object(
-            transform=affine(np.eye(3), (120 + k, 200, 117)),
+        format_object(
+            transform=make_affine(np.eye(3), (120 + k, 200, 117)),
             index=k + 1,
             dynamic=1,
             dynamicSeq=7,
@@ -325,7 +339,7 @@ def test_kitti360_places_moving_objects_by_frame(tmp_path):
         )
         for k in range(3)
     ]
-    drive, report = read(tmp_path, *moving, moving[1], an_object(index=12))
+    drive, report = read_objects(tmp_path, *moving, moving[1], format_object(index=12))
     assert report.duplicates == 1
     assert drive.timestamp.tolist() == [0, 1, 2, STATIC]
     assert drive.instance_id.tolist() == [7, 7, 7, 12]
@@ -334,29 +348,32 @@ def test_kitti360_places_moving_objects_by_frame(tmp_path):
 
 
 def test_kitti360_is_independent_of_element_order(tmp_path):
-    element = ElementTree.fromstring(an_object())
+    element = ElementTree.fromstring(format_object())
     element[:] = reversed(element[:])
-    drive, _ = read(tmp_path, ElementTree.tostring(element, "unicode"))
+    drive, _ = read_objects(tmp_path, ElementTree.tostring(element, "unicode"))
     assert drive.size_m.tolist() == [[4.4, 2.0, 1.5]]
 
 
 def test_kitti360_scene_axes_point_ahead_and_left(tmp_path):
-    """The car faces east, so north is left. Coordinates of many km keep millimetre precision."""
+    """The car faces east, so north is to its left.
+
+    World coordinates of many km keep millimetre precision.
+    """
     far_pose = IDENTITY_POSE.replace("100", "41100").replace("200", "98200")
-    far_box = an_object(transform=affine(np.eye(3), (41110.001, 98203.002, 118)))
-    drive, _ = read_drive(write(tmp_path, document(far_box), f"0 {far_pose}\n"), "0003")
+    far_box = format_object(transform=make_affine(np.eye(3), (41110.001, 98203.002, 118)))
+    drive, _ = read_drive(write_drive(tmp_path, format_document(far_box), f"0 {far_pose}\n"), "0003")
     scene = drive.scene(0)
     assert np.allclose(scene.center_m, [[10.001, 3.002, 1]], atol=1e-5)
 
 
 def test_kitti360_reads_drive_without_boxes_or_ground(tmp_path):
-    drive, _ = read(tmp_path, a_slab())
+    drive, _ = read_objects(tmp_path, format_slab())
     assert len(drive.scene(0)) == 0
-    drive, _ = read(tmp_path, an_object())
+    drive, _ = read_objects(tmp_path, format_object())
     assert drive.scene(0).occupied.sum() == 0
 
 
-# ------------------------------------------------------------------------------- defective objects are listed
+# ------------------------------------------------------------------------------- defective objects
 
 BROKEN_OBJECTS = {
     "no transform": (lambda x: re.sub(r"<transform .*?</transform>", "", x, flags=re.S), "no transform"),
@@ -392,9 +409,9 @@ BROKEN_OBJECTS = {
 @pytest.mark.parametrize("name", BROKEN_OBJECTS)
 def test_kitti360_drops_defective_object_with_reason(tmp_path, name):
     breaks, reason = BROKEN_OBJECTS[name]
-    broken = breaks(an_object(index=77, transform=affine(np.diag([4.4, 2.0, 1.5]), (130, 205, 117))))
-    assert broken != an_object(index=77)
-    drive, report = read(tmp_path, broken, an_object("truck", index=2), a_slab(index=3))
+    broken = breaks(format_object(index=77, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130, 205, 117))))
+    assert broken != format_object(index=77)
+    drive, report = read_objects(tmp_path, broken, format_object("truck", index=2), format_slab(index=3))
     assert drive.instance_id.tolist() == [2] and report.slabs == 1
     (defect,) = report.defects
     assert reason in defect.reason and defect.index in (77, -1)
@@ -413,25 +430,25 @@ def test_kitti360_drops_defective_object_with_reason(tmp_path, name):
     ],
 )
 def test_kitti360_drops_defective_slab_with_reason(tmp_path, faces, reason):
-    drive, report = read(tmp_path, a_slab(faces=faces, index=5), an_object(index=2))
+    drive, report = read_objects(tmp_path, format_slab(faces=faces, index=5), format_object(index=2))
     assert reason in report.defects[0].reason and report.defects[0].index == 5
     assert len(drive.ground.slab_class) == 0 and len(drive.category) == 1
 
 
 def test_kitti360_sheared_flat_box_is_defective(tmp_path):
-    transform = affine(np.array([[4, 2, 0], [0, 0.5, 0], [0, 0, 1.5]]))
-    _, report = read(tmp_path, an_object(transform=transform))
+    transform = make_affine(np.array([[4, 2, 0], [0, 0.5, 0], [0, 0, 1.5]]))
+    _, report = read_objects(tmp_path, format_object(transform=transform))
     assert "sheared flat" in report.defects[0].reason
 
 
-# ----------------------------------------------------------------------------------- broken files are refused
+# ----------------------------------------------------------------------------------- broken files
 
 BOMB = '<!DOCTYPE b [<!ENTITY a "ha"><!ENTITY c "&a;&a;&a;&a;&a;&a;&a;">]>'
-GOOD = document(an_object(index=1), a_slab(index=2))
+GOOD = format_document(format_object(index=1), format_slab(index=2))
 BROKEN_FILES = {
     "empty": "",
     "blank": "  \n",
-    "no objects": document(),
+    "no objects": format_document(),
     "truncated": GOOD[: len(GOOD) // 2],
     "truncated by a byte": GOOD.rstrip()[:-1],
     "other root": GOOD.replace("opencv_storage", "kml"),
@@ -451,7 +468,7 @@ BROKEN_FILES = {
 
 @pytest.mark.parametrize("name", BROKEN_FILES)
 def test_kitti360_names_broken_xml(tmp_path, name):
-    write(tmp_path, BROKEN_FILES[name])
+    write_drive(tmp_path, BROKEN_FILES[name])
     with pytest.raises(ValueError) as error:
         read_drive(tmp_path, "0003")
     assert type(error.value) is ValueError
@@ -479,7 +496,7 @@ BROKEN_POSES = {
 @pytest.mark.parametrize("name", BROKEN_POSES)
 def test_kitti360_names_broken_poses(tmp_path, name):
     poses, reason = BROKEN_POSES[name]
-    write(tmp_path, GOOD, poses)
+    write_drive(tmp_path, GOOD, poses)
     with pytest.raises(ValueError) as error:
         read_drive(tmp_path, "0003")
     assert type(error.value) is ValueError
@@ -489,7 +506,7 @@ def test_kitti360_names_broken_poses(tmp_path, name):
 def test_kitti360_names_missing_file(tmp_path):
     with pytest.raises(ValueError, match="data_3d_bboxes"):
         list_sequences(tmp_path)
-    write(tmp_path, GOOD)
+    write_drive(tmp_path, GOOD)
     assert list_sequences(tmp_path) == ["0003"]
     poses = tmp_path / "data_poses" / NAME / "poses.txt"
     poses.unlink()
@@ -503,13 +520,13 @@ def test_kitti360_names_missing_file(tmp_path):
     poses.mkdir()
     with pytest.raises(ValueError, match=r"poses\.txt"):
         read_poses(tmp_path, "0003")
-    write(tmp_path / "two", GOOD)
+    write_drive(tmp_path / "two", GOOD)
     with pytest.raises(ValueError, match=r"0002_sync"):
         read_drive(tmp_path / "two", "0002")
 
 
 def test_kitti360_poses_are_in_world_coordinates(tmp_path):
-    write(tmp_path, GOOD)
+    write_drive(tmp_path, GOOD)
     frame, world_from_imu = read_poses(tmp_path, "0003")
     assert frame.tolist() == [0, 1, 2, 5]
     assert world_from_imu.shape == (4, 3, 4) and world_from_imu.dtype == np.float64
@@ -518,7 +535,7 @@ def test_kitti360_poses_are_in_world_coordinates(tmp_path):
 
 def test_kitti360_raises_only_named_errors_for_mutated_files(tmp_path):
     rng = np.random.default_rng(0)
-    good = document(an_object(index=1), a_slab(index=2), an_object("truck", index=3)).encode()
+    good = format_document(format_object(index=1), format_slab(index=2), format_object("truck", index=3)).encode()
     refused = 0
     for _ in range(200):
         bad = bytearray(good)
@@ -527,7 +544,7 @@ def test_kitti360_raises_only_named_errors_for_mutated_files(tmp_path):
         if rng.random() < 0.1:
             del bad[rng.integers(len(bad)) :]
         try:
-            drive, report = read_drive(write(tmp_path, bytes(bad)), "0003")
+            drive, report = read_drive(write_drive(tmp_path, bytes(bad)), "0003")
         except ValueError as error:
             refused += 1
             assert type(error) is ValueError and f"{NAME}.xml" in str(error)
