@@ -1,4 +1,4 @@
-"""The GLB of a scene, read by trimesh, has the nodes, corners, volumes and colours of the scene."""
+"""Tests of the GLB export: nodes, corners, volumes and colours, as trimesh reads them."""
 
 import io
 import json
@@ -36,8 +36,8 @@ def load(glb: bytes) -> trimesh.Scene:
     return trimesh.load_scene(io.BytesIO(glb), file_type="glb")
 
 
-def placed(loaded: trimesh.Scene, node: str) -> trimesh.Trimesh:
-    """The node's mesh in the scene frame, z up."""
+def place_mesh(loaded: trimesh.Scene, node: str) -> trimesh.Trimesh:
+    """Return the mesh of a node in the scene frame (z up)."""
     gltf_from_mesh, geometry = loaded.graph[node]
     mesh = loaded.geometry[geometry].copy()
     mesh.apply_transform(np.linalg.inv(GLTF_FROM_SCENE) @ gltf_from_mesh)
@@ -49,7 +49,7 @@ def test_scene_glb_has_named_node_per_primitive_and_ground():
     loaded = load(export_glb(scene))
     expected = {f"{CATEGORIES[c]}_{i:04d}" for i, c in enumerate(scene.category)} | {"ground"}
     assert set(loaded.graph.nodes_geometry) == expected
-    assert len(loaded.geometry) == len(CATEGORIES) + 1  # shared, not copied
+    assert len(loaded.geometry) == len(CATEGORIES) + 1  # nodes of one category share a mesh
     extras = loaded.graph.transforms.edge_data[("scene", "human_0005")]["metadata"]
     assert extras["category"] == "human" and extras["class_id"] == 11 and extras["instance_id"] == 1005
     assert extras["kind"] == "cuboid" and extras["heading_rad"] is None and extras["existence"] == 1.0
@@ -69,7 +69,7 @@ def test_scene_glb_keeps_corners_and_volumes():
     loaded = load(export_glb(scene))
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     for i, category in enumerate(scene.category):
-        mesh = placed(loaded, f"{CATEGORIES[category]}_{i:04d}")
+        mesh = place_mesh(loaded, f"{CATEGORIES[category]}_{i:04d}")
         assert mesh.is_watertight and mesh.is_winding_consistent
         if category == ELLIPSOID:
             assert 0.985 < mesh.volume / scene.volume_m3[i] < 1
@@ -94,12 +94,12 @@ def test_ground_mesh_is_fused_surface_at_pixel_centers():
     assert (mesh.face_normals[:, 2] > 0.5).all()
     quads = sum(
         (winner[i : i + 2, j : j + 2] >= 0).all() for i in range(0, 255, 5) for j in range(0, 255, 5)
-    )  # brute force on every 25th block
+    )  # compare every 25th block with brute force
     first = vertices[triangles[::2, 0]]
     at_row, at_col = scene.grid.pixel(first[:, 0], first[:, 1])
     assert ((at_row % 5 == 0) & (at_col % 5 == 0)).sum() == quads
 
-    loaded = placed(load(export_glb(scene)), "ground")
+    loaded = place_mesh(load(export_glb(scene)), "ground")
     assert np.allclose(loaded.vertices, vertices, atol=1e-4) and np.array_equal(loaded.faces, triangles)
 
 
@@ -136,7 +136,7 @@ def test_scene_glb_colors_are_palette_in_linear_light():
     expected = np.array([linear_light(COLOR_HEX[name]) for name in KITTI_GROUND_CLASSES])
     distance = np.abs(painted[::97, None] - expected[None]).max(axis=-1)
     assert distance.min(axis=1).max() <= 0.5 / 255 + 1e-6
-    assert (distance.min(axis=0) < 0.01).all()  # each class occurs
+    assert (distance.min(axis=0) < 0.01).all()  # the scene contains each class
 
 
 def test_scene_triangles_are_closed_per_primitive():
@@ -167,8 +167,8 @@ def test_scene_glb_accepts_empty_scene():
 
 
 def test_scene_glb_passes_khronos_validator(tmp_path):
-    """The glTF validator reports no errors, warnings, infos or hints, and finds every mesh."""
-    modules = Path(sys.prefix) / "npm" / "node_modules"  # installed by the Makefile where npm exists
+    """The glTF validator reports no errors, warnings, infos or hints, and it finds every mesh."""
+    modules = Path(sys.prefix) / "npm" / "node_modules"  # the Makefile installs the validator if npm exists
     if not (shutil.which("node") and modules.is_dir()):
         pytest.skip("no node, or no gltf-validator in .venv/npm")
     scenes = [example_scene(), example_scene(3), replace(example_scene(2), occupied=np.zeros((5, 256, 256), bool))]
@@ -179,7 +179,9 @@ def test_scene_glb_passes_khronos_validator(tmp_path):
     done = subprocess.run(["node", script, modules, *paths], capture_output=True, text=True, check=True)
     for report, scene in zip(json.loads(done.stdout), scenes, strict=True):
         assert report["issues"]["messages"] == []
-        assert report["info"]["drawCallCount"] == len(np.unique(scene.category)) + scene.occupied.any()  # meshes
+        assert (
+            report["info"]["drawCallCount"] == len(np.unique(scene.category)) + scene.occupied.any()
+        )  # number of meshes
 
 
 def test_write_glb_leaves_only_its_file(tmp_path):
