@@ -1,4 +1,7 @@
-"""GLB files are read as scenes: own exports exactly, files of the authors (docs/imports.md) by shape."""
+"""Tests of the GLB import: exports of PrITTI on Ray, and files of the paper's authors.
+
+docs/how_to/import_scenes.md describes both formats.
+"""
 
 import json
 from dataclasses import replace
@@ -23,29 +26,29 @@ def town_scenes(town_drive_3) -> list[Scene]:
     return [town_drive_3.scene(k, "test") for k in (0, len(town_drive_3) // 2)]
 
 
-def corners_m(scene: Scene) -> np.ndarray:
-    """(n, 8, 3)."""
+def compute_corners_m(scene: Scene) -> np.ndarray:
+    """Return the corners (n, 8, 3) of all primitives in m."""
     return (SIGNS * scene.size_m[:, None]) @ np.swapaxes(scene.rotation, 1, 2) + scene.center_m[:, None]
 
 
-def scatter_m2(scene: Scene) -> np.ndarray:
-    """(n, 3, 3) R diag(size)^2 R^T: the shape of an ellipsoid, independent of its axis order."""
+def compute_scatter_m2(scene: Scene) -> np.ndarray:
+    """Return R diag(size)^2 R^T (n, 3, 3), the shape of an ellipsoid regardless of its axis order."""
     axes = scene.rotation.astype(float) * scene.size_m[:, None]
     return axes @ np.swapaxes(axes, 1, 2)
 
 
-def surface_classes(scene: Scene) -> np.ndarray:
+def list_surface_classes(scene: Scene) -> np.ndarray:
     return np.array([*scene.ground_classes, ""])[scene.surface()[1]]
 
 
 def assert_same_ground(got: Scene, want: Scene) -> None:
     assert np.array_equal(got.surface()[0], want.surface()[0])
-    assert np.array_equal(surface_classes(got), surface_classes(want))
-    assert np.array_equal(got.occupied.sum(axis=0), want.occupied.any(axis=0))  # one class per pixel
+    assert np.array_equal(list_surface_classes(got), list_surface_classes(want))
+    assert np.array_equal(got.occupied.sum(axis=0), want.occupied.any(axis=0))  # each pixel has one class
 
 
-def edited(glb: bytes, change) -> bytes:
-    """The GLB with its JSON changed."""
+def edit_glb(glb: bytes, change) -> bytes:
+    """Return the GLB after `change` edited its JSON."""
     size = int.from_bytes(glb[12:16], "little")
     tree = json.loads(glb[20 : 20 + size])
     change(tree)
@@ -55,11 +58,11 @@ def edited(glb: bytes, change) -> bytes:
     return glb[:8] + (12 + len(body)).to_bytes(4, "little") + body
 
 
-# ------------------------------------------------------------------------------------------------------ our own
+# ------------------------------------------------------------------------------------------------------ own exports
 
 
 def assert_same_scene(got: Scene, want: Scene) -> None:
-    assert np.abs(corners_m(got) - corners_m(want)).max(initial=0) < 1e-3
+    assert np.abs(compute_corners_m(got) - compute_corners_m(want)).max(initial=0) < 1e-3
     for name in ("category", "center_m", "size_m", "existence", "heading_rad", "instance_id", "label"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
     for name in ("scene_id", "source", "sequence", "frame", "split", "grid", "ground_classes", "world_xyz_m"):
@@ -118,19 +121,22 @@ def test_scene_from_glb_applies_node_transform():
         matrix[0, 3] += 1.5
         node["matrix"] = matrix.T.ravel().tolist()
 
-    got = import_glb(edited(export_glb(scene), change), scene_id="edited")
+    got = import_glb(edit_glb(export_glb(scene), change), scene_id="edited")
     box = SIGNS * scene.size_m[1] @ (turn @ scene.rotation[1]).T + scene.center_m[1] + [1.5, 0, 0]
-    apart = np.linalg.norm(corners_m(got)[1][:, None] - box[None], axis=-1)
+    apart = np.linalg.norm(compute_corners_m(got)[1][:, None] - box[None], axis=-1)
     assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
     assert np.isnan(got.heading_rad[1]) and np.array_equal(got.heading_rad[[0, 2]], scene.heading_rad[[0, 2]])
     assert got.scene_id == "edited"
 
 
-# -------------------------------------------------------------------------------------------- the authors' form
+# -------------------------------------------------------------------------------------------- format of the authors
 
 
-def three_sphere() -> tuple[np.ndarray, np.ndarray]:
-    """63 vertices of radius 1, 9 columns x 7 rows, poles on y, and 80 triangles; two vertices are unused."""
+def make_three_sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return the sphere of three.js: 63 vertices (9 columns x 7 rows, radius 1, poles on y) and 80 triangles.
+
+    Two of the vertices belong to no triangle.
+    """
     u, v = np.meshgrid(np.arange(9) / 8 * 2 * np.pi, np.arange(7) / 6 * np.pi)
     vertices = np.stack([-np.cos(u) * np.sin(v), np.cos(v), np.sin(u) * np.sin(v)], axis=-1).reshape(-1, 3)
     faces = []
@@ -142,8 +148,8 @@ def three_sphere() -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.array(faces)
 
 
-def three_box() -> tuple[np.ndarray, np.ndarray]:
-    """Eight vertices at ±0.5 in the order of KITTI-360, and twelve triangles."""
+def make_three_box() -> tuple[np.ndarray, np.ndarray]:
+    """Return a box with eight vertices at ±0.5, in the order of KITTI-360, and twelve triangles."""
     corners = [
         [(1 if s == "+" else -1) / 2 for s in word] for word in ["+++", "++-", "+-+", "+--", "-+-", "-++", "---", "--+"]
     ]
@@ -157,7 +163,7 @@ def three_box() -> tuple[np.ndarray, np.ndarray]:
     return corners, np.array(faces)
 
 
-def painted(vertices, faces, name: str | np.ndarray, linear: bool) -> trimesh.Trimesh:
+def make_painted_mesh(vertices, faces, name: str | np.ndarray, linear: bool) -> trimesh.Trimesh:
     names = np.broadcast_to(name, len(vertices))
     color = np.array([parse_rgb(COLOR_HEX[n]) for n in names]) / 255
     if linear:
@@ -166,7 +172,7 @@ def painted(vertices, faces, name: str | np.ndarray, linear: bool) -> trimesh.Tr
     return trimesh.Trimesh(vertices, faces, vertex_colors=rgba, process=False)
 
 
-def authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
+def make_authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
     height, winner = scene.surface()
     i, j = np.nonzero(winner >= 0)
     vertices = np.stack([64 - 0.25 * i, -32 + 0.25 * j, -height[i, j].astype(float)], axis=1)
@@ -175,20 +181,25 @@ def authors_ground(scene: Scene, linear: bool) -> trimesh.Trimesh:
     here, below, right, across = at[:-1, :-1], at[1:, :-1], at[:-1, 1:], at[1:, 1:]
     faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((here, below, right), (right, below, across))])
     names = np.array(scene.ground_classes)[winner[i, j]]
-    return painted(vertices, faces[(faces >= 0).all(axis=1)], names, linear)
+    return make_painted_mesh(vertices, faces[(faces >= 0).all(axis=1)], names, linear)
 
 
-def authors_glb(
+def export_authors_glb(
     scene: Scene, merged: bool = False, linear: bool = False, unmerged: bool = False, faces: bool = False
 ) -> bytes:
-    """The scene in the format of the published files (docs/imports.md), exported by trimesh."""
-    parts = [(authors_ground(scene, linear), np.eye(4))] if scene.occupied.any() else []
+    """Export a scene with trimesh in the format of the authors' files (docs/how_to/import_scenes.md)."""
+    parts = [(make_authors_ground(scene, linear), np.eye(4))] if scene.occupied.any() else []
     for k, category in enumerate(scene.category):
         round_ = category == ELLIPSOID
         transform = np.eye(4)
         transform[:3, :3] = Z_DOWN @ scene.rotation[k] * scene.size_m[k] / (2 if round_ else 1)
         transform[:3, 3] = Z_DOWN @ scene.center_m[k]
-        parts.append((painted(*(three_sphere() if round_ else three_box()), CATEGORIES[category], linear), transform))
+        parts.append(
+            (
+                make_painted_mesh(*(make_three_sphere() if round_ else make_three_box()), CATEGORIES[category], linear),
+                transform,
+            )
+        )
     if unmerged:
         for mesh, _ in parts:
             mesh.unmerge_vertices()
@@ -205,24 +216,24 @@ def authors_glb(
 
 
 def assert_same_primitives(got: Scene, want: Scene) -> None:
-    """Asserts a one-to-one match in any order: boxes by their corners, ellipsoids by their shape."""
+    """Assert that primitives match one to one in any order: boxes by corners, ellipsoids by shape."""
     assert np.array_equal(got.counts(), want.counts())
     left = list(range(len(got)))
-    for k, corners in enumerate(corners_m(want)):
+    for k, corners in enumerate(compute_corners_m(want)):
         same = [i for i in left if got.category[i] == want.category[k]]
         nearest = min(
             same,
             key=lambda i: (
-                np.abs(scatter_m2(got)[i] - scatter_m2(want)[k]).max()
+                np.abs(compute_scatter_m2(got)[i] - compute_scatter_m2(want)[k]).max()
                 + np.linalg.norm(got.center_m[i] - want.center_m[k])
             ),
         )
         left.remove(nearest)
         assert np.linalg.norm(got.center_m[nearest] - want.center_m[k]) < 1e-3
         if want.category[k] == ELLIPSOID:
-            assert np.abs(scatter_m2(got)[nearest] - scatter_m2(want)[k]).max() < 1e-3
+            assert np.abs(compute_scatter_m2(got)[nearest] - compute_scatter_m2(want)[k]).max() < 1e-3
         else:
-            apart = np.linalg.norm(corners_m(got)[nearest][:, None] - corners[None], axis=-1)
+            apart = np.linalg.norm(compute_corners_m(got)[nearest][:, None] - corners[None], axis=-1)
             assert apart.min(axis=0).max() < 1e-3 and apart.min(axis=1).max() < 1e-3
     rotation, size_m = canonicalize_boxes(got.rotation, got.size_m)
     assert np.allclose(rotation, got.rotation, atol=1e-5) and np.array_equal(size_m, got.size_m)
@@ -232,7 +243,7 @@ def assert_same_primitives(got: Scene, want: Scene) -> None:
 @pytest.mark.parametrize("linear", [False, True], ids=["sRGB", "linear"])
 def test_scene_from_glb_reads_format_of_authors(town_scenes, merged, linear):
     scene = town_scenes[1]
-    got = import_glb(authors_glb(scene, merged, linear))
+    got = import_glb(export_authors_glb(scene, merged, linear))
     assert_same_primitives(got, scene)
     assert_same_ground(got, scene)
     assert got.source == "imported" and got.split == "generated" and got.grid == Grid()
@@ -245,44 +256,49 @@ def test_scene_from_glb_keeps_pitch_and_roll(merged):
     roll = trimesh.transformations.rotation_matrix(0.4, [1, 0, 0])[:3, :3]
     rotation, size_m = canonicalize_boxes(rotation @ roll, size_m)
     scene = replace(random_scene(5, n=60), rotation=rotation.astype(np.float32), size_m=size_m.astype(np.float32))
-    assert_same_primitives(import_glb(authors_glb(scene, merged)), scene)
+    assert_same_primitives(import_glb(export_authors_glb(scene, merged)), scene)
 
 
 def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
     scene = town_scenes[1].select(np.arange(20))
     assert {ELLIPSOID, *scene.category} > {ELLIPSOID}
     for merged in (False, True):
-        got = import_glb(authors_glb(scene, merged, unmerged=True))
+        got = import_glb(export_authors_glb(scene, merged, unmerged=True))
         assert_same_primitives(got, scene)
-        isolated = got.occupied.any(axis=0) != scene.occupied.any(axis=0)  # in no triangle, so absent from this file
+        isolated = got.occupied.any(axis=0) != scene.occupied.any(
+            axis=0
+        )  # the file lacks pixels that belong to no triangle
         assert isolated.sum() < 50
 
 
 def test_scene_from_glb_mixes_face_colors_only_on_borders(town_scenes):
     scene = town_scenes[1]
-    got = import_glb(authors_glb(scene, merged=True, faces=True))
+    got = import_glb(export_authors_glb(scene, merged=True, faces=True))
     assert_same_primitives(got, scene)
     both = got.occupied.any(axis=0) & scene.occupied.any(axis=0)
     assert both.sum() > 0.99 * scene.occupied.any(axis=0).sum()
     assert np.array_equal(got.surface()[0][both], scene.surface()[0][both])
-    assert (surface_classes(got) == surface_classes(scene))[both].mean() > 0.97
+    assert (list_surface_classes(got) == list_surface_classes(scene))[both].mean() > 0.97
 
 
 def test_scene_from_glb_reads_mesh_without_extras_by_shape(town_scenes):
-    """Own export without extras, as some editors write it: y up, vertices at pixel centres, linear light."""
+    """Some editors drop the extras of a GLB, so the import must recognise the shapes.
+
+    The file is an export of PrITTI on Ray with y up and vertices at pixel centres.
+    """
     scene = town_scenes[1]
 
     def strip(tree):
         for entry in (*tree["scenes"], *tree["nodes"], *tree["meshes"]):
             entry.pop("extras", None)
 
-    got = import_glb(edited(export_glb(scene), strip), axes=("y+", "z+", "x+"))
+    got = import_glb(edit_glb(export_glb(scene), strip), axes=("y+", "z+", "x+"))
     assert_same_primitives(got, scene)
     assert_same_ground(got, scene)
 
 
 def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
-    (tmp_path / "scene-7.glb").write_bytes(authors_glb(town_scenes[0].select([0])))
+    (tmp_path / "scene-7.glb").write_bytes(export_authors_glb(town_scenes[0].select([0])))
     assert import_glb(tmp_path / "scene-7.glb").scene_id == "scene-7"
     assert import_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
 
@@ -290,60 +306,63 @@ def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
 # ------------------------------------------------------------------------------------------------------- faults
 
 
-def one_mesh(vertices, faces, name: str = "vehicle_small") -> bytes:
-    return trimesh.Scene(painted(np.asarray(vertices, float), faces, name, False)).export(file_type="glb")
+def export_mesh(vertices, faces, name: str = "vehicle_small") -> bytes:
+    return trimesh.Scene(make_painted_mesh(np.asarray(vertices, float), faces, name, False)).export(file_type="glb")
 
 
-def welded_boxes(name: str) -> bytes:
-    """Two boxes that share a face and its vertices."""
+def export_welded_boxes(name: str) -> bytes:
+    """Return a GLB of two boxes that share a face and its vertices."""
     boxes = trimesh.creation.box(), trimesh.creation.box(bounds=[[0.5, -0.5, -0.5], [2, 0.5, 0.5]])
     whole = trimesh.util.concatenate(boxes)
     whole.merge_vertices()
-    return one_mesh(whole.vertices, whole.faces, name)
+    return export_mesh(whole.vertices, whole.faces, name)
 
 
-def sheared() -> bytes:
+def export_sheared_box() -> bytes:
     box = trimesh.creation.box()
-    return one_mesh(box.vertices @ np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]), box.faces)
+    return export_mesh(box.vertices @ np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]), box.faces)
 
 
-def with_json(change) -> bytes:
-    return edited(export_glb(random_scene(6, n=2)), change)
+def export_with_json(change) -> bytes:
+    return edit_glb(export_glb(random_scene(6, n=2)), change)
 
 
-def green() -> bytes:
-    return trimesh.Trimesh(*three_box(), vertex_colors=[10, 200, 10, 255], process=False).export(file_type="glb")
+def export_green_box() -> bytes:
+    return trimesh.Trimesh(*make_three_box(), vertex_colors=[10, 200, 10, 255], process=False).export(file_type="glb")
 
 
 FAULTS = {
     "text": (lambda: b"{}", "not a binary glTF"),
     "truncated": (lambda: export_glb(random_scene(6, n=2))[:-100], "expected a whole file"),
-    "uri": (lambda: with_json(lambda t: t["buffers"][0].update(uri="http://x/y.bin")), "buffers lie outside"),
-    "image": (lambda: with_json(lambda t: t.update(images=[{"uri": "../x.png"}])), "images lie outside"),
-    "draco": (lambda: with_json(lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"])), "draco"),
-    "cycle": (lambda: with_json(lambda t: t["nodes"][0].update(children=[0])), "two parents"),
-    "beyond": (lambda: with_json(lambda t: t["accessors"][0].update(count=10**7)), "beyond the file's"),
-    "stride": (lambda: with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond the file's"),
-    "many": (lambda: with_json(lambda t: t["accessors"][0].update(count=10**12)), "more than"),
-    "missing": (lambda: with_json(lambda t: t.pop("accessors")), "not well-formed"),
-    "number": (lambda: with_json(lambda t: t.update(nodes=7)), "not well-formed"),
+    "uri": (lambda: export_with_json(lambda t: t["buffers"][0].update(uri="http://x/y.bin")), "buffers lie outside"),
+    "image": (lambda: export_with_json(lambda t: t.update(images=[{"uri": "../x.png"}])), "images lie outside"),
+    "draco": (lambda: export_with_json(lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"])), "draco"),
+    "cycle": (lambda: export_with_json(lambda t: t["nodes"][0].update(children=[0])), "two parents"),
+    "beyond": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**7)), "beyond the file's"),
+    "stride": (lambda: export_with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond the file's"),
+    "many": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**12)), "more than"),
+    "missing": (lambda: export_with_json(lambda t: t.pop("accessors")), "not well-formed"),
+    "number": (lambda: export_with_json(lambda t: t.update(nodes=7)), "not well-formed"),
     "grid": (
-        lambda: with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)),
+        lambda: export_with_json(lambda t: t["scenes"][0]["extras"]["grid"].update(rows=10**9)),
         "the grid .* is invalid",
     ),
     "extras": (
-        lambda: with_json(lambda t: t["nodes"][-1]["extras"].pop("label")),
+        lambda: export_with_json(lambda t: t["nodes"][-1]["extras"].pop("label")),
         "extras of this export are incomplete",
     ),
     "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class colour"),
-    "colour": (green, r"colour #0ac80a \(sRGB\) of 8 vertices is no class colour"),
-    "sheared": (sheared, "eight vertices that are not the corners of a box|corners are not square"),
-    "welded": (lambda: welded_boxes("vehicle_small"), "more than eight vertices but is no vegetation"),
-    "bush": (lambda: welded_boxes("vegetation_cuboid"), "neither on a box nor on an ellipsoid"),
-    "ball": (lambda: one_mesh(*three_sphere(), "vehicle_small"), "more than eight vertices but is no vegetation"),
-    "flat": (lambda: one_mesh(three_box()[0] * [1, 1, 0], three_box()[1]), "thinner than 1 mm"),
-    "triangle": (lambda: one_mesh(np.eye(3), [[0, 1, 2]]), "fewer than eight"),
-    "nan": (lambda: one_mesh(np.full((8, 3), np.nan), three_box()[1]), "NaN"),
+    "colour": (export_green_box, r"colour #0ac80a \(sRGB\) of 8 vertices is no class colour"),
+    "sheared": (export_sheared_box, "eight vertices that are not the corners of a box|corners are not square"),
+    "welded": (lambda: export_welded_boxes("vehicle_small"), "more than eight vertices but is no vegetation"),
+    "bush": (lambda: export_welded_boxes("vegetation_cuboid"), "neither on a box nor on an ellipsoid"),
+    "ball": (
+        lambda: export_mesh(*make_three_sphere(), "vehicle_small"),
+        "more than eight vertices but is no vegetation",
+    ),
+    "flat": (lambda: export_mesh(make_three_box()[0] * [1, 1, 0], make_three_box()[1]), "thinner than 1 mm"),
+    "triangle": (lambda: export_mesh(np.eye(3), [[0, 1, 2]]), "fewer than eight"),
+    "nan": (lambda: export_mesh(np.full((8, 3), np.nan), make_three_box()[1]), "NaN"),
 }
 
 
@@ -357,7 +376,7 @@ def test_scene_from_glb_names_unknown_mesh_and_its_content(tmp_path, fault):
 
 
 def test_scene_from_glb_rejects_wrong_frame_and_axes(town_scenes):
-    glb = authors_glb(town_scenes[0])
+    glb = export_authors_glb(town_scenes[0])
     with pytest.raises(ValueError, match=r"ground vertices, x .* are not one per pixel .*check the axes"):
         import_glb(glb, axes=("y+", "x+", "z+"))
     with pytest.raises(ValueError, match=r"axes 'x\+ x\+ z\+' are invalid; name x"):
@@ -369,13 +388,15 @@ def test_scene_from_glb_names_missing_file(tmp_path):
         import_glb(tmp_path / "absent.glb")
 
 
-def leaves(tree: dict | list) -> list[tuple]:
-    """(container, key) of every value in a JSON tree."""
+def iterate_leaves(tree: dict | list) -> list[tuple]:
+    """Yield (container, key) of every value in a JSON tree."""
     items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
-    return [(tree, k) for k, _ in items] + [leaf for _, v in items if isinstance(v, dict | list) for leaf in leaves(v)]
+    return [(tree, k) for k, _ in items] + [
+        leaf for _, v in items if isinstance(v, dict | list) for leaf in iterate_leaves(v)
+    ]
 
 
-@pytest.mark.parametrize("make", [export_glb, authors_glb], ids=["ours", "theirs"])
+@pytest.mark.parametrize("make", [export_glb, export_authors_glb], ids=["ours", "theirs"])
 def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
     grid = Grid(front_m=64.0, left_m=32.0, resolution_m=0.25, rows=8, cols=8)
     glb, rng = make(random_scene(7, n=4, grid=grid)), np.random.default_rng(0)
@@ -384,12 +405,12 @@ def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
     for _ in range(300):
 
         def change(tree):
-            inside = leaves(tree)
+            inside = iterate_leaves(tree)
             container, key = inside[rng.integers(len(inside))]
             container[key] = values[rng.integers(len(values))]
 
         try:
-            import_glb(edited(glb, change))
+            import_glb(edit_glb(glb, change))
             outcomes["scene"] += 1
         except ValueError:
             outcomes["refused"] += 1
@@ -397,4 +418,4 @@ def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
 
 
 def test_scene_from_glb_of_authors_has_five_ground_classes(town_scenes):
-    assert import_glb(authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]
+    assert import_glb(export_authors_glb(town_scenes[0])).ground_classes == GROUND_CLASSES[:5]
