@@ -1,4 +1,4 @@
-"""Schedule, samplers, RePaint and the trainer, compared with diffusers and torch."""
+"""Tests of the noise schedule, samplers, RePaint and the trainer, in part against diffusers and torch."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from models.sampling.schedulers import SchedulerConfig
 from models.training import ExecutionConfig, NonFiniteLossError, OptimizerConfig, make_dit_trainer
 
 
-def random_dit(seed: int = 0, **options) -> DiT:
+def make_random_dit(seed: int = 0, **options) -> DiT:
     torch.manual_seed(seed)
     dit = DiT(channels=4, size=8, width=32, depth=2, heads=2, **options)
     for parameter in dit.parameters():
@@ -70,18 +70,20 @@ def test_add_noise_in_two_steps_has_variance_of_one():
 
 
 def test_velocity_converts_to_epsilon():
-    """Converts the velocity of diffusers with the weights of a DiT that predicts velocities."""
+    """The velocity is computed by diffusers; its factors are those of a DiT that predicts velocities."""
     clean, noise, t = torch.randn(4, *LATENT_SHAPE), torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999])
     latent, velocity = (
         SchedulerConfig.ddpm().build().add_noise(clean, noise, t),
         SchedulerConfig.ddpm().build().get_velocity(clean, noise, t),
     )
-    of_latent, of_velocity = random_dit(prediction="v_prediction").noise_shares[t][:, :, None, None, None].unbind(1)
+    of_latent, of_velocity = (
+        make_random_dit(prediction="v_prediction").noise_shares[t][:, :, None, None, None].unbind(1)
+    )
     assert torch.allclose(of_latent * latent + of_velocity * velocity, noise, atol=1e-5)
 
 
 def test_velocity_dit_equals_weighted_epsilon_dit():
-    noise_dit, velocity_dit = random_dit(), random_dit(prediction="v_prediction")
+    noise_dit, velocity_dit = make_random_dit(), make_random_dit(prediction="v_prediction")
     latent, t, label = torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999]), torch.tensor([0, 1, 2, 3])
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar[t]).float()[:, None, None, None]
     velocity = noise_dit(latent, t, label)
@@ -91,7 +93,7 @@ def test_velocity_dit_equals_weighted_epsilon_dit():
         velocity_dit.precompute_conditioning(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5
     )
     assert (noise_dit.loss_weight(t) == 1).all()
-    other = torch.randn(4, *LATENT_SHAPE)  # the weighted error in epsilon is the error in velocity
+    other = torch.randn(4, *LATENT_SHAPE)  # the weighted epsilon error equals the velocity error
     wrong = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * other
     weighted = velocity_dit.loss_weight(t) * ((wrong - expected) ** 2).mean((1, 2, 3))
     assert torch.allclose(weighted, ((other - velocity) ** 2).mean((1, 2, 3)), rtol=1e-3)
@@ -100,7 +102,7 @@ def test_velocity_dit_equals_weighted_epsilon_dit():
 
 
 def test_sample_depends_only_on_seed_and_index():
-    dit, schedule = random_dit(), SamplingSchedule(Diffusion(), 20)
+    dit, schedule = make_random_dit(), SamplingSchedule(Diffusion(), 20)
     labels = torch.arange(8) % 3
     together = sample(dit, schedule, SceneNoise(5, range(8), LATENT_SHAPE, "cpu"), labels)
     alone = torch.cat(
@@ -127,7 +129,7 @@ def test_guidance_at_scale_one_adds_no_evaluation():
 
 
 def test_repaint_timesteps_equal_diffusers():
-    """The sequence of timesteps equals that of diffusers, which uses the code of RePaint's authors."""
+    """The timesteps equal those of diffusers, which contains code of the RePaint authors."""
     reference = RePaintScheduler(num_train_timesteps=250)
     for jump, resamplings in ((10, 10), (5, 3), (10, 1), (1, 2)):
         reference.set_timesteps(250, jump_length=jump, jump_n_sample=resamplings)
@@ -143,7 +145,7 @@ def test_repaint_timesteps_equal_diffusers():
 
 
 def test_repaint_returns_known_part_exactly():
-    dit, schedule = random_dit(), SamplingSchedule(Diffusion(), 20)
+    dit, schedule = make_random_dit(), SamplingSchedule(Diffusion(), 20)
     clean = torch.randn(2, *LATENT_SHAPE)
     mask = torch.zeros(2, *LATENT_SHAPE)
     mask[:, :, :4] = 1
@@ -193,13 +195,13 @@ def test_sampler_rejects_invalid_step_counts():
     )
 
 
-def dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
+def make_dit_batch(n: int = 8) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     mean = torch.randn(n, *LATENT_SHAPE, generator=generator)
     return {"mean": mean, "logvar": torch.full_like(mean, -6.0), "label": torch.arange(n) % 3}
 
 
-def new_trainer(execution: ExecutionConfig | None = None, prediction: str = "epsilon", **changes):
+def make_trainer(execution: ExecutionConfig | None = None, prediction: str = "epsilon", **changes):
     torch.manual_seed(0)
     settings = OptimizerConfig(
         **({"steps": 300, "learning_rate": 2e-3, "weight_decay": 0.0, "ema_decay": 0.99} | changes)
@@ -210,21 +212,21 @@ def new_trainer(execution: ExecutionConfig | None = None, prediction: str = "eps
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_dit_overfits_one_batch(prediction):
-    trainer, batch = new_trainer(prediction=prediction), dit_batch(2)
+    trainer, batch = make_trainer(prediction=prediction), make_dit_batch(2)
     losses = [trainer.step(batch, range(2)) for _ in range(300)]
     assert np.mean([float(loss["loss"]) for loss in losses[:5]]) > 0.9
     assert np.mean([float(loss["noise_error"]) for loss in losses[-50:]]) < 0.35
 
 
 def test_trainer_resumes_exactly(tmp_path):
-    batch = dit_batch()
-    straight = new_trainer()
+    batch = make_dit_batch()
+    straight = make_trainer()
     curve = [float(straight.step(batch, range(8))["loss"]) for _ in range(8)]
-    first = new_trainer()
+    first = make_trainer()
     for _ in range(4):
         first.step(batch, range(8))
     first.save(tmp_path)
-    second = new_trainer()
+    second = make_trainer()
     second.load(tmp_path)
     assert [float(second.step(batch, range(8))["loss"]) for _ in range(4)] == curve[4:]
     for name, value in straight.model.state_dict().items():
@@ -233,24 +235,24 @@ def test_trainer_resumes_exactly(tmp_path):
         assert torch.equal(value, second.ema[name]), name
     assert {p.suffix for p in tmp_path.iterdir()} == {".json", ".safetensors"}
     with pytest.raises(ValueError, match=r"was trained with learning_rate=0.002, asked for 0.1"):
-        new_trainer(learning_rate=0.1).load(tmp_path)
+        make_trainer(learning_rate=0.1).load(tmp_path)
 
 
 def test_trainer_half_batches_have_losses_of_whole_batch():
-    """Two workers of 4 see the losses that one worker of 8 sees."""
-    batch = dit_batch()
-    whole = float(new_trainer().step(batch, range(8))["loss"])
+    """Two workers with four samples each compute the losses of one worker with eight samples."""
+    batch = make_dit_batch()
+    whole = float(make_trainer().step(batch, range(8))["loss"])
     halves = []
     for rank in range(2):
         here = slice(4 * rank, 4 * rank + 4)
-        halves.append(float(new_trainer().step({k: v[here] for k, v in batch.items()}, range(8)[here])["loss"]))
+        halves.append(float(make_trainer().step({k: v[here] for k, v in batch.items()}, range(8)[here])["loss"]))
     assert np.isclose(np.mean(halves), whole, rtol=1e-6)
 
 
 @pytest.mark.parametrize("parts", [2, 3, 8])
 def test_trainer_accumulated_parts_equal_whole_step(parts):
-    batch = dit_batch()
-    whole, cut = new_trainer(), new_trainer(execution=ExecutionConfig(accumulate=parts))
+    batch = make_dit_batch()
+    whole, cut = make_trainer(), make_trainer(execution=ExecutionConfig(accumulate=parts))
     for _ in range(3):
         losses = [trainer.step(batch, range(8)) for trainer in (whole, cut)]
     assert np.isclose(*(float(part["loss"]) for part in losses), rtol=1e-5)
@@ -260,9 +262,9 @@ def test_trainer_accumulated_parts_equal_whole_step(parts):
 
 
 def test_trainer_bf16_and_compile_compute_same_loss():
-    batch = dit_batch()
-    plain = float(new_trainer().step(batch, range(8))["loss"])
-    half = new_trainer(execution=ExecutionConfig(precision="bf16"))
+    batch = make_dit_batch()
+    plain = float(make_trainer().step(batch, range(8))["loss"])
+    half = make_trainer(execution=ExecutionConfig(precision="bf16"))
     assert np.isclose(float(half.step(batch, range(8))["loss"]), plain, rtol=2e-2)
     assert all(p.dtype == torch.float32 for p in half.model.parameters())
     with pytest.raises(ValueError, match="expected 1 or more, and auto, fp32 or bf16"):
@@ -270,15 +272,15 @@ def test_trainer_bf16_and_compile_compute_same_loss():
 
 
 def test_trainer_stops_at_nonfinite_loss_before_update():
-    trainer, batch, asked = new_trainer(), dit_batch(), []
+    trainer, batch, calls = make_trainer(), make_dit_batch(), []
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
-    trainer.wrapped = lambda *inputs: asked.append(1) or trainer.model(*inputs)
+    trainer.wrapped = lambda *inputs: calls.append(1) or trainer.model(*inputs)
     batch["mean"][3] = float("nan")
     with pytest.raises(NonFiniteLossError, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
         trainer.step(batch, range(8, 16))
     assert (
-        caught.value.positions == [11] and len(asked) == 1
-    )  # the search for the sample is no step: other workers take none
+        caught.value.positions == [11] and len(calls) == 1
+    )  # the search for the sample does not call the wrapped model, which would wait for other workers
     batch["mean"][:] = float("nan")
     with pytest.raises(NonFiniteLossError, match="of every sample, so the weights are invalid"):
         trainer.step(batch, range(8))
@@ -286,15 +288,15 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
 
 
 def test_trainer_drops_labels_of_a_tenth_of_samples():
-    trainer, labels = new_trainer(), []
+    trainer, labels = make_trainer(), []
     real = trainer.wrapped.forward
 
-    def spy(latent, timestep, label):
+    def record_labels(latent, timestep, label):
         labels.extend(label.tolist())
         return real(latent, timestep, label)
 
-    trainer.wrapped.forward = spy
-    batch = {name: value.repeat(16, *[1] * (value.ndim - 1)) for name, value in dit_batch().items()}
+    trainer.wrapped.forward = record_labels
+    batch = {name: value.repeat(16, *[1] * (value.ndim - 1)) for name, value in make_dit_batch().items()}
     for _ in range(8):
         trainer.step(batch, range(128))
     dropped = np.mean(np.array(labels) == trainer.model.null_label)
@@ -302,7 +304,7 @@ def test_trainer_drops_labels_of_a_tenth_of_samples():
 
 
 def test_learning_rate_is_one_cycle_without_warm_up():
-    """Equals torch's cosine annealing from 1e-4 to 1e-5: OneCycleLR without warm-up."""
+    """The learning rate equals CosineAnnealingLR of torch from 1e-4 to 1e-5: OneCycleLR without warm-up."""
     settings = OptimizerConfig(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
     rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
     assert (
@@ -319,8 +321,8 @@ def test_learning_rate_is_one_cycle_without_warm_up():
         reference.step()
 
 
-def test_pseudoinverse_guidance_follows_line_that_repaint_loses():
-    """Data on the line z_1 = z_0 with its exact denoiser: generated values must match the known ones."""
+def test_pseudoinverse_guidance_halves_error():
+    """For data on the line z_1 = z_0 and the exact denoiser, generated values must equal known values."""
     schedule, covariance = SamplingSchedule(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
 
     def denoise(latent, timestep, label):
@@ -333,10 +335,10 @@ def test_pseudoinverse_guidance_follows_line_that_repaint_loses():
     given = torch.linspace(-2, 2, count)[:, None, None, None].expand(count, 2, 1, 1).clone()
     mask = torch.tensor([0.0, 1.0])[None, :, None, None].expand_as(given)
     label = torch.zeros(count, dtype=torch.long)
-    missed = {}
+    errors = {}
     for weight in (0.0, 1.0):
         noise = SceneNoise(0, range(count), (2, 1, 1), "cpu")
         made = sample(denoise, schedule, noise, label, None, InpaintCondition(given, mask), guidance_weight=weight)
         assert torch.equal(made[:, 0], given[:, 0])
-        missed[weight] = (made[:, 1] - given[:, 1]).abs().mean().item()
-    assert missed[1.0] < 0.5 * missed[0.0], missed
+        errors[weight] = (made[:, 1] - given[:, 1]).abs().mean().item()
+    assert errors[1.0] < 0.5 * errors[0.0], errors
