@@ -388,11 +388,11 @@ def test_scene_from_glb_names_missing_file(tmp_path):
         import_glb(tmp_path / "absent.glb")
 
 
-def iterate_leaves(tree: dict | list) -> list[tuple]:
-    """Yield (container, key) of every value in a JSON tree."""
+def list_leaves(tree: dict | list) -> list[tuple]:
+    """Return (container, key) of every value in a JSON tree."""
     items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
     return [(tree, k) for k, _ in items] + [
-        leaf for _, v in items if isinstance(v, dict | list) for leaf in iterate_leaves(v)
+        leaf for _, v in items if isinstance(v, dict | list) for leaf in list_leaves(v)
     ]
 
 
@@ -405,7 +405,7 @@ def test_scene_from_glb_raises_only_value_error_for_mutated_json(make):
     for _ in range(300):
 
         def change(tree):
-            inside = iterate_leaves(tree)
+            inside = list_leaves(tree)
             container, key = inside[rng.integers(len(inside))]
             container[key] = values[rng.integers(len(values))]
 
