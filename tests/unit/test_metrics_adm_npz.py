@@ -1,4 +1,4 @@
-"""ADM's .npz batches are exchanged with numpy in bounded memory; errors name damaged files."""
+"""Tests of ADM's .npz batches: exchange with numpy, memory, and errors for damaged files."""
 
 import tracemalloc
 import zipfile
@@ -10,7 +10,7 @@ from pipelines.metrics.adm_npz import iterate_pictures, read_picture_shape, read
 from pipelines.metrics.frechet import StoredGaussian, compute_frechet_distance, compute_moments
 
 
-def pictures(n=7, height=5, width=6) -> np.ndarray:
+def make_pictures(n=7, height=5, width=6) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (n, height, width, 3), dtype=np.uint8)
 
 
@@ -18,31 +18,31 @@ def pictures(n=7, height=5, width=6) -> np.ndarray:
 @pytest.mark.parametrize("batch", [1, 3, 7, 100])
 def test_npz_images_are_read_whole_in_order(tmp_path, save, batch):
     path = str(tmp_path / "samples.npz")
-    save(path, pictures(), np.arange(7))  # as ADM: pictures, then labels as arr_1
+    save(path, make_pictures(), np.arange(7))  # ADM stores images as arr_0 and labels as arr_1
     assert read_picture_shape(path) == (7, 5, 6, 3)
     parts = list(iterate_pictures(path, batch))
     assert [len(part) for part in parts[:-1]] == [batch] * (len(parts) - 1) and 0 < len(parts[-1]) <= batch
     assert all(part.flags.writeable for part in parts)
-    np.testing.assert_array_equal(np.concatenate(parts), pictures())
+    np.testing.assert_array_equal(np.concatenate(parts), make_pictures())
 
 
 def test_npz_without_images_has_no_batches(tmp_path):
-    np.savez(tmp_path / "none.npz", pictures(0))
+    np.savez(tmp_path / "none.npz", make_pictures(0))
     assert list(iterate_pictures(str(tmp_path / "none.npz"), 4)) == []
 
 
 @pytest.mark.parametrize("grouping", [[7], [3, 4], [1] * 7])
 def test_npz_writer_is_readable_by_numpy(tmp_path, grouping):
     path = str(tmp_path / "new" / "samples.npz")
-    write_npz(path, iter(np.split(pictures(), np.cumsum(grouping)[:-1])), 7)
+    write_npz(path, iter(np.split(make_pictures(), np.cumsum(grouping)[:-1])), 7)
     with np.load(path, allow_pickle=False) as written:
         assert written.files == ["arr_0"]
-        np.testing.assert_array_equal(written["arr_0"], pictures())
-    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 2))), pictures())
+        np.testing.assert_array_equal(written["arr_0"], make_pictures())
+    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 2))), make_pictures())
 
 
 def test_npz_memory_is_bounded_by_batch(tmp_path):
-    """Reads and writes 64 MB of images with less than 8 MB of memory."""
+    """Reading and writing 67 MB of images needs less than 8 MB of memory."""
     path = str(tmp_path / "many.npz")
     tracemalloc.start()
     try:
@@ -57,26 +57,26 @@ def test_npz_memory_is_bounded_by_batch(tmp_path):
 # ------------------------------------------------------------------------------------------------------ bad files
 
 
-def refused(path, match):
+def assert_refused(path, match):
     with pytest.raises(ValueError, match=match) as raised:
-        iterate_pictures(str(path), 4)  # immediately, before the first image
+        iterate_pictures(str(path), 4)  # the call fails before it reads the first image
     assert str(path) in str(raised.value)
 
 
 def test_npz_reader_rejects_files_without_images(tmp_path):
     path = tmp_path / "x.npz"
-    refused(path, "no such file")
+    assert_refused(path, "no such file")
     path.write_bytes(b"not an archive")
-    refused(path, "damaged or not an .npz archive")
-    np.savez(path, images=pictures())
-    refused(path, r"no array 'arr_0', only \['images.npy'\]")
-    np.savez(path, pictures().astype(np.float32))
-    refused(path, "arr_0 is float32")
-    np.savez(path, pictures().transpose(0, 3, 1, 2).copy())
-    refused(path, r"uint8 \(7, 3, 5, 6\); pictures are uint8 \(N, height, width, 3\)")
-    np.savez(path, np.asfortranarray(pictures()))
-    refused(path, "Fortran order")
-    np.savez(path, pictures())
+    assert_refused(path, "damaged or not an .npz archive")
+    np.savez(path, images=make_pictures())
+    assert_refused(path, r"no array 'arr_0', only \['images.npy'\]")
+    np.savez(path, make_pictures().astype(np.float32))
+    assert_refused(path, "arr_0 is float32")
+    np.savez(path, make_pictures().transpose(0, 3, 1, 2).copy())
+    assert_refused(path, r"uint8 \(7, 3, 5, 6\); pictures are uint8 \(N, height, width, 3\)")
+    np.savez(path, np.asfortranarray(make_pictures()))
+    assert_refused(path, "Fortran order")
+    np.savez(path, make_pictures())
     with pytest.raises(ValueError, match="at least 1 picture, got 0"):
         iterate_pictures(str(path), 0)
 
@@ -88,7 +88,7 @@ def test_npz_reader_rejects_pickle_without_reading(tmp_path):
 
     path = tmp_path / "x.npz"
     np.savez(path, np.array([Trap()], dtype=object))
-    refused(path, "pickled")
+    assert_refused(path, "pickled")
     np.savez(path, mu=np.array([Trap()], dtype=object), sigma=np.zeros((2, 2)))
     with pytest.raises(ValueError, match="pickled"):
         read_reference_moments(str(path))
@@ -97,31 +97,31 @@ def test_npz_reader_rejects_pickle_without_reading(tmp_path):
 
 def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
     path = tmp_path / "x.npz"
-    np.savez(path, pictures())
+    np.savez(path, make_pictures())
     whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])  # half a copy
-    refused(path, "damaged or not an .npz archive")
+    path.write_bytes(whole[: len(whole) // 2])  # an incomplete copy
+    assert_refused(path, "damaged or not an .npz archive")
 
-    at = whole.index(pictures().tobytes()) + 300
-    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])  # one bit in the fourth picture
+    at = whole.index(make_pictures().tobytes()) + 300
+    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])  # one wrong bit in the fourth image
     with pytest.raises(ValueError, match=r"x\.npz: damaged .*CRC"):
         list(iterate_pictures(str(path), 2))
 
-    with zipfile.ZipFile(path, "w") as archive, archive.open("arr_0.npy", "w") as stream:  # a writer stopped early
+    with zipfile.ZipFile(path, "w") as archive, archive.open("arr_0.npy", "w") as stream:  # the writer stopped early
         header = {"descr": "|u1", "fortran_order": False, "shape": (7, 5, 6, 3)}
         np.lib.format.write_array_header_1_0(stream, header)
-        stream.write(pictures()[:6].tobytes())
-    refused(path, r"arr_0 of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
+        stream.write(make_pictures()[:6].tobytes())
+    assert_refused(path, r"arr_0 of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
 
 
 def test_npz_writer_rejects_bad_images_and_leaves_nothing(tmp_path):
     path = str(tmp_path / "x.npz")
     for batches, count, match in (
-        ([pictures()], 8, "got 7 pictures, expected 8"),
-        ([pictures(), pictures()], 7, "got 14 pictures, expected 7"),
-        ([pictures(), pictures(1, 4, 6)], 8, r"one size, got uint8 \(1, 4, 6, 3\) after 7"),
-        ([pictures().astype(np.float32)], 7, "got float32"),
-        ([pictures()[..., :1]], 7, r"got uint8 \(7, 5, 6, 1\)"),
+        ([make_pictures()], 8, "got 7 pictures, expected 8"),
+        ([make_pictures(), make_pictures()], 7, "got 14 pictures, expected 7"),
+        ([make_pictures(), make_pictures(1, 4, 6)], 8, r"one size, got uint8 \(1, 4, 6, 3\) after 7"),
+        ([make_pictures().astype(np.float32)], 7, "got float32"),
+        ([make_pictures()[..., :1]], 7, r"got uint8 \(7, 5, 6, 1\)"),
         ([], 0, "no pictures to write"),
     ):
         with pytest.raises(ValueError, match=match):
@@ -137,17 +137,17 @@ def test_npz_reference_moments_equal_those_of_features(tmp_path):
     pool3, spatial = rng.normal(size=(30, 2048)).astype(np.float32), rng.normal(size=(30, 2023)).astype(np.float32)
     path = str(tmp_path / "reference.npz")
     arrays = {"mu": pool3.mean(0), "sigma": np.cov(pool3, rowvar=False)}
-    np.savez(path, pictures(), **arrays, mu_s=spatial.mean(0), sigma_s=np.cov(spatial, rowvar=False))
+    np.savez(path, make_pictures(), **arrays, mu_s=spatial.mean(0), sigma_s=np.cov(spatial, rowvar=False))
     found = read_reference_moments(path)
     np.testing.assert_allclose(found.spatial.covariance, compute_moments(spatial).covariance, atol=1e-12)
     assert found.spatial.mean.shape == (2023,)
     assert found.pool3.mean.dtype == found.pool3.covariance.dtype == np.float64
     np.testing.assert_allclose(found.pool3.covariance, compute_moments(pool3).covariance, atol=1e-12)
-    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 4))), pictures())
+    np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 4))), make_pictures())
 
-    np.savez(path, **arrays)  # as TTUR and pytorch-fid store them
+    np.savez(path, **arrays)  # names of TTUR and pytorch-fid
     assert read_reference_moments(path).spatial is None
-    np.savez(path, pictures())
+    np.savez(path, make_pictures())
     assert read_reference_moments(path) is None
 
 
