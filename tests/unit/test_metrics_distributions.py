@@ -1,4 +1,4 @@
-"""Layout histograms equal hand-computed values; distances equal scipy; errors and noise floors."""
+"""Tests of layout histograms and their distances against hand-computed values and scipy."""
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ CAR = CATEGORY_INDEX["vehicle_small"]
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
 
-def street(width_px: int, cars_xy_m=(), tilted: bool = False) -> Scene:
-    """A road ahead, terrain on both sides, cars of 4 x 2 x 1.5 m."""
+def make_street(width_px: int, cars_xy_m=(), tilted: bool = False) -> Scene:
+    """Return a scene with a road ahead, terrain on both sides and cars of 4 x 2 x 1.5 m."""
     n = len(cars_xy_m)
     occupied = np.zeros((2, 256, 256), bool)
     row, col = np.mgrid[:256, :256]
@@ -44,55 +44,55 @@ def street(width_px: int, cars_xy_m=(), tilted: bool = False) -> Scene:
     )  # fmt: skip
 
 
-def histogram(scene: Scene, name: str) -> np.ndarray:
+def compute_histogram(scene: Scene, name: str) -> np.ndarray:
     index = [one.name for one in HISTOGRAMS].index(name)
     return compute_scene_histograms(scene)[ENDS[index] - len(HISTOGRAMS[index]) : ENDS[index]]
 
 
-def bin_of(name: str, value: float) -> int:
+def find_bin(name: str, value: float) -> int:
     one = next(one for one in HISTOGRAMS if one.name == name)
     return int(np.searchsorted(one.edges, value, side="right") - 1)
 
 
 def test_histograms_equal_hand_computed():
-    scene = street(24, [(10, 0), (10, 5), (13, 9)])  # a road of 6 m: one car on it, two next to it
-    below = histogram(scene, "vehicle_small.ground_below")
+    scene = make_street(24, [(10, 0), (10, 5), (13, 9)])  # one car is on the road of 6 m, two cars are next to it
+    below = compute_histogram(scene, "vehicle_small.ground_below")
     names = next(one for one in HISTOGRAMS if one.name == "vehicle_small.ground_below").bins
     assert dict(zip(names, below.tolist(), strict=True)) | {"road": 1, "terrain": 2} == dict(
         zip(names, below, strict=True)
     )
     assert below.sum() == 3 and names[-1] == NO_GROUND
-    assert histogram(scene, "vehicle_small.length_m")[bin_of("vehicle_small.length_m", 4.0)] == 3
-    pairs = histogram(scene, "vehicle_small.pair_distance_m")
+    assert compute_histogram(scene, "vehicle_small.length_m")[find_bin("vehicle_small.length_m", 4.0)] == 3
+    pairs = compute_histogram(scene, "vehicle_small.pair_distance_m")
     assert pairs.sum() == 3
     for distance in (5, 5, np.hypot(3, 9)):
-        assert pairs[bin_of("vehicle_small.pair_distance_m", distance)] > 0
-    to_road = histogram(scene, "vehicle_small.to_road_m")
+        assert pairs[find_bin("vehicle_small.pair_distance_m", distance)] > 0
+    to_road = compute_histogram(scene, "vehicle_small.to_road_m")
     assert to_road[0] == 1 and to_road[2] == 1 and to_road[6] == 1
-    assert histogram(scene, "pole.length_m").sum() == 0
+    assert compute_histogram(scene, "pole.length_m").sum() == 0
 
 
 @pytest.mark.parametrize("tilted", [False, True])
 @pytest.mark.parametrize("width_px", [24, 41])
 def test_road_width_of_straight_road(width_px, tilted):
-    width_m, _ = measure_road_widths(street(width_px, tilted=tilted))
+    width_m, _ = measure_road_widths(make_street(width_px, tilted=tilted))
     assert len(width_m) >= 200
     assert np.median(width_m) == pytest.approx(width_px * 0.25, abs=0.5)
 
 
 def test_road_widths_of_scenes_without_or_with_only_road():
-    empty = street(0)
+    empty = make_street(0)
     assert measure_road_widths(empty)[1] is None and len(measure_road_widths(empty)[0]) == 0
-    everywhere = street(600)
+    everywhere = make_street(600)
     assert len(measure_road_widths(everywhere)[0]) == 0 and (measure_road_widths(everywhere)[1] == 0).all()
     assert compute_scene_histograms(empty).sum() == 0
 
 
 def test_histograms_object_beyond_grid_has_no_ground():
-    scene = street(24, [(70, 0)])
-    below = histogram(scene, "vehicle_small.ground_below")
+    scene = make_street(24, [(70, 0)])
+    below = compute_histogram(scene, "vehicle_small.ground_below")
     assert below[-1] == 1 and below.sum() == 1
-    assert histogram(scene, "vehicle_small.to_road_m").sum() == 0
+    assert compute_histogram(scene, "vehicle_small.to_road_m").sum() == 0
 
 
 def test_pair_distances_equal_loops():
@@ -120,18 +120,18 @@ def test_size_distance_of_shift_is_in_meters():
     scenes = [random_scene(seed, n=60) for seed in range(24)]
     real = np.stack([compute_scene_histograms(scene) for scene in scenes])
     assert all(found.value == 0 for found in compute_histogram_distances(real, real).values())
-    near = street(24, rng.uniform(5, 60, (30, 2)) - [0, 30])
+    near = make_street(24, rng.uniform(5, 60, (30, 2)) - [0, 30])
     near = np.stack([compute_scene_histograms(near)] * 12)
     longer = near.copy()
     index = [one.name for one in HISTOGRAMS].index("vehicle_small.length_m")
     columns = slice(ENDS[index] - len(HISTOGRAMS[index]), ENDS[index])
     longer[:, columns] = np.roll(longer[:, columns], 3, axis=1)
     middle = (HISTOGRAMS[index].edges[1:] + HISTOGRAMS[index].edges[:-1]) / 2
-    at = bin_of("vehicle_small.length_m", 4.0)
+    at = find_bin("vehicle_small.length_m", 4.0)
     got = compute_histogram_distances(near, longer)
     assert got["vehicle_small.length_m"].value == pytest.approx(middle[at + 3] - middle[at])
     assert all(found.value == 0 for name, found in got.items() if name != "vehicle_small.length_m")
-    assert "pole.length_m" not in got  # in neither source
+    assert "pole.length_m" not in got  # neither source contains the category
 
 
 def test_count_distance_names_differing_category():
