@@ -1,4 +1,4 @@
-"""Scores equal literal float64 versions of their definitions; intervals have the stated coverage."""
+"""Tests of generation scores against literal float64 definitions, and of the coverage of intervals."""
 
 import warnings
 
@@ -32,23 +32,23 @@ from pipelines.metrics.neighbours import (
 # ------------------------------------------------------------------------------------------ Frechet distance
 
 
-def literal_fid(x: np.ndarray, y: np.ndarray) -> float:
-    """Heusel et al. 2017, with a general matrix square root."""
+def compute_literal_fid(x: np.ndarray, y: np.ndarray) -> float:
+    """Return the FID of Heusel et al. 2017 from a general matrix square root."""
     a, b = np.cov(x, rowvar=False), np.cov(y, rowvar=False)
     root = scipy.linalg.sqrtm(a @ b)
     return float(np.square(x.mean(0) - y.mean(0)).sum() + np.trace(a + b - 2 * np.real(root)))
 
 
-def sets(rng, n=400, m=300, d=32):
+def draw_feature_sets(rng, n=400, m=300, d=32):
     mix_x, mix_y = rng.normal(size=(2, d, d)) / np.sqrt(d)
     return rng.normal(size=(n, d)) @ mix_x, rng.normal(size=(m, d)) @ mix_y + 0.3
 
 
 def test_frechet_distance_equals_literal_version():
     for seed in range(5):
-        x, y = sets(np.random.default_rng(seed))
+        x, y = draw_feature_sets(np.random.default_rng(seed))
         assert compute_frechet_distance(compute_moments(x), compute_moments(y)) == pytest.approx(
-            literal_fid(x, y), rel=1e-6
+            compute_literal_fid(x, y), rel=1e-6
         )
         assert compute_frechet_distance(compute_moments(x), compute_moments(y)) == pytest.approx(
             compute_frechet_distance(compute_moments(y), compute_moments(x))
@@ -56,11 +56,11 @@ def test_frechet_distance_equals_literal_version():
 
 
 def test_frechet_distance_equals_closed_form():
-    """Diagonal covariances: the sum of (mean difference)^2 + (deviation difference)^2."""
+    """For diagonal covariances, the distance is the sum of (mean difference)^2 + (deviation difference)^2."""
     rng = np.random.default_rng(0)
     mean, other_mean = rng.normal(size=(2, 6))
     deviation, other_deviation = rng.uniform(0, 3, (2, 6))
-    deviation[0] = other_deviation[1] = 0  # a constant feature
+    deviation[0] = other_deviation[1] = 0  # each side has one constant feature
     a = Moments(11, mean, np.diag(deviation**2) * 10)
     b = Moments(21, other_mean, np.diag(other_deviation**2) * 20)
     expected = np.square(mean - other_mean).sum() + np.square(deviation - other_deviation).sum()
@@ -69,22 +69,22 @@ def test_frechet_distance_equals_closed_form():
 
 def test_frechet_distance_handles_constant_and_few_samples():
     rng = np.random.default_rng(1)
-    x, _ = sets(rng)
+    x, _ = draw_feature_sets(rng)
     assert compute_frechet_distance(compute_moments(x), compute_moments(x)) == pytest.approx(0, abs=1e-6)
     assert compute_frechet_distance(compute_moments(x), compute_moments(x + 1)) == pytest.approx(32, rel=1e-6)
     constant = np.ones((10, 4))
     assert compute_frechet_distance(compute_moments(constant), compute_moments(constant + 2)) == pytest.approx(16)
-    few, many = rng.normal(size=(5, 32)), rng.normal(size=(500, 32))  # rank 4 of 32
+    few, many = rng.normal(size=(5, 32)), rng.normal(size=(500, 32))  # the covariance of five samples has rank 4 of 32
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert compute_frechet_distance(compute_moments(few), compute_moments(many)) == pytest.approx(
-            literal_fid(few, many), rel=1e-4
+            compute_literal_fid(few, many), rel=1e-4
         )
 
 
 def test_moments_add_up_exactly_in_any_grouping():
     rng = np.random.default_rng(2)
-    x = rng.normal(1000, 1, size=(500, 8))  # a mean far from 0, where sums of squares lose digits
+    x = rng.normal(1000, 1, size=(500, 8))  # sums of squares lose digits because the mean is far from 0
     parts = [compute_moments(part) for part in np.split(x, [1, 40, 300])]
     for total in (parts[0] + parts[1] + parts[2] + parts[3], (parts[3] + parts[1]) + (parts[0] + parts[2])):
         assert total.count == 500
@@ -110,14 +110,14 @@ def test_inception_score_of_certain_and_equal_predictions():
     assert compute_inception_score(np.ones((9, 7))).value == pytest.approx(1)
     assert compute_inception_score(np.array([[1e4, 0.0], [1e4, 0.0]])).value == pytest.approx(
         1
-    )  # a class that never occurs
+    )  # the second class never occurs
 
 
 # ------------------------------------------------------------------------------------------ neighbourhoods
 
 
-def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float, float, float]:
-    """Precision, recall, density, coverage by sorted distances and loops; float64 differences, no matrix product."""
+def compute_by_brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float, float, float]:
+    """Return precision, recall, density and coverage from float64 differences, sorted distances and loops."""
     real, generated = real.astype(np.float64), generated.astype(np.float64)
 
     def distances(x, y):
@@ -135,13 +135,16 @@ def brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float,
     return precision, recall, density, coverage
 
 
-def scores(real, generated, k) -> list[tuple]:
+def compute_scores(real, generated, k) -> list[tuple]:
     found = compute_neighbourhoods(real, generated, k)
     return [(one.precision, one.recall, one.density, one.coverage) for one in found]
 
 
-def clustered(rng, n: int, d: int, shift: float) -> np.ndarray:
-    """A few strong and many weak directions, as in real features: the filter decides most pairs, not all."""
+def draw_clustered_features(rng, n: int, d: int, shift: float) -> np.ndarray:
+    """Return features with few strong and many weak directions, as real features have.
+
+    For such features, the filter of nearest neighbours decides most pairs but not all.
+    """
     strength = 0.85 ** np.arange(d)
     return (shift + rng.normal(size=(n, d)) + rng.integers(0, 3, (n, 1))) * strength
 
@@ -152,56 +155,61 @@ def test_neighborhood_scores_equal_brute_force(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     if seed % 3 == 1:
         real, generated = rng.normal(size=(90, 6)), rng.normal(0.5, 0.8, size=(70, 6))
-    elif seed % 3 == 2:  # without dominant axes the filter uses all features
+    elif seed % 3 == 2:  # the filter uses all features because there are no dominant axes
         monkeypatch.setattr(neighbours, "BASIS_SAMPLES", 20)
         real, generated = rng.normal(size=(90, 50)), rng.normal(0.05, 0.98, size=(70, 50))
         assert not prepare_features(real, generated, (3,))[0].rest.any()
     else:
-        real, generated = clustered(rng, 90, 60, 0).astype(np.float32), clustered(rng, 130, 60, 0.3).astype(np.float32)
+        real, generated = (
+            draw_clustered_features(rng, 90, 60, 0).astype(np.float32),
+            draw_clustered_features(rng, 130, 60, 0.3).astype(np.float32),
+        )
         assert len(compute_principal_axes(real, generated).axes) < 30
-    for k, got in zip((1, 3, 5), scores(real, generated, (1, 3, 5)), strict=True):
-        assert got == brute_force(real, generated, k)
+    for k, got in zip((1, 3, 5), compute_scores(real, generated, (1, 3, 5)), strict=True):
+        assert got == compute_by_brute_force(real, generated, k)
         assert 0 < got[0] <= 1 and 0 < got[1] <= 1
 
 
 def test_neighborhood_scores_count_ties_as_within():
-    """Integer points far from the origin: many ties, exact in differences, blurred in a matrix product."""
+    """Integer points far from the origin have many ties, which differences resolve and matrix products do not."""
     rng = np.random.default_rng(5)
     real, generated = rng.integers(0, 4, (2, 60, 3)).astype(float) + 1e6
-    for k, got in zip((1, 2, 3), scores(real, generated, (1, 2, 3)), strict=True):
-        assert got == brute_force(real, generated, k)
+    for k, got in zip((1, 2, 3), compute_scores(real, generated, (1, 2, 3)), strict=True):
+        assert got == compute_by_brute_force(real, generated, k)
 
 
 def test_neighborhood_scores_include_border_of_ball():
-    """generated[0] is real[1], the nearest neighbour of the far-away real[0]: its distance is that radius."""
+    """generated[0] equals real[1], so it is on the border of each ball with the nearest neighbour real[1]."""
     rng = np.random.default_rng(6)
     base = rng.normal(size=(40, 512))
     generated = rng.normal(50, 1, size=(40, 512))
     generated[0] = base[1]
-    got = scores(base, generated, [1])[0]
+    got = compute_scores(base, generated, [1])[0]
     assert got[0] == 1 / 40
-    assert got == brute_force(base, generated, 1)
+    assert got == compute_by_brute_force(base, generated, 1)
 
 
 def test_neighborhood_of_duplicates_contains_copies():
     rng = np.random.default_rng(7)
-    real = np.repeat(rng.normal(size=(5, 16)) * 1e3, 4, axis=0)  # every sample four times: radius 0 at k = 3
+    real = np.repeat(
+        rng.normal(size=(5, 16)) * 1e3, 4, axis=0
+    )  # each sample occurs four times, so the radius for k = 3 is 0
     side = project_to_axes(real, compute_principal_axes(real, real))
     np.testing.assert_array_equal(compute_ball_radii(side, range(20), [3]), 0)
-    assert scores(real, real[::4].repeat(4, axis=0), [3])[0][:2] == (1, 1)
-    assert scores(real, real + 1e-3, [3])[0] == (0, 0, 0, 0)
+    assert compute_scores(real, real[::4].repeat(4, axis=0), [3])[0][:2] == (1, 1)
+    assert compute_scores(real, real + 1e-3, [3])[0] == (0, 0, 0, 0)
 
 
 def test_neighborhood_of_constant_features_requires_equality():
     constant = np.full((6, 3), 0.1)
-    assert scores(constant, constant, [3])[0] == (1, 1, 2, 1)
-    assert scores(constant, constant + 1e-9, [3])[0] == (0, 0, 0, 0)
+    assert compute_scores(constant, constant, [3])[0] == (1, 1, 2, 1)
+    assert compute_scores(constant, constant + 1e-9, [3])[0] == (0, 0, 0, 0)
 
 
 def test_nearest_returns_neighbors_in_order(monkeypatch):
     rng = np.random.default_rng(9)
-    a, b = clustered(rng, 50, 40, 0), clustered(rng, 80, 40, 0)
-    b[30] = b[60]  # equal distances: the lower index first
+    a, b = draw_clustered_features(rng, 50, 40, 0), draw_clustered_features(rng, 80, 40, 0)
+    b[30] = b[60]  # of two equal distances, the lower index is first
     basis = compute_principal_axes(a, b)
     squared, index = find_nearest(project_to_axes(a, basis), project_to_axes(b, basis), range(10, 50), 4)
     every = np.array([[np.square(p - q).sum() for q in b] for p in a[10:]])
@@ -212,8 +220,8 @@ def test_nearest_returns_neighbors_in_order(monkeypatch):
 # ------------------------------------------------------------------------------------------ kernel distance
 
 
-def literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
-    """Binkowski et al. 2018, with loops."""
+def compute_literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
+    """Return the kernel distance of Binkowski et al. 2018 from loops."""
 
     def k(a, b):
         return (a @ b / len(a) + 1) ** 3
@@ -228,10 +236,10 @@ def test_kernel_distance_equals_literal_version(monkeypatch):
     rng = np.random.default_rng(10)
     x, y = rng.normal(size=(40, 8)), rng.normal(0.4, 1.2, size=(50, 8))
     got = compute_kernel_distance(x, y)
-    assert got.value == pytest.approx(literal_kernel_distance(x, y), rel=1e-9)
+    assert got.value == pytest.approx(compute_literal_kernel_distance(x, y), rel=1e-9)
     assert got.low < got.value < got.high
     monkeypatch.setattr(kernel_distance_module, "GROUP_SAMPLES", 20)
-    halves = [literal_kernel_distance(x[k::2], y[k::2]) for k in range(2)]
+    halves = [compute_literal_kernel_distance(x[k::2], y[k::2]) for k in range(2)]
     assert compute_kernel_distance(x, y).value == pytest.approx(np.mean(halves), rel=1e-9)
 
 
@@ -245,7 +253,7 @@ def test_kernel_distance_of_equal_sources_contains_zero():
 
 
 def test_intervals_have_stated_coverage():
-    """200 experiments with 150 scenes each, for a mean and for a fraction of objects."""
+    """In 200 experiments with 150 scenes each, 95 % of the intervals contain the true mean and the true share."""
     rng = np.random.default_rng(12)
     held = np.zeros(2)
     for _ in range(200):
@@ -256,7 +264,7 @@ def test_intervals_have_stated_coverage():
     assert (np.abs(held / 200 - 0.95) < 0.045).all()
 
 
-def both_influences(real: np.ndarray, generated: np.ndarray) -> list[np.ndarray]:
+def compute_both_influences(real: np.ndarray, generated: np.ndarray) -> list[np.ndarray]:
     a, b = compute_moments(real), compute_moments(generated)
     maps = compute_influence_maps(b, compute_transport(a, b))
     return [
@@ -278,7 +286,7 @@ def test_frechet_interval_matches_spread_of_distance():
         real, generated = draw()
         a, b = compute_moments(real), compute_moments(generated)
         between = compute_transport(a, b)
-        influences = both_influences(real, generated)
+        influences = compute_both_influences(real, generated)
         got = estimate_from_influence(compute_frechet_distance(a, b, between), influences)
         assert got.low < got.value < got.high
         widths.append(got.high - got.low)
@@ -286,22 +294,24 @@ def test_frechet_interval_matches_spread_of_distance():
 
 
 def test_influences_are_derivatives_of_frechet_distance():
-    """Compares with finite differences of moments moved towards one sample."""
+    """The reference is the finite difference after a small shift of the moments towards one sample."""
     rng = np.random.default_rng(14)
     real, generated = rng.normal(size=(600, 5)), rng.normal(0.5, 1.5, size=(700, 5))
     a, b = compute_moments(real), compute_moments(generated)
-    influences = both_influences(real, generated)
+    influences = compute_both_influences(real, generated)
 
-    def towards(side: Moments, sample: np.ndarray, share: float) -> Moments:
+    def move_moments(side: Moments, sample: np.ndarray, share: float) -> Moments:
         step = sample - side.mean
         covariance = (1 - share) * side.covariance + share * np.outer(step, step)
         return Moments(side.count, side.mean + share * step, covariance * (side.count - 1))
 
     share = 1e-6
     for i in (0, 17, 300):
-        slope = (compute_frechet_distance(towards(a, real[i], share), b) - compute_frechet_distance(a, b)) / share
+        slope = (compute_frechet_distance(move_moments(a, real[i], share), b) - compute_frechet_distance(a, b)) / share
         assert slope == pytest.approx(influences[0][i], rel=1e-3, abs=0.02)
-        slope = (compute_frechet_distance(a, towards(b, generated[i], share)) - compute_frechet_distance(a, b)) / share
+        slope = (
+            compute_frechet_distance(a, move_moments(b, generated[i], share)) - compute_frechet_distance(a, b)
+        ) / share
         assert slope == pytest.approx(influences[1][i], rel=1e-3, abs=0.02)
 
 
