@@ -1,4 +1,4 @@
-"""AP3D equals a literal version of COCO's evaluation as used by Omni3D; ground scores equal plain loops."""
+"""Tests of AP3D against a literal COCO evaluation, as Omni3D uses it, and of ground scores against loops."""
 
 import dataclasses
 from itertools import permutations
@@ -44,7 +44,7 @@ GRID = Grid(front_m=2.0, left_m=1.0, resolution_m=0.5, rows=4, cols=4)
 CAR, POLE, TREE = CATEGORY_INDEX["vehicle_small"], CATEGORY_INDEX["pole"], CATEGORY_INDEX["vegetation_cuboid"]
 
 
-def scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scene:
+def make_scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scene:
     n = len(category)
     ground = np.zeros((5, 4, 4), np.float32)
     return Scene(
@@ -58,18 +58,21 @@ def scene(category, center_m, size_m=None, existence=None, yaw_rad=None) -> Scen
     )  # fmt: skip
 
 
-def scores(truths: list[Scene], predictions: list[Scene], **options):
+def compute_scores(truths: list[Scene], predictions: list[Scene], **options):
     parts = [match_scene(t, p) for t, p in zip(truths, predictions, strict=True)]
     return compute_detection_scores(join_matches(parts), **options)
 
 
-# ------------------------------------------------------------------------------------------ the literal version
+# ------------------------------------------------------------------------------------------ literal version
 
 
-def literal_ap(
+def compute_literal_ap(
     truths: list[Scene], predictions: list[Scene], max_detections: int, threshold: float
 ) -> dict[str, float]:
-    """COCOeval.evaluateImg and accumulate, step by step, for one threshold and no ignored truths."""
+    """Return the AP per category from the steps of COCOeval.evaluateImg and COCOeval.accumulate.
+
+    There is one IoU threshold, and no truth is ignored.
+    """
     result = {}
     for c in SCORED:
         scored_hits, num_truths = [], 0
@@ -103,22 +106,22 @@ def literal_ap(
     return result
 
 
-def random_dataset(rng, num_scenes=6):
+def draw_dataset(rng, num_scenes=6):
     truths, predictions = [], []
     for _ in range(num_scenes):
         n = rng.integers(0, 30)
         category = rng.choice([CAR, POLE, TREE, ELLIPSOID], n)
         center_m, size_m, yaw = rng.uniform(-6, 6, (n, 3)), rng.uniform(1, 4, (n, 3)), rng.uniform(-1.5, 1.5, n)
-        truths.append(scene(category, center_m, size_m, yaw_rad=yaw))
+        truths.append(make_scene(category, center_m, size_m, yaw_rad=yaw))
         again = np.concatenate([np.arange(n), rng.choice(n, n // 2)]) if n else np.arange(0)
         kept = again[rng.random(len(again)) < 0.8]
         m = len(kept)
         predictions.append(
-            scene(
+            make_scene(
                 category[kept],
                 center_m[kept] + rng.normal(0, 0.4, (m, 3)),
                 size_m[kept] * rng.uniform(0.7, 1.4, (m, 3)),
-                existence=rng.integers(0, 8, m) / 8,  # many equal scores
+                existence=rng.integers(0, 8, m) / 8,  # many detections have equal scores
                 yaw_rad=yaw[kept] + rng.normal(0, 0.2, m),
             )
         )
@@ -128,10 +131,10 @@ def random_dataset(rng, num_scenes=6):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("max_detections", [3, 100])
 def test_ap3d_equals_literal_version(seed, max_detections):
-    truths, predictions = random_dataset(np.random.default_rng(seed))
-    got = scores(truths, predictions, max_detections=max_detections)
+    truths, predictions = draw_dataset(np.random.default_rng(seed))
+    got = compute_scores(truths, predictions, max_detections=max_detections)
     for t, threshold in enumerate(THRESHOLDS):
-        literal = literal_ap(truths, predictions, max_detections, threshold)
+        literal = compute_literal_ap(truths, predictions, max_detections, threshold)
         assert {name: values[t] for name, values in got.table.items()} == pytest.approx(literal, abs=1e-12)
     assert got.category_ap3d_50 == {name: values[-1] for name, values in got.table.items()}
     assert got.ap3d == pytest.approx(np.mean(list(got.table.values())))
@@ -139,7 +142,7 @@ def test_ap3d_equals_literal_version(seed, max_detections):
 
 
 def test_ap3d_records_join_in_any_grouping():
-    truths, predictions = random_dataset(np.random.default_rng(7))
+    truths, predictions = draw_dataset(np.random.default_rng(7))
     parts = [match_scene(t, p) for t, p in zip(truths, predictions, strict=True)]
     grouped = join_matches([join_matches(parts[:2]), parts[2], join_matches(parts[3:])])
     assert compute_detection_scores(grouped) == compute_detection_scores(join_matches(parts))
@@ -152,53 +155,53 @@ CENTERS = [[0, 0, 0], [10, 0, 0], [20, 0, 0], [30, 0, 0]]
 
 
 def test_ap3d_of_perfect_is_one_and_of_empty_is_zero():
-    truth, nothing = scene([CAR, CAR, POLE, TREE], CENTERS), scene([], [])
-    assert scores([truth], [truth]).ap3d == 1
-    assert scores([truth], [nothing]).ap3d == 0
-    assert scores([truth, nothing], [truth, nothing]).ap3d == 1
+    truth, nothing = make_scene([CAR, CAR, POLE, TREE], CENTERS), make_scene([], [])
+    assert compute_scores([truth], [truth]).ap3d == 1
+    assert compute_scores([truth], [nothing]).ap3d == 0
+    assert compute_scores([truth, nothing], [truth, nothing]).ap3d == 1
 
 
 def test_ap3d_penalizes_duplicates_by_rank():
-    truth = scene([CAR, CAR], CENTERS[:2])
-    behind = scene([CAR] * 3, [*CENTERS[:2], CENTERS[0]], existence=[0.9, 0.8, 0.1])
-    assert scores([truth], [behind]).ap3d == 1
-    between = scene([CAR] * 3, [CENTERS[0], CENTERS[0], CENTERS[1]], existence=[0.9, 0.8, 0.1])
-    # recall 0 ... .50 (51 points) at precision 1, .51 ... 1 (50 points) at 2/3
-    assert scores([truth], [between]).ap3d == pytest.approx((51 + 50 * 2 / 3) / 101)
+    truth = make_scene([CAR, CAR], CENTERS[:2])
+    behind = make_scene([CAR] * 3, [*CENTERS[:2], CENTERS[0]], existence=[0.9, 0.8, 0.1])
+    assert compute_scores([truth], [behind]).ap3d == 1
+    between = make_scene([CAR] * 3, [CENTERS[0], CENTERS[0], CENTERS[1]], existence=[0.9, 0.8, 0.1])
+    # The precision is 1 at recalls 0 to 0.50 (51 points) and 2/3 at recalls 0.51 to 1 (50 points).
+    assert compute_scores([truth], [between]).ap3d == pytest.approx((51 + 50 * 2 / 3) / 101)
 
 
 def test_ap3d_of_half_the_truths_is_51_of_101_points():
-    truth = scene([CAR, CAR], CENTERS[:2])
-    assert scores([truth], [truth.select(np.array([0]))]).ap3d == pytest.approx(51 / 101)
+    truth = make_scene([CAR, CAR], CENTERS[:2])
+    assert compute_scores([truth], [truth.select(np.array([0]))]).ap3d == pytest.approx(51 / 101)
 
 
 def test_ap3d_counts_shifted_box_up_to_its_iou():
-    truth = scene([CAR], CENTERS[:1])
-    shifted = scene([CAR], [[0.5, 0, 0]])  # IoU3D 1/3: true at .05 ... .30, false at .35 ... .50
-    got = scores([truth], [shifted])
+    truth = make_scene([CAR], CENTERS[:1])
+    shifted = make_scene([CAR], [[0.5, 0, 0]])  # IoU3D 1/3: a hit at thresholds 0.05 to 0.30, a miss at 0.35 to 0.50
+    got = compute_scores([truth], [shifted])
     assert got.ap3d == pytest.approx(0.6)
     assert got.ap3d_50 == 0
 
 
 def test_ap3d_ignores_ellipsoids_and_absent_categories():
-    truth = scene([CAR, ELLIPSOID], CENTERS[:2])
-    got = scores([truth], [scene([CAR, POLE], CENTERS[:2])])
+    truth = make_scene([CAR, ELLIPSOID], CENTERS[:2])
+    got = compute_scores([truth], [make_scene([CAR, POLE], CENTERS[:2])])
     assert set(got.table) == {"vehicle_small"} and got.ap3d == 1
     with pytest.raises(ValueError, match="no scored category"):
-        scores([scene([ELLIPSOID], CENTERS[:1])], [scene([], [])])
+        compute_scores([make_scene([ELLIPSOID], CENTERS[:1])], [make_scene([], [])])
 
 
 def test_ap3d_truncates_per_scene_and_category():
-    cars = scene([CAR] * 150, [[10 * i, 0, 0] for i in range(150)])
-    assert scores([cars], [cars]).ap3d == 1
-    assert scores([cars], [cars], max_detections=100).ap3d == pytest.approx(67 / 101)  # recall 100/150
+    cars = make_scene([CAR] * 150, [[10 * i, 0, 0] for i in range(150)])
+    assert compute_scores([cars], [cars]).ap3d == 1
+    assert compute_scores([cars], [cars], max_detections=100).ap3d == pytest.approx(67 / 101)  # the recall is 100/150
 
 
 def test_ap3d_score_threshold_equals_dropping_detections():
-    truths, predictions = random_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence > 0.375) for p in predictions]  # as returned by decode_layout
-    got = scores(truths, predictions, min_score=0.375)
-    assert got == scores(truths, dropped)
+    truths, predictions = draw_dataset(np.random.default_rng(3))
+    dropped = [p.select(p.existence > 0.375) for p in predictions]  # decode_layout drops these objects, too
+    got = compute_scores(truths, predictions, min_score=0.375)
+    assert got == compute_scores(truths, dropped)
     assert list(got.at_threshold) == [f"{t:.2f}" for t in THRESHOLDS]
     assert np.mean(list(got.at_threshold.values())) == pytest.approx(got.ap3d)
 
@@ -216,20 +219,20 @@ def test_ap3d_matches_best_free_truth_and_later_of_ties():
 
 def test_ap3d_rejects_nan_existence():
     with pytest.raises(ValueError, match="existence"):
-        match_scene(scene([CAR], CENTERS[:1]), scene([CAR], CENTERS[:1], existence=[np.nan]))
+        match_scene(make_scene([CAR], CENTERS[:1]), make_scene([CAR], CENTERS[:1], existence=[np.nan]))
 
 
 # ------------------------------------------------------------------------------------------ ground
 
 
-def random_rasters(rng, shape=(3, 2, 5, 6)):
+def draw_rasters(rng, shape=(3, 2, 5, 6)):
     true_height_m, height_m = rng.normal(0, 2, (2, *shape)).astype(np.float32)
     true_occupied, occupied = rng.random((2, *shape)) < 0.4
     return true_occupied, true_height_m, occupied, height_m
 
 
 def test_ground_scores_equal_plain_loops():
-    true_occupied, true_height_m, occupied, height_m = random_rasters(np.random.default_rng(0))
+    true_occupied, true_height_m, occupied, height_m = draw_rasters(np.random.default_rng(0))
     bounds_m = np.array([[-5.0, 5.0], [-2.0, 8.0]])
     got = compute_ground_scores(
         sum_ground(true_occupied, true_height_m, occupied, height_m), ("road", "terrain"), bounds_m
@@ -259,7 +262,7 @@ def test_ground_scores_equal_plain_loops():
 
 
 def test_ground_sums_of_scenes_equal_those_of_stack():
-    rasters = random_rasters(np.random.default_rng(1))
+    rasters = draw_rasters(np.random.default_rng(1))
     one_by_one = [sum_ground(*(part[s] for part in rasters)) for s in range(3)]
     total, stacked = one_by_one[0] + one_by_one[1] + one_by_one[2], sum_ground(*rasters)
     for field in dataclasses.fields(total):
@@ -267,7 +270,7 @@ def test_ground_sums_of_scenes_equal_those_of_stack():
 
 
 def test_ground_scores_of_perfect_ground_and_absent_class():
-    true_occupied, true_height_m, _, _ = random_rasters(np.random.default_rng(2))
+    true_occupied, true_height_m, _, _ = draw_rasters(np.random.default_rng(2))
     true_occupied[:, 1] = False
     got = compute_ground_scores(
         sum_ground(true_occupied, true_height_m, true_occupied, true_height_m), ("road", "terrain"), (-5, 5)
@@ -276,7 +279,7 @@ def test_ground_scores_of_perfect_ground_and_absent_class():
 
 
 def test_ground_scores_reject_missing_truth_bad_bounds_and_nan():
-    rasters = random_rasters(np.random.default_rng(3))
+    rasters = draw_rasters(np.random.default_rng(3))
     empty = sum_ground(np.zeros_like(rasters[0]), *rasters[1:])
     with pytest.raises(ValueError, match="at least one occupied pixel"):
         compute_ground_scores(empty, ("road", "terrain"), (-5, 5))
@@ -292,8 +295,8 @@ def test_ground_scores_reject_missing_truth_bad_bounds_and_nan():
 # ------------------------------------------------------------------------------------------ matched primitives
 
 
-def best_pairs(iou: np.ndarray) -> tuple[int, float]:
-    """Number and summed IoU of the best one-to-one pairs, by exhaustive search."""
+def find_best_pairs(iou: np.ndarray) -> tuple[int, float]:
+    """Return the number and the total IoU of the best one-to-one pairs by exhaustive search."""
     if iou.shape[0] > iou.shape[1]:
         iou = iou.T
     ways = [iou[np.arange(iou.shape[0]), list(way)] for way in permutations(range(iou.shape[1]), iou.shape[0])]
@@ -305,7 +308,9 @@ def best_pairs(iou: np.ndarray) -> tuple[int, float]:
 def test_pairs_equal_best_assignment(seed):
     rng = np.random.default_rng(seed)
     category = np.repeat([CAR, POLE, ELLIPSOID], 5)
-    truth = scene(category, rng.uniform(-3, 3, (15, 3)), rng.uniform(1, 4, (15, 3)), yaw_rad=rng.uniform(-1, 1, 15))
+    truth = make_scene(
+        category, rng.uniform(-3, 3, (15, 3)), rng.uniform(1, 4, (15, 3)), yaw_rad=rng.uniform(-1, 1, 15)
+    )
     kept = rng.permutation(15)[:12]
     found = dataclasses.replace(
         truth.select(kept), center_m=truth.center_m[kept] + rng.normal(0, 0.5, (12, 3)).astype(np.float32)
@@ -314,29 +319,31 @@ def test_pairs_equal_best_assignment(seed):
     for c in (CAR, POLE, ELLIPSOID):
         sides = [extract_boxes(side.select(side.category == c)) for side in (found, truth)]
         iou = (compute_ellipsoid_iou3d_matrix if c == ELLIPSOID else compute_iou3d_matrix)(*sides)
-        pairs, total = best_pairs(iou) if iou.size else (0, 0.0)
+        pairs, total = find_best_pairs(iou) if iou.size else (0, 0.0)
         assert got.pairs[c] == pairs and got.iou[c] == pytest.approx(total)
         assert (got.truths[c], got.predictions[c]) == (len(iou.T), len(iou))
 
 
 def test_pair_scores_equal_hand_computed():
-    truth = scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
-    found = scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D 1/3, nothing, 1
+    truth = make_scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
+    found = make_scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D with the truths: 1/3, 0, 1
     sums = sum_pairs(truth, found)
     got = compute_pair_scores(sums + sums)
     assert got.mean_iou3d == pytest.approx(1 / 3) and got.truth_iou3d == pytest.approx(1 / 9)
-    assert got.found == pytest.approx(1 / 3) and got.right == pytest.approx(1 / 2)  # of boxes: three true, two found
+    assert got.found == pytest.approx(1 / 3) and got.right == pytest.approx(
+        1 / 2
+    )  # there are three true boxes and two predicted boxes
     assert got.category_mean_iou3d == pytest.approx({"vehicle_small": 1 / 3, "vegetation_ellipsoid": 1})
     assert got.category_found == pytest.approx({"vehicle_small": 0.5, "pole": 0, "vegetation_ellipsoid": 1})
     assert got.category_right == pytest.approx({"vehicle_small": 0.5, "vegetation_ellipsoid": 1})
 
 
 def test_pair_scores_without_pairs_or_truths_are_undefined():
-    nothing = scene([], [])
-    got = compute_pair_scores(sum_pairs(scene([CAR], CENTERS[:1]), nothing))
+    nothing = make_scene([], [])
+    got = compute_pair_scores(sum_pairs(make_scene([CAR], CENTERS[:1]), nothing))
     assert got.mean_iou3d is None and got.right is None and got.found == got.truth_iou3d == 0
     with pytest.raises(ValueError, match="no scored category"):
-        compute_pair_scores(sum_pairs(nothing, scene([CAR], CENTERS[:1])))
+        compute_pair_scores(sum_pairs(nothing, make_scene([CAR], CENTERS[:1])))
 
 
 # ------------------------------------------------------------------------------------------ voxels
@@ -359,7 +366,7 @@ def test_voxel_scores_equal_plain_counting():
 
 def test_voxel_scores_of_equal_voxels_are_one_and_ignore_air():
     space = VoxelGrid(GRID, -2, 2, 8)
-    voxels = voxelize(scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
+    voxels = voxelize(make_scene([CAR, POLE], [[1, 0, 0], [0.5, 0.5, 1]]), space)
     got = compute_voxel_scores(compute_voxel_confusion(voxels, voxels))
     assert got.iou == got.miou == 1 and set(got.class_iou) == {"vehicle_small", "pole"}
     nothing = np.zeros_like(voxels)
@@ -374,7 +381,7 @@ def test_voxel_scores_of_equal_voxels_are_one_and_ignore_air():
 
 
 def test_layout_memory_equals_paper():
-    """2.50 MB of rasters, 0.02 MB of primitives; voxels of four bytes 8.00 MB (paper, Sec. 4.2 and Tab. 1)."""
+    """Rasters need 2.50 MB, primitives 0.02 MB and voxels of four bytes 8.00 MB (paper, Sec. 4.2 and Tab. 1)."""
     truth, spec = random_scene(0, n=40), LayoutSpec()
     latent = np.zeros((64, 32, 32), np.float32)
     got = measure_memory_bytes(make_layout_batch([truth], spec), latent, voxelize(truth, VoxelGrid()))
