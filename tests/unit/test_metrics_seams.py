@@ -1,4 +1,4 @@
-"""Seam scores on hand-computed cases and on scenes with known visible or invisible seams."""
+"""Tests of seam scores on hand-computed cases and on scenes with visible or invisible seams."""
 
 from dataclasses import replace
 
@@ -26,8 +26,11 @@ from pipelines.metrics.seams import (
 GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
 
-def speckled(seed: int, block_px: int = 8):
-    """Random ground classes per block of pixels and random heights per pixel: all lines are alike."""
+def make_random_ground(seed: int, block_px: int = 8):
+    """Return random ground classes per square of pixels and random heights per pixel.
+
+    All lines of such a scene have the same statistics.
+    """
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, 0)
     blocks = 256 // block_px
@@ -40,7 +43,7 @@ def speckled(seed: int, block_px: int = 8):
     )
 
 
-def with_cars(scene, centers_xy_m, size_m=(4.0, 2.0, 1.5)):
+def replace_objects_by_cars(scene, centers_xy_m, size_m=(4.0, 2.0, 1.5)):
     n = len(centers_xy_m)
     center = np.zeros((n, 3), np.float32)
     center[:, :2] = centers_xy_m
@@ -58,36 +61,36 @@ def with_cars(scene, centers_xy_m, size_m=(4.0, 2.0, 1.5)):
     )
 
 
-def ratios(scenes, **lines) -> dict:
+def compute_ratios(scenes, **lines) -> dict:
     return estimate_seam_ratios(np.stack([measure_scene_seams(scene, **lines) for scene in scenes]))
 
 
 def test_seam_ratio_of_invisible_seam_is_one():
-    got = ratios([speckled(seed, block_px=1) for seed in range(60)], rows=[64, 130], cols=[100])
+    got = compute_ratios([make_random_ground(seed, block_px=1) for seed in range(60)], rows=[64, 130], cols=[100])
     for name in ("class_changes", "height_step"):
         assert got[name].low < 1.02 and got[name].high > 0.98
         assert got[name].high - got[name].low < 0.1
-    assert got["cut_objects"] is None  # no objects, so no score
+    assert got["cut_objects"] is None  # a scene without objects has no score
 
 
 def test_seam_ratio_shows_change_of_scene():
     scenes = []
     for seed in range(20):
-        near, far = speckled(seed), speckled(seed + 100)
+        near, far = make_random_ground(seed), make_random_ground(seed + 100)
         height = near.height_m.copy()
         occupied = near.occupied.copy()
         occupied[:, :128] = far.occupied[:, :128]
-        height[:, :128] = np.where(far.occupied[:, :128], far.height_m[:, :128] + 1, 0)  # a step of a metre
+        height[:, :128] = np.where(far.occupied[:, :128], far.height_m[:, :128] + 1, 0)  # a height step of 1 m
         scenes.append(replace(near, occupied=occupied, height_m=height.astype(np.float32)))
-    got = ratios(scenes, rows=[128])
+    got = compute_ratios(scenes, rows=[128])
     assert got["class_changes"].low > 3 and got["height_step"].low > 3
-    got = ratios(scenes, rows=[64])
+    got = compute_ratios(scenes, rows=[64])
     assert got["class_changes"].low < 1 < got["class_changes"].high
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_seam_scores_count_cut_and_duplicate_objects(axis):
-    def placed(offset_m, along_m=0.0):
+    def make_position(offset_m, along_m=0.0):
         at = np.array([32.0, 0.0])
         at[axis] += offset_m
         at[1 - axis] += along_m
@@ -95,13 +98,17 @@ def test_seam_scores_count_cut_and_duplicate_objects(axis):
 
     size = (4.0, 2.0) if axis == 0 else (2.0, 4.0)
     lines = {"rows": [128]} if axis == 0 else {"cols": [128]}
-    ends = with_cars(speckled(0), [placed(2.0), placed(-2.1, 3)], (*size, 1.5))  # both end within 0.25 m of the line
+    ends = replace_objects_by_cars(
+        make_random_ground(0), [make_position(2.0), make_position(-2.1, 3)], (*size, 1.5)
+    )  # both cars end within 0.25 m of the line
     assert measure_scene_seams(ends, **lines)[2, 0].tolist() == [2, 2]
-    crosses = with_cars(speckled(0), [placed(0.5)], (*size, 1.5))
+    crosses = replace_objects_by_cars(make_random_ground(0), [make_position(0.5)], (*size, 1.5))
     assert measure_scene_seams(crosses, **lines)[2, 0].tolist() == [0, 1]
-    twice = with_cars(speckled(0), [placed(0.6), placed(-0.6), placed(0.0, 8)], (*size, 1.5))
+    twice = replace_objects_by_cars(
+        make_random_ground(0), [make_position(0.6), make_position(-0.6), make_position(0.0, 8)], (*size, 1.5)
+    )
     assert measure_scene_seams(twice, **lines)[3, 0].tolist() == [2, 3]
-    same_side = with_cars(speckled(0), [placed(0.6), placed(0.7)], (*size, 1.5))
+    same_side = replace_objects_by_cars(make_random_ground(0), [make_position(0.6), make_position(0.7)], (*size, 1.5))
     assert measure_scene_seams(same_side, **lines)[3, 0].tolist() == [0, 2]
 
 
@@ -115,7 +122,7 @@ def test_footprint_of_rotated_box_contains_corners():
 
 
 def test_reference_lines_avoid_every_seam():
-    near = list_parallel_lines([100, 130], 256, 0.25)  # 7.5 m apart
+    near = list_parallel_lines([100, 130], 256, 0.25)  # the lines are 7.5 m apart
     assert 115 not in near[100] and 84 in near[100] and 85 not in near[100] and 146 in near[100]
     assert min(abs(line - seam) for line in near[130] for seam in (100, 130)) == 16
     assert near[100].min() == 36
@@ -123,16 +130,16 @@ def test_reference_lines_avoid_every_seam():
 
 def test_seam_scores_reject_edge_seam_and_skip_empty_scene():
     with pytest.raises(ValueError, match="seam before pixel 256, expected 1 to 255"):
-        measure_scene_seams(speckled(0), rows=[256])
-    empty = replace(speckled(0), occupied=np.zeros((5, 256, 256), bool))
+        measure_scene_seams(make_random_ground(0), rows=[256])
+    empty = replace(make_random_ground(0), occupied=np.zeros((5, 256, 256), bool))
     assert set(estimate_seam_ratios(measure_scene_seams(empty, rows=[128])[None]).values()) == {None}
     assert len(MEASURES) == 4
 
 
 def test_seam_sweep_row_has_cost_and_visibility():
     ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
-    cars = with_cars(speckled(0), [(10, 0), (20, 3)])
-    assert count_objects_per_ha([cars, speckled(1)]) == pytest.approx(2 / 0.8192)  # 64 m squared twice
+    cars = replace_objects_by_cars(make_random_ground(0), [(10, 0), (20, 3)])
+    assert count_objects_per_ha([cars, make_random_ground(1)]) == pytest.approx(2 / 0.8192)  # two scenes of 64 m x 64 m
     row = make_seam_row(RePaintConfig(), 200, 12.3, ratios)
     assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
     (cells,) = build_seam_table([row]).rows
