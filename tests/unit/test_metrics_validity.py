@@ -1,4 +1,4 @@
-"""Validity measures on scenes with known answers; road connectivity equals a flood fill."""
+"""Tests of validity measures on scenes with known values, and of road connectivity against a flood fill."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SLAB_M = 0.3
 ROAD, SIDEWALK, PARKING = 0, 1, 2
 
 
-def town(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
+def make_town_scene(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
     """Road on the left half (y > 0), sidewalk on the right but for the last row, which has no ground at all.
 
     primitives: (category, x, y, height of the bottom above the surface); all are 2 m cubes but for houses of 4 m.
@@ -53,38 +53,40 @@ def measure(name: str, scene: Scene) -> tuple[float, float]:
 
 def test_validity_overlap_counts_both_solid_objects_of_a_pair():
     apart, near = (CAR, 3.0, 4.0, 0), (CAR, 4.9, 4.0, 0)  # IoU3D 0.1 / 3.9 = 0.026
-    assert measure("overlapping", town([apart, near])) == (0, 2)
-    assert measure("overlapping", town([apart, (CAR, 4.5, 4.0, 0)])) == (2, 2)  # 0.5 / 3.5 = 0.14
-    assert measure("overlapping", town([apart, (TREE, 3.0, 4.0, 0)])) == (0, 1)
-    assert measure("overlapping", town([apart, (HUMAN, 3.0, 4.0, 0), (POLE, 12.0, -4.0, 0)])) == (2, 3)
-    assert measure("overlapping", town()) == (0, 0)
+    assert measure("overlapping", make_town_scene([apart, near])) == (0, 2)
+    assert measure("overlapping", make_town_scene([apart, (CAR, 4.5, 4.0, 0)])) == (2, 2)  # 0.5 / 3.5 = 0.14
+    assert measure("overlapping", make_town_scene([apart, (TREE, 3.0, 4.0, 0)])) == (0, 1)
+    assert measure("overlapping", make_town_scene([apart, (HUMAN, 3.0, 4.0, 0), (POLE, 12.0, -4.0, 0)])) == (2, 3)
+    assert measure("overlapping", make_town_scene()) == (0, 0)
 
 
 @pytest.mark.parametrize(("bottom_m", "floats", "sinks"), [(0, 0, 0), (0.45, 0, 0), (0.55, 1, 0), (-0.55, 0, 1)])
 def test_validity_floating_is_measured_from_surface_below_slab(bottom_m, floats, sinks):
-    scene = town([(POLE, 5.0, -4.5, bottom_m), (TREE, 5.0, 3.0, 9)])  # a crown may hang
+    scene = make_town_scene([(POLE, 5.0, -4.5, bottom_m), (TREE, 5.0, 3.0, 9)])  # tree crowns may float
     assert measure("floating", scene) == (floats, 1)
     assert measure("sunken", scene) == (sinks, 1)
 
 
 def test_validity_tilted_box_stands_on_lowest_corner():
-    scene = town([(POLE, 5.0, -4.5, 0)])
+    scene = make_town_scene([(POLE, 5.0, -4.5, 0)])
     cos = np.sqrt(0.5)
-    tilted = np.array([[[cos, 0, cos], [0, 1, 0], [-cos, 0, cos]]], np.float32)  # lowest corner sqrt(2) below centre
+    tilted = np.array(
+        [[[cos, 0, cos], [0, 1, 0], [-cos, 0, cos]]], np.float32
+    )  # the lowest corner is sqrt(2) m below the centre
     object.__setattr__(scene, "rotation", tilted)
-    assert measure("sunken", scene) == (0, 1)  # sqrt(2) - 1 = 0.41 m down
+    assert measure("sunken", scene) == (0, 1)  # the corner is sqrt(2) - 1 = 0.41 m below the surface
     object.__setattr__(scene, "center_m", scene.center_m - np.float32([0, 0, 0.1]))
     assert measure("sunken", scene) == (1, 1)
 
 
-def test_validity_counts_but_does_not_judge_unknown_ground():
+def test_validity_counts_objects_over_unknown_ground_separately():
     over_nothing, behind, ahead, good = (
         (CAR, 0.5, 4.0, 7),
         (CAR, -3.0, 4.0, 7),
         (CAR, 20.0, -4.0, 7),
         (CAR, 5.0, 4.0, 0),
     )
-    scene = town([over_nothing, behind, ahead, good])
+    scene = make_town_scene([over_nothing, behind, ahead, good])
     assert measure("floating", scene) == (0, 1)
     assert measure("off_road_vehicles", scene) == (0, 1)
     assert measure("over_unknown_ground", scene) == (1, 2)
@@ -93,13 +95,13 @@ def test_validity_counts_but_does_not_judge_unknown_ground():
 def test_validity_expects_cars_on_road_and_houses_off_road():
     on_road, parked, on_sidewalk = (CAR, 5.0, 4.0, 0), (CAR, 15.5, -4.0, 0), (CAR, 5.0, -4.0, 0)
     houses = [(HOUSE, 9.0, 4.0, 0), (HOUSE, 9.0, -4.0, 0)]
-    scene = town([on_road, parked, on_sidewalk, *houses])
+    scene = make_town_scene([on_road, parked, on_sidewalk, *houses])
     assert measure("off_road_vehicles", scene) == (1, 3)
     assert measure("buildings_on_road", scene) == (1, 2)
 
 
-def flood(mask: np.ndarray) -> float:
-    """Share of the mask's pixels in its largest 4-connected part."""
+def compute_share_by_flood_fill(mask: np.ndarray) -> float:
+    """Return the share of the pixels of a mask in its largest 4-connected part."""
     left, sizes = set(zip(*np.nonzero(mask), strict=True)), []
     total = len(left)
     while left:
@@ -118,17 +120,22 @@ def flood(mask: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_road_connectivity_equals_flood_fill(seed):
     road = np.random.default_rng(seed).random((16, 16)) < 0.5
-    assert measure("road_connectivity", town(road=road)) == pytest.approx((flood(road), 1))
+    assert measure("road_connectivity", make_town_scene(road=road)) == pytest.approx(
+        (compute_share_by_flood_fill(road), 1)
+    )
 
 
 def test_road_connectivity_breaks_at_diagonal_and_skips_no_road():
-    assert measure("road_connectivity", town(road=np.eye(16, dtype=bool))) == (1 / 16, 1)
-    assert measure("road_connectivity", town(road=np.zeros((16, 16), bool))) == (0, 0)
-    assert measure("road_connectivity", town()) == (1, 1)
+    assert measure("road_connectivity", make_town_scene(road=np.eye(16, dtype=bool))) == (1 / 16, 1)
+    assert measure("road_connectivity", make_town_scene(road=np.zeros((16, 16), bool))) == (0, 0)
+    assert measure("road_connectivity", make_town_scene()) == (1, 1)
 
 
 def test_validity_rates_pool_scenes_and_skip_absent_categories():
-    good, bad = town([(CAR, 5.0, 4.0, 0)]), town([(CAR, 5.0, -4.0, 0), (CAR, 9.0, -4.0, 0), (CAR, 12.0, 4.0, 3)])
+    good, bad = (
+        make_town_scene([(CAR, 5.0, 4.0, 0)]),
+        make_town_scene([(CAR, 5.0, -4.0, 0), (CAR, 9.0, -4.0, 0), (CAR, 12.0, 4.0, 3)]),
+    )
     rates = compute_validity_rates([compute_scene_validity(good, SLAB_M), compute_scene_validity(bad, SLAB_M)])
     assert rates["off_road_vehicles"] == 0.5 and rates["floating"] == 0.25
     assert rates["buildings_on_road"] is None
@@ -138,12 +145,12 @@ def test_validity_rates_pool_scenes_and_skip_absent_categories():
 
 def test_label_fidelity_compares_measured_and_stated_label():
     many = DensityThresholds(count_p25=1.5, count_p75=2.5, volume_p25_m3=10, volume_p75_m3=20)
-    three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3: high; no car: low
-    right = town(three_trees, vegetation_density="high", vehicle_density="low")
-    wrong = town(three_trees, vegetation_density="high", vehicle_density="medium")
+    three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3 of vegetation is high, no vehicle is low
+    right = make_town_scene(three_trees, vegetation_density="high", vehicle_density="low")
+    wrong = make_town_scene(three_trees, vegetation_density="high", vehicle_density="medium")
     records = [compute_label_fidelity(scene, many, many) for scene in (right, wrong)]
     np.testing.assert_array_equal(records[0], [[1, 1], [1, 1], [1, 1]])
     np.testing.assert_array_equal(records[1], [[1, 1], [0, 1], [0, 1]])
     assert compute_validity_rates(records, LABEL_MEASURES) == dict(zip(LABEL_MEASURES, (1, 0.5, 0.5), strict=True))
     with pytest.raises(ValueError, match="no density label"):
-        compute_label_fidelity(town(three_trees), many, many)
+        compute_label_fidelity(make_town_scene(three_trees), many, many)
