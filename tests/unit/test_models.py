@@ -1,4 +1,4 @@
-"""The networks: sizes, masks, equivariance, losses and learning."""
+"""Tests of the networks: sizes, masks, equivariance, losses and training."""
 
 import itertools
 
@@ -36,11 +36,11 @@ from models.vae.matching import MatchWeights, match_primitives
 from models.vae.outputs import Posterior
 
 
-def millions(model) -> float:
+def count_million_parameters(model) -> float:
     return sum(p.numel() for p in model.parameters()) / 1e6
 
 
-def small_lvae(seed: int = 0, **options) -> LayoutVAE:
+def make_small_lvae(seed: int = 0, **options) -> LayoutVAE:
     torch.manual_seed(seed)
     options = override_options(LVAE_PRESETS["smoke"].architecture(), nest_flat_options(options))
     return LayoutVAE(layout=small_spec().to_dict(), **options)
@@ -51,9 +51,9 @@ def test_presets_have_parameter_counts_of_paper():
         row = LVAE_PRESETS["kitti360"]
         lvae = LayoutVAE(layout=LayoutSpec().with_resolution(row.raster_px).to_dict(), **row.architecture())
         assert lvae.latent_shape == (64, 32, 32)
-        assert abs(millions(lvae) - 93.1) < 0.1
+        assert abs(count_million_parameters(lvae) - 93.1) < 0.1
         for name, count in (("kitti360", 130), ("kitti360-l", 458), ("kitti360-xl", 675)):
-            assert abs(millions(DiT(**DIT_PRESETS[name].architecture())) / count - 1) < 0.005
+            assert abs(count_million_parameters(DiT(**DIT_PRESETS[name].architecture())) / count - 1) < 0.005
 
 
 def test_presets_error_lists_known_names():
@@ -62,11 +62,11 @@ def test_presets_error_lists_known_names():
 
 
 def test_object_encoder_ignores_padding_and_order():
-    lvae, spec = small_lvae(), small_spec()
+    lvae, spec = make_small_lvae(), small_spec()
     batch = make_layout_batch([random_scene(0), random_scene(1, n=0)], spec)
     latent = lvae.object_encoder(batch.features, batch.real)
     assert torch.isfinite(latent).all()
-    assert torch.equal(latent[1], lvae.object_encoder.grid)  # an empty scene is the learnable grid
+    assert torch.equal(latent[1], lvae.object_encoder.grid)  # the encoder maps an empty scene to its learnable grid
     noisy = torch.where(batch.real[..., None], batch.features, torch.rand_like(batch.features))
     assert torch.allclose(lvae.object_encoder(noisy, batch.real), latent, atol=1e-5)
     order = torch.cat([torch.randperm(6) + 6 * k for k in range(11)])
@@ -75,15 +75,15 @@ def test_object_encoder_ignores_padding_and_order():
 
 
 def test_object_encoder_writes_to_cell_under_center():
-    lvae, spec = small_lvae(), small_spec()
-    scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # far left corner
+    lvae, spec = make_small_lvae(), small_spec()
+    scene = random_scene(0, n=1, center_m=np.array([[63.0, 31.0, 0.0]], np.float32))  # the far left corner of the crop
     batch = make_layout_batch([scene], spec)
     change = (lvae.object_encoder(batch.features, batch.real)[0] - lvae.object_encoder.grid).abs().sum(0)
     assert change[0, 0] > 0 and change.sum() == change[0, 0]
 
 
-def test_layout_vae_latent_is_split():
-    lvae, batch = small_lvae(), make_layout_batch([random_scene(0)], small_spec())
+def test_layout_vae_ground_reads_first_half_of_latent():
+    lvae, batch = make_small_lvae(), make_layout_batch([random_scene(0)], small_spec())
     latent = lvae.encode(batch).mean
     changed = latent.clone()
     changed[:, latent.shape[1] // 2 :] += 1
@@ -92,8 +92,8 @@ def test_layout_vae_latent_is_split():
     assert not torch.allclose(a.features, b.features)
 
 
-def literal_total(features, logit, truth, real, columns) -> float:
-    """The square matching cost of the paper for one category, term by term."""
+def compute_literal_cost(features, logit, truth, real, columns) -> float:
+    """Return the matching cost of the paper for one category, term by term."""
     p = torch.sigmoid(logit.double())
     total = 0.0
     for i, j in enumerate(columns):
@@ -121,7 +121,7 @@ def test_matching_reaches_optimum_of_padded_square_problem():
             part = (features[0, here], logit[0, here], truth[0, here], real[0, here])
             square = np.array(
                 [
-                    [literal_total(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
+                    [compute_literal_cost(*part[:2], part[2][i : i + 1], part[3][i : i + 1], [j]) for j in range(s)]
                     for i in range(s)
                 ]
             )
@@ -130,12 +130,12 @@ def test_matching_reaches_optimum_of_padded_square_problem():
             taken = [int((mine == start + i).nonzero()) for i in range(count)]
             free = [j for j in range(s) if mine[j] < 0]
             assert len(taken) + len(free) == s
-            assert abs(literal_total(*part, taken + free) - square[rows, cols].sum()) < 1e-5, trial
+            assert abs(compute_literal_cost(*part, taken + free) - square[rows, cols].sum()) < 1e-5, trial
             start += s
 
 
 def test_matching_of_surplus_proposals_is_optimal():
-    """The cell decoder proposes more objects than slots; compares with brute force over the rectangular cost."""
+    """The cell decoder has more proposals than slots, so the reference is a search over the rectangular cost."""
     generator = torch.Generator().manual_seed(3)
     slots, proposals, weights = (3, 2), (7, 5), MatchWeights(1.0, 24.0, 3.0)
     features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
@@ -160,22 +160,22 @@ def test_matching_of_surplus_proposals_is_optimal():
 
 
 def test_cell_decoder_proposals_lie_around_their_cell():
-    decoder = small_lvae(decoder="cells").object_decoder
+    decoder = make_small_lvae(decoder="cells").object_decoder
     features, existence = decoder(torch.randn(1, 4, 8, 8) * 10)
     assert features.shape == (1, sum(decoder.proposals), 9) and existence.shape == features.shape[:2]
-    first = features[0, : decoder.proposals[0]].view(-1, 8, 8, 9)  # k, row, col
+    first = features[0, : decoder.proposals[0]].view(-1, 8, 8, 9)  # proposal, row, column, feature
     middle = 1 - (torch.arange(8) + 0.5) / 8
     assert (first[..., 0] - middle[:, None]).abs().max() <= 1 / 8 + 1e-6
     assert (first[..., 1] - middle[None, :]).abs().max() <= 1 / 8 + 1e-6
 
 
 def test_object_shortcut_is_equivariant_to_cell_shift():
-    encoder = small_lvae(shortcut=True).object_encoder
+    encoder = make_small_lvae(shortcut=True).object_encoder
     torch.nn.init.zeros_(encoder.project_out.weight)
     features = torch.full((2, sum(small_spec().slots), 9), 0.3)
     features[1, 0, :2] += torch.tensor(
         [2 / 8, -1 / 8]
-    )  # two cells ahead, one to the right: to a lower row, a higher column
+    )  # two cells ahead (a lower row) and one cell to the right (a higher column)
     real = torch.zeros(features.shape[:2], dtype=torch.bool)
     real[:, 0] = True
     with torch.no_grad():
@@ -187,7 +187,7 @@ def test_object_shortcut_is_equivariant_to_cell_shift():
 def test_init_from_data_starts_outputs_at_means():
     batch = make_layout_batch([random_scene(i) for i in range(8)], small_spec())
     for decoder in ("detr", "cells"):
-        lvae = small_lvae(decoder=decoder)
+        lvae = make_small_lvae(decoder=decoder)
         before = lvae.decode(lvae.encode(batch).mean)
         lvae.init_from_data(batch)
         after = lvae.decode(lvae.encode(batch).mean)
@@ -206,7 +206,7 @@ def test_distance_transform_equals_scipy():
     for most in (1, 3, 6):
         found = compute_signed_distance_px(torch.from_numpy(inside), most).numpy()
         for mask, distance in zip(inside, found, strict=True):
-            border = np.pad(mask, 50, mode="edge")  # ground beyond the crop is unknown
+            border = np.pad(mask, 50, mode="edge")  # ground outside the crop is unknown
             to = [
                 ndimage.distance_transform_edt(side) if not side.all() else np.full(side.shape, 99.0)
                 for side in (border, ~border)
@@ -215,13 +215,13 @@ def test_distance_transform_equals_scipy():
             inner = (
                 slice(most, -most),
                 slice(most, -most),
-            )  # edge padding creates boundaries near the border of the crop
+            )  # exclude the border of the crop, where edge padding creates boundaries
             assert np.allclose(distance[inner], want[inner], atol=1e-5)
 
 
 def test_linear_init_is_optimal_with_unit_variance_codes():
     batch = make_layout_batch([random_scene(i) for i in range(12)], small_spec())
-    lvae = small_lvae(shortcut=True, latent_channels=16)
+    lvae = make_small_lvae(shortcut=True, latent_channels=16)
     lvae.init_from_data(batch)
     cell = lvae.ground_encoder.shortcut.stride[0]
     maps = compute_smooth_maps(batch.height, batch.occupied, cell)
@@ -239,15 +239,17 @@ def test_linear_init_is_optimal_with_unit_variance_codes():
     )
     truth, ours = (part.double() for part in cells)
     centred = truth - truth.mean(dim=0)
-    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # Eckart-Young: no map of rank 16 does better
-    within = 0.02 * float((centred**2).sum())  # the decoder's bias is one per map, not per pixel
+    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # minimum error of maps with rank 16 (Eckart-Young)
+    within = 0.02 * float(
+        (centred**2).sum()
+    )  # tolerance, because the decoder has one bias per map instead of one per pixel
     assert least <= float(((ours - truth) ** 2).sum()) < least + within
     deviation = code.transpose(0, 1).flatten(1).std(dim=1)
     assert (deviation < 1.01).all() and deviation.max() > 0.99
 
 
 def test_linear_init_lowers_learning_rate():
-    lvae = small_lvae(shortcut=True, decoder="cells")
+    lvae = make_small_lvae(shortcut=True, decoder="cells")
     trainer = Trainer(
         lvae, lambda *_: {}, OptimizerConfig(steps=10, learning_rate=1e-2, weight_decay=0.0), torch.device("cpu")
     )
@@ -259,14 +261,14 @@ def test_linear_init_lowers_learning_rate():
     }
     assert {v for n, v in names.items() if n.startswith("ground_") and ".shortcut" not in n} == {0.25}
     assert {v for n, v in names.items() if n.startswith("object_")} == {1.0}
-    assert not small_lvae().learning_rate_factors()
+    assert not make_small_lvae().learning_rate_factors()
 
 
 def test_shortcuts_show_ground_before_first_step():
     batch = make_layout_batch([random_scene(i) for i in range(12)], small_spec())
     iou = []
     for shortcut in (False, True):
-        lvae = small_lvae(shortcut=shortcut, latent_channels=16)
+        lvae = make_small_lvae(shortcut=shortcut, latent_channels=16)
         lvae.init_from_data(batch)
         with torch.no_grad():
             seen = lvae.decode(lvae.encode(batch).mean).occupancy_logit > 0
@@ -302,7 +304,7 @@ def test_losses_equal_their_equations():
     assert np.allclose(got, want, rtol=1e-4)
 
     occupied = (torch.rand(2, 5, 8, 8, generator=generator) < 0.5).float()
-    occupied[1] = 0  # a sample without ground must not divide by zero
+    occupied[1] = 0  # a sample without ground must not cause a division by zero
     height, true_height = (torch.rand(2, 5, 8, 8, generator=generator) for _ in range(2))
     want = float(((height - true_height).abs()[0] * occupied[0]).sum() / occupied[0].sum()) / 2
     assert np.isclose(float(compute_height_loss(height, true_height, occupied)), want, rtol=1e-5)
@@ -319,7 +321,7 @@ def test_losses_equal_their_equations():
 @pytest.mark.parametrize("decoder, steps, ground", [("detr", 200, 0.9), ("cells", 60, 0.7)])
 def test_lvae_overfits_one_batch(decoder, steps, ground):
     spec = small_spec()
-    lvae = small_lvae(
+    lvae = make_small_lvae(
         decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
     )
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
@@ -344,13 +346,13 @@ def test_lvae_overfits_one_batch(decoder, steps, ground):
     [ExecutionConfig(precision="bf16"), ExecutionConfig(accumulate=2), ExecutionConfig(accumulate=4, precision="bf16")],
 )
 def test_lvae_step_is_equal_in_halves_and_bf16(execution):
-    """Compares the loss at equal weights, then the decrease of the loss after separate training steps."""
+    """The test compares the loss at equal weights, then the decrease of the loss after 20 training steps."""
     spec = small_spec()
     layouts = [encode_layout(random_scene(i, n=20), spec) for i in range(4)]
     arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
     losses = {}
     for way in (ExecutionConfig(precision="fp32"), execution):
-        lvae = small_lvae(decoder="cells", shortcut=True)
+        lvae = make_small_lvae(decoder="cells", shortcut=True)
         lvae.init_from_data(LayoutBatch.from_compact(arrays))
         settings = OptimizerConfig(steps=20, learning_rate=3e-3, weight_decay=0.0)
         trainer = make_lvae_trainer(lvae, settings, 1e-6, torch.device("cpu"), lambda model: model, way)
@@ -367,8 +369,10 @@ def test_latent_noise_is_per_sample_with_stated_scale():
     alone = sample_corruption([torch.Generator().manual_seed(7)], (4, 8, 8), 0.2, torch.device("cpu"))
     assert torch.equal(drawn[7], alone[0])
     sizes = drawn.std(dim=(1, 2, 3))
-    assert np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02  # |N(0, 0.2)|
-    lvae, spec = small_lvae(decoder="cells", shortcut=True), small_spec()
+    assert (
+        np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02
+    )  # sizes follow |N(0, 0.2)|
+    lvae, spec = make_small_lvae(decoder="cells", shortcut=True), small_spec()
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     noise = torch.zeros(2, *lvae.latent_shape)
     with torch.no_grad():
@@ -382,7 +386,8 @@ def test_latent_noise_is_per_sample_with_stated_scale():
 
 def test_lvae_retrains_more_proposals_on_same_latents():
     old, new = (
-        small_lvae(shortcut=True, objects={"decoder": "cells", "min_proposals_per_cell": least}) for least in (1, 3)
+        make_small_lvae(shortcut=True, objects={"decoder": "cells", "min_proposals_per_cell": least})
+        for least in (1, 3)
     )
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], small_spec())
     new.freeze_all_but_object_decoder(old.state_dict())
@@ -400,7 +405,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
     dit = DiT(channels=4, size=8, width=32, depth=2, heads=2)
     latent, time, label = torch.randn(3, 4, 8, 8), torch.tensor([0, 500, 999]), torch.tensor([0, 1, 3])
     assert dit(latent, time, label).shape == latent.shape
-    assert (dit(latent, time, label) == 0).all()  # adaLN-Zero and a zero output layer
+    assert (dit(latent, time, label) == 0).all()  # adaLN-Zero and the output layer start at 0
     for parameter in dit.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     base = dit(latent, time, label)
@@ -416,7 +421,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
 
 
 def test_dit_unpatchify_inverts_patchify():
-    """With the network reduced to its patch embedding and its transpose, out = in."""
+    """A network that consists of the patch embedding and its transpose returns its normalised input."""
     dit = DiT(channels=3, size=8, width=12, depth=1, heads=1)
     with torch.no_grad():
         dit.patch_in.weight.copy_(torch.eye(12).view(12, 3, 2, 2))
