@@ -1,4 +1,4 @@
-"""Worlds of blocks: given the truth for every block they equal the truth, in any order of blocks."""
+"""Tests of outpainting: block grids, composition of true blocks, and the pipeline."""
 
 from dataclasses import replace
 from itertools import product
@@ -29,23 +29,26 @@ EMPTY = make_empty_scene("empty", "town", "0", 0, TRUTH_SPEC)
 SIDES, CORNERS = [(1, 0), (-1, 0), (0, 1), (0, -1)], [(1, 1), (1, -1), (-1, 1), (-1, -1)]
 
 
-def cell_occupancy(scenes) -> torch.Tensor:
-    """A test encoder whose latent is the occupancy of 8 x 8 cells, which shows what a block knows."""
+def encode_occupancy(scenes) -> torch.Tensor:
+    """Encode scenes as the occupancy of 8 x 8 cells, which shows the known region of a block."""
     occupied = np.stack([s.occupied for s in scenes]).astype(np.float32)
     return torch.from_numpy(occupied.reshape(len(scenes), len(KITTI_GROUND_CLASSES), 8, 4, 8, 4).mean(axis=(3, 5)))
 
 
 @pytest.fixture
 def truth():
-    """128 x 128 m on one slope with block (0, 0) in the middle; objects of a category do not overlap."""
+    """A scene of 128 x 128 m on one slope, with block (0, 0) in the middle.
+
+    Objects of the same category do not overlap.
+    """
     scene = random_scene(3, n=300, grid=LARGE)
     rng = np.random.default_rng(0)
     center = rng.uniform([-32, -64, -2], [96, 64, 6], (300, 3)).astype(np.float32)
     return replace(scene, center_m=center, size_m=scene.size_m * 0.05)
 
 
-def seen(truth, index, block_grid=None):
-    """The truth as a block at `index` sees it, in its own frame."""
+def crop_truth(truth, index, block_grid=None):
+    """Return the crop of the truth for the block at `index`, in the frame of the block."""
     step = 64.0 * (block_grid.step / block_grid.size if block_grid else 0.5)
     x, y = step * index[0], step * index[1]
     return truth.crop(replace(SMALL, front_m=64 + x, left_m=32 + y)).translate(-x, -y)
@@ -54,7 +57,7 @@ def seen(truth, index, block_grid=None):
 # ------------------------------------------------------------------------------------------------------ block grids
 
 
-def block_grids():
+def iterate_block_grids():
     rectangles = [(1, 1, 1, 1), (3, 0, 2, 1), (0, 4, 0, 0)]
     for last, overlap in product(rectangles, (0.125, 0.25, 0.5, 0.75)):
         yield BlockGrid.from_overlap(8, overlap, num_blocks=last)
@@ -64,7 +67,7 @@ def block_grids():
 
 @pytest.mark.parametrize(
     "block_grid",
-    block_grids(),
+    iterate_block_grids(),
     ids=lambda block_grid: f"{block_grid.rank.__name__}-{block_grid.step}-{block_grid.num_blocks}",
 )
 def test_block_grid_cells_have_one_owner_known_to_later_blocks(block_grid):
@@ -72,7 +75,7 @@ def test_block_grid_cells_have_one_owner_known_to_later_blocks(block_grid):
     owners: dict[tuple[int, int], list] = {}
     for index in indices:
         for row, col in np.argwhere(block_grid.owned_cells(index)).tolist():
-            # World cells: rows grow backward, columns to the right.
+            # World cells: rows increase backward, columns increase to the right.
             owners.setdefault((row - index[0] * block_grid.step, col - index[1] * block_grid.step), []).append(index)
     assert all(len(found) == 1 for found in owners.values())
     for index in indices:
@@ -110,46 +113,45 @@ def test_block_grid_rejects_wrong_overlaps():
         BlockGrid.from_overlap(8, 0.5, rank=rank_four_colors, num_blocks=None)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# composition
+# ------------------------------------------------------------------------------------------------------ composition
 
 
 @pytest.mark.parametrize("mode", ["copy", "reencode"])
 def test_block_composer_gives_blocks_their_known_neighbors(truth, mode):
     block_grid = BlockGrid.from_overlap(8, 0.5)
-    composer = BlockComposer(block_grid, TRUTH_SPEC, cell_occupancy)
+    composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy)
     blocks = {}
     for index in [(0, 0), *SIDES, *CORNERS]:
-        scene = seen(truth, index)
+        scene = crop_truth(truth, index)
         condition = composer.condition_block(index, blocks, EMPTY, mode)
         known = condition.mask == 0
         assert known.float().mean() == (0 if index == (0, 0) else 0.5 if index in SIDES else 0.75)
-        assert torch.equal(condition.latent[known], cell_occupancy([scene])[0][known])
+        assert torch.equal(condition.latent[known], encode_occupancy([scene])[0][known])
         assert np.array_equal(condition.known.occupied, scene.occupied & ~condition.new_pixels)
-        blocks[index] = SceneBlock(scene, cell_occupancy([scene])[0])
+        blocks[index] = SceneBlock(scene, encode_occupancy([scene])[0])
     with pytest.raises(KeyError):
         composer.condition_block((1, 1), {}, EMPTY, mode)
 
 
 @pytest.mark.parametrize(("overlap", "rank"), [(0.5, rank_outward), (0.25, rank_outward), (0.25, rank_four_colors)])
 def test_block_composer_of_true_blocks_equals_truth_in_one_datum(truth, overlap, rank):
-    """Heights of a block are relative to its own ground; heights of the composer are not."""
+    """Heights of a block are relative to its ground; heights of the composed scene have one datum."""
     last = (1, 1, 1, 1) if overlap == 0.5 else (0, 0, 0, 0)
     block_grid = BlockGrid.from_overlap(8, overlap, rank=rank, num_blocks=last if rank is rank_outward else None)
-    composer = BlockComposer(block_grid, TRUTH_SPEC, cell_occupancy, find_ground_height(truth, 0.0, 0.0))
+    composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy, find_ground_height(truth, 0.0, 0.0))
     blocks = {}
     wanted = block_grid.indices() if rank is rank_outward else list(product((-1, 0, 1), (-1, 0, 1)))
     for index in [index for front in block_grid.group_by_rank(wanted) for index in front]:
         needed = {other for other, _ in block_grid.known_cells(index)}
         if not needed <= blocks.keys():
-            continue  # beyond the truth
+            continue  # a known block of this block is outside the truth
         condition = composer.condition_block(index, blocks, EMPTY, "reencode")
         datum = condition.datum_m
         assert (datum != 0) == (
             not condition.is_empty
             and find_ground_height(condition.known.translate(0, 0, datum), 0, 0) != composer.level_m
         )
-        scene = seen(truth, index, block_grid).translate(0, 0, -datum)
+        scene = crop_truth(truth, index, block_grid).translate(0, 0, -datum)
         blocks[index] = composer.finish_block(condition, condition.latent, scene)
         assert blocks[index].known_ground > 0.5
     whole = composer.stitch(blocks, EMPTY)
@@ -165,11 +167,11 @@ def test_block_composer_of_true_blocks_equals_truth_in_one_datum(truth, overlap,
 
 def test_block_composer_does_not_repeat_known_object(truth):
     block_grid = BlockGrid.from_overlap(8, 0.5)
-    composer = BlockComposer(block_grid, TRUTH_SPEC, cell_occupancy)
-    middle = seen(truth, (0, 0))
-    blocks = {(0, 0): SceneBlock(middle, cell_occupancy([middle])[0])}
+    composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy)
+    middle = crop_truth(truth, (0, 0))
+    blocks = {(0, 0): SceneBlock(middle, encode_occupancy([middle])[0])}
     condition = composer.condition_block((1, 0), blocks, EMPTY, "copy")
-    # An object just behind the seam, generated again just ahead of the seam and once more far ahead.
+    # A known object is just behind the seam. A copy just ahead of the seam is a duplicate; an object far ahead is not.
     car = {"size_m": np.float32([[4, 2, 1.5]]), "rotation": np.eye(3, dtype=np.float32)[None]}
     known = replace(condition.known.select([0]), center_m=np.float32([[31.9, 5, 0]]), **car)
     condition = replace(condition, known=known)
@@ -180,12 +182,14 @@ def test_block_composer_does_not_repeat_known_object(truth):
 
 def test_block_composer_marks_blocks_that_know_only_empty_ground(truth):
     block_grid = BlockGrid.from_overlap(8, 0.5)
-    composer = BlockComposer(block_grid, TRUTH_SPEC, cell_occupancy)
-    bare = replace(seen(truth, (0, 0)), occupied=np.zeros_like(EMPTY.occupied), height_m=np.zeros_like(EMPTY.height_m))
-    condition = composer.condition_block(
-        (1, 0), {(0, 0): SceneBlock(bare, cell_occupancy([bare])[0])}, EMPTY, "reencode"
+    composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy)
+    bare = replace(
+        crop_truth(truth, (0, 0)), occupied=np.zeros_like(EMPTY.occupied), height_m=np.zeros_like(EMPTY.height_m)
     )
-    assert composer.finish_block(condition, condition.latent, seen(truth, (1, 0))).known_ground == 0.0
+    condition = composer.condition_block(
+        (1, 0), {(0, 0): SceneBlock(bare, encode_occupancy([bare])[0])}, EMPTY, "reencode"
+    )
+    assert composer.finish_block(condition, condition.latent, crop_truth(truth, (1, 0))).known_ground == 0.0
 
 
 # ---------------------------------------------------------------------------------------------------------- pipeline
