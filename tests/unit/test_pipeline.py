@@ -1,4 +1,4 @@
-"""PrITTIPipeline without Ray: samplers, seeds, diffusers' conventions, inpainting."""
+"""Tests of PrITTIPipeline without Ray: samplers, seeds, conventions of diffusers and inpainting."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ from models.scene import Grid
 SPEC = small_spec()
 
 
-def sampler_of(name: str):
+def build_sampler(name: str):
     return SchedulerConfig.ddpm().with_sampler(name).build()
 
 
@@ -46,11 +46,11 @@ def sampler_of(name: str):
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "off"),
+    ("name", "steps", "tolerance"),
     [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)],
 )
-def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, off):
-    """For data N(mean, std^2) the optimal denoiser is known; samples must have that mean and std."""
+def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, tolerance):
+    """With the exact denoiser of data N(mean, std^2), samples have the mean and the standard deviation of the data."""
     mean, std, alpha_bar = 1.5, 0.5, torch.from_numpy(Diffusion().alpha_bar).float()
 
     def model(latent, timestep, label):
@@ -61,10 +61,10 @@ def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, off):
     if name == "ddpm":
         drawn = sample(model, SamplingSchedule(Diffusion(), steps), noise, label)
     else:
-        solver = sampler_of(name)
+        solver = build_sampler(name)
         solver.set_timesteps(steps)
         drawn = sample_with_scheduler(model, solver, noise, label)
-    assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < off
+    assert abs(drawn.mean() - mean) < 0.02 and abs(drawn.std() - std) < tolerance
 
 
 def test_samplers_are_independent_of_batch_composition(pipeline):
@@ -75,9 +75,9 @@ def test_samplers_are_independent_of_batch_composition(pipeline):
         alone = torch.cat([pipeline.sample_latents([label], 3, [k], 10) for k, label in enumerate(labels)])
         assert torch.allclose(together, alone, atol=1e-4), name
         again = pipeline.sample_latents(labels, 3, range(3), 10)
-        assert torch.equal(together, again), name  # no state remains from the previous run
+        assert torch.equal(together, again), name  # a scheduler keeps no state of the previous run
     assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
-    pipeline.use_sampler("dpm++")  # after the one of its kind that draws noise
+    pipeline.use_sampler("dpm++")  # sde-dpm++, the previous sampler, draws noise; dpm++ does not
     assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
     with pytest.raises(ValueError, match="num_inference_steps is 600"):
         pipeline.sample_latents(labels, 3, range(3), 600)
@@ -125,42 +125,45 @@ def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
     latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.new_identity("run", 0, 0, "low")]
     (everything,) = pipeline.decode(latents, identities, 1e-6)
     existence = np.sort(everything.existence)
-    gap = np.argmax(np.diff(existence))  # away from any primitive, whose existence may round differently after loading
+    gap = np.argmax(np.diff(existence))  # a gap, because existence may round differently after loading
     middle = float(existence[gap : gap + 2].mean())
     (probable,) = pipeline.decode(latents, identities, middle)
     assert 0 < len(probable) < len(everything) and probable.existence.min() > middle
     pipeline.register_to_config(existence_threshold=middle)
     pipeline.save_pretrained(tmp_path)
-    pipeline.register_to_config(existence_threshold=0.3)  # the paper's
+    pipeline.register_to_config(existence_threshold=0.3)  # threshold of the paper
     again = PrITTIPipeline.from_pretrained(tmp_path)
     again.set_progress_bar_config(disable=True)
     assert scenes_equal(again.decode(latents, identities)[0], probable)
-    asked = {"seed": 1, "num_inference_steps": 2}
-    drawn = again.generate(["low"], **asked)[0], pipeline.generate(["low"], **asked, existence_threshold=middle)[0]
+    options = {"seed": 1, "num_inference_steps": 2}
+    drawn = again.generate(["low"], **options)[0], pipeline.generate(["low"], **options, existence_threshold=middle)[0]
     assert scenes_equal(*drawn)
     with pytest.raises(ValueError, match="existence_threshold is 30, expected between 0 and 1"):
-        pipeline.generate(["low"], **asked, existence_threshold=30)
+        pipeline.generate(["low"], **options, existence_threshold=30)
 
 
 def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
     mask = torch.zeros(1, *pipeline.lvae.latent_shape)
     mask[..., :4] = 1
 
-    def raw(resampling, scaling):
+    def run_inpainting(resampling, scaling):
         pipeline.register_to_config(noise_scaling=scaling)
         made = pipeline.inpaint_latents(InpaintCondition(torch.ones_like(mask), mask), ["low"], 0, [0], resampling)
         pipeline.register_to_config(noise_scaling=1.0)
         return made
 
-    assert torch.equal(raw(QUICK, 1.0), raw(QUICK, 1.01))
-    assert not torch.equal(raw(RePaintConfig.guided(6), 1.0), raw(RePaintConfig.guided(6), 1.01))
+    assert torch.equal(run_inpainting(QUICK, 1.0), run_inpainting(QUICK, 1.01))
+    assert not torch.equal(run_inpainting(RePaintConfig.guided(6), 1.0), run_inpainting(RePaintConfig.guided(6), 1.01))
     assert RePaintConfig.guided().num_evaluations == 50
     with pytest.raises(ValueError, match="eta is 2, expected 0"):
         RePaintConfig(eta=2)
 
 
 def test_noise_scaling_corrects_overestimated_noise():
-    """For Gaussian data the noise is known. A model that predicts 1 % too much noise samples too small a deviation."""
+    """For Gaussian data, the exact noise is known.
+
+    A model that overestimates the noise by 1 % samples a standard deviation that is too small.
+    """
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar).float()
 
     def model(excess):
@@ -170,16 +173,16 @@ def test_noise_scaling_corrects_overestimated_noise():
 
         return predict
 
-    solver, label = sampler_of("dpm++"), torch.zeros(64, dtype=torch.long)
+    solver, label = build_sampler("dpm++"), torch.zeros(64, dtype=torch.long)
 
-    def deviation(denoiser):
+    def compute_deviation(denoiser):
         solver.set_timesteps(20)
         return float(
             sample_with_scheduler(denoiser, solver, SceneNoise(0, range(64), LATENT_SHAPE, "cpu"), label).std()
         )
 
-    assert deviation(model(1.01)) < 0.49
-    assert abs(deviation(scale_noise(model(1.01), 1.01)) - deviation(model(1.0))) < 1e-6
+    assert compute_deviation(model(1.01)) < 0.49
+    assert abs(compute_deviation(scale_noise(model(1.01), 1.01)) - compute_deviation(model(1.0))) < 1e-6
 
 
 # ------------------------------------------------------------------------------------------------------ conventions
@@ -189,17 +192,17 @@ def test_pipeline_draws_seeds_from_generator(pipeline):
     def generate(**options):
         return pipeline.generate(["low", "high"], num_inference_steps=4, **options)
 
-    def seeded(seed):
+    def make_generator(seed):
         return torch.Generator().manual_seed(seed)
 
-    one, again, other = (generate(generator=seeded(seed)) for seed in (7, 7, 8))
+    one, again, other = (generate(generator=make_generator(seed)) for seed in (7, 7, 8))
     assert [s.scene_id for s in one] == [s.scene_id for s in again] != [s.scene_id for s in other]
     assert scenes_equal(one[0], again[0]) and not scenes_equal(one[0], other[0])
-    each = generate(generator=[seeded(7), seeded(8)])
+    each = generate(generator=[make_generator(7), make_generator(8)])
     assert [s.scene_id for s in each] == [one[0].scene_id, other[1].scene_id]
     assert scenes_equal(each[0], one[0]) and scenes_equal(each[1], other[1])
     with pytest.raises(ValueError, match="3 generators for 2 scenes: expected one, or one per scene"):
-        generate(generator=[seeded(0)] * 3)
+        generate(generator=[make_generator(0)] * 3)
 
 
 def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
@@ -218,7 +221,7 @@ def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
     seen.clear()
     whole = np.ones((32, 32), bool)
     pipeline.inpaint([random_scene(0, grid=SPEC.grid)], [whole], ["low"], repaint=QUICK, callback_on_step_end=watch)
-    assert [step for step, _ in seen] == list(range(10))  # 6 and twice a roll-back of 2
+    assert [step for step, _ in seen] == list(range(10))  # 6 steps and two jumps back by 2 steps
 
 
 # ------------------------------------------------------------------------------------------------------- inpainting
@@ -236,7 +239,7 @@ def test_polygon_region_equals_shapely():
             select_polygon(grid, bad)
 
 
-def test_half_plane_and_object_regions_lie_where_stated():
+def test_half_plane_and_object_regions_contain_stated_pixels():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     ahead = select_half_plane(grid, (2, 0), 40)
     assert np.array_equal(ahead, np.broadcast_to(grid.x_m()[:, None] >= 40, ahead.shape))
@@ -269,7 +272,7 @@ def test_region_grows_to_whole_cells():
 
 
 @pytest.mark.parametrize("contents", ["both", "ground", "objects"])
-def test_inpaint_keeps_the_rest(pipeline, contents):
+def test_inpaint_keeps_known_region(pipeline, contents):
     scene = random_scene(2, n=30, grid=SPEC.grid)
     region = select_half_plane(SPEC.grid, (1, 0), 32.0)
     (made,) = pipeline.inpaint([scene], [region], ["high"], contents, seed=4, repaint=QUICK)
@@ -288,7 +291,7 @@ def test_inpaint_keeps_the_rest(pipeline, contents):
 
 
 def test_inpaint_decodes_given_ground_exactly(pipeline):
-    """Inpaints objects on known ground: the ground decoder reads only the known ground channels."""
+    """If only objects are inpainted, the ground decoder reads only known channels of the latent."""
     scene = random_scene(5, n=30, grid=SPEC.grid)
     whole = np.ones((32, 32), bool)
     (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", repaint=QUICK, composite=False)
