@@ -1,6 +1,6 @@
-"""Scores of given features: equal to ADM's formulas written out in float64, and to torch-fidelity's own numbers.
+"""Tests of scores of given features against ADM's formulas in float64 and against results of torch-fidelity.
 
-Where a definition differs, the difference is measured here and explained in docs/evaluation.md.
+Tests measure the differences of definitions that docs/concepts/evaluation.md explains.
 """
 
 import json
