@@ -22,9 +22,15 @@ ROAD, SIDEWALK, PARKING = 0, 1, 2
 
 
 def make_town_scene(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
-    """Road on the left half (y > 0), sidewalk on the right but for the last row, which has no ground at all.
+    """Return a scene with road on the left half (y > 0) and sidewalk on the right half.
 
-    primitives: (category, x, y, height of the bottom above the surface); all are 2 m cubes but for houses of 4 m.
+    The last row has no ground. All primitives are cubes of 2 m, except houses, which are cubes of 4 m.
+
+    Args:
+        primitives: (category, x, y, height of the bottom above the surface) of each primitive (m).
+        road: Mask of the road, which replaces all ground (default: the halves above).
+        heights_m: Height of the surface below the ground slabs.
+        labels: Density labels of the scene.
     """
     occupied = np.zeros((5, 16, 16), bool)
     occupied[ROAD, :, :8] = True
