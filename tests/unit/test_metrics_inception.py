@@ -1,4 +1,4 @@
-"""The Inception network, compared with published parameter names, plain torch layers and torch-fidelity."""
+"""Tests of the Inception network against published parameter names, plain torch layers and torch-fidelity."""
 
 import hashlib
 import warnings
@@ -25,7 +25,7 @@ from pipelines.metrics.inception import (
 
 @pytest.fixture(scope="module")
 def network() -> Inception:
-    """Random weights with non-vanishing activations in all layers and random batch norm statistics."""
+    """An Inception network with random weights, random batch norm statistics and activations in all layers."""
     torch.manual_seed(0)
     network = Inception()
     for module in network.modules():
@@ -40,13 +40,14 @@ def network() -> Inception:
     return network
 
 
-def pictures(n=2, height=64, width=64, seed=0) -> np.ndarray:
+def make_pictures(n=2, height=64, width=64, seed=0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (n, height, width, 3), dtype=np.uint8)
 
 
 # ------------------------------------------------------------------------------------------ architecture
 
-# Shapes of convolutions as converted weight files list them (pytorch-fid, torch-fidelity): output, input, kernel.
+# Shapes (output, input, kernel) of convolutions in the converted weight files of pytorch-fid and torch-fidelity.
+# An input of 0 stands for the number of inputs of the block.
 A = {
     "branch1x1": (64, 0, 1, 1), "branch5x5_1": (48, 0, 1, 1), "branch5x5_2": (64, 48, 5, 5),
     "branch3x3dbl_1": (64, 0, 1, 1), "branch3x3dbl_2": (96, 64, 3, 3), "branch3x3dbl_3": (96, 96, 3, 3),
@@ -59,7 +60,7 @@ E = {
 }  # fmt: skip
 
 
-def c(channels):
+def list_branches_c(channels):
     return {
         "branch1x1": (192, 0, 1, 1), "branch7x7_1": (channels, 0, 1, 1), "branch7x7_2": (channels, channels, 1, 7),
         "branch7x7_3": (192, channels, 7, 1), "branch7x7dbl_1": (channels, 0, 1, 1),
@@ -77,7 +78,8 @@ BLOCKS = {
         "branch3x3": (384, 0, 3, 3), "branch3x3dbl_1": (64, 0, 1, 1), "branch3x3dbl_2": (96, 64, 3, 3),
         "branch3x3dbl_3": (96, 96, 3, 3),
     }),
-    "Mixed_6b": (768, c(128)), "Mixed_6c": (768, c(160)), "Mixed_6d": (768, c(160)), "Mixed_6e": (768, c(192)),
+    "Mixed_6b": (768, list_branches_c(128)), "Mixed_6c": (768, list_branches_c(160)),
+    "Mixed_6d": (768, list_branches_c(160)), "Mixed_6e": (768, list_branches_c(192)),
     "Mixed_7a": (768, {
         "branch3x3_1": (192, 0, 1, 1), "branch3x3_2": (320, 192, 3, 3), "branch7x7x3_1": (192, 0, 1, 1),
         "branch7x7x3_2": (192, 192, 1, 7), "branch7x7x3_3": (192, 192, 7, 1), "branch7x7x3_4": (192, 192, 3, 3),
@@ -90,7 +92,7 @@ STEM = {
 }  # fmt: skip
 
 
-def published_shapes() -> dict[str, tuple[int, ...]]:
+def list_published_shapes() -> dict[str, tuple[int, ...]]:
     convs = dict(STEM)
     for block, (inputs, branches) in BLOCKS.items():
         for branch, (outputs, own_inputs, height, width) in branches.items():
@@ -105,14 +107,14 @@ def published_shapes() -> dict[str, tuple[int, ...]]:
 
 def test_inception_parameters_match_published_names_and_shapes(network):
     ours = {name: tuple(value.shape) for name, value in network.state_dict().items() if "num_batches" not in name}
-    assert ours == published_shapes()
-    # The usual 1000-class Inception v3 without its auxiliary head has 23,834,568; this one has 8 classes more.
+    assert ours == list_published_shapes()
+    # Inception v3 with 1000 classes and no auxiliary head has 23,834,568 parameters. The FID network has 1008 classes.
     assert sum(p.numel() for p in network.parameters()) == 23_834_568 + 8 * 2049
 
 
 def test_inception_features_equal_literal_forward_pass(network):
-    """Applies the same weights with plain functions, block by block as in the TensorFlow graph."""
-    images = pictures(1, 80, 100)
+    """The reference applies the weights with plain functions, block by block, as the TensorFlow graph does."""
+    images = make_pictures(1, 80, 100)
     state = network.state_dict()
 
     def conv(name, x, stride=1, padding=0):
@@ -158,7 +160,7 @@ def test_inception_features_equal_literal_forward_pass(network):
             1,
         )
 
-    x = torch.from_numpy(literal_resize(images[0].astype(np.float64), 299)).permute(2, 0, 1)[None].float()
+    x = torch.from_numpy(resize_literally(images[0].astype(np.float64), 299)).permute(2, 0, 1)[None].float()
     x = (x - 128) / 128
     x = conv("Conv2d_2b_3x3", conv("Conv2d_2a_3x3", conv("Conv2d_1a_3x3", x, stride=2)), padding=1)
     x = conv("Conv2d_4a_3x3", conv("Conv2d_3b_1x1", F.max_pool2d(x, 3, 2)))
@@ -181,13 +183,13 @@ def test_inception_features_equal_literal_forward_pass(network):
 
     pool3, _, logits = compute_inception_features(network, images)
     scale = expected.abs().max().item()
-    assert expected.std().item() > 0.01 * scale  # activations do not vanish
+    assert expected.std().item() > 0.01 * scale  # the activations are not 0
     np.testing.assert_allclose(pool3, expected, atol=1e-4 * scale)
     np.testing.assert_allclose(logits, expected @ state["fc.weight"].T, atol=1e-3 * scale)
 
 
-def literal_resize(picture: np.ndarray, size: int) -> np.ndarray:
-    """TF1's ResizeBilinear, pixel by pixel: (height, width, 3) -> (size, size, 3)."""
+def resize_literally(picture: np.ndarray, size: int) -> np.ndarray:
+    """Resize (height, width, 3) to (size, size, 3) pixel by pixel, as ResizeBilinear of TensorFlow 1 does."""
     height, width, _ = picture.shape
     out = np.empty((size, size, 3))
     for row in range(size):
@@ -206,13 +208,13 @@ def literal_resize(picture: np.ndarray, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("height", "width", "size"), [(5, 7, 13), (16, 9, 6), (12, 12, 12)])
 def test_inception_resize_equals_tensorflow(height, width, size):
-    picture = pictures(1, height, width)[0].astype(np.float64)
+    picture = make_pictures(1, height, width)[0].astype(np.float64)
     got = resize_like_tensorflow1(torch.from_numpy(picture).permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
-    np.testing.assert_allclose(got, literal_resize(picture, size), atol=1e-3)
+    np.testing.assert_allclose(got, resize_literally(picture, size), atol=1e-3)
 
 
 def test_inception_features_are_independent_of_batch(network):
-    images = pictures(3)
+    images = make_pictures(3)
     together = compute_inception_features(network, images, batch_size=3)
     alone = compute_inception_features(network, images, batch_size=1)
     for got, expected in zip(together, alone, strict=True):
@@ -221,12 +223,12 @@ def test_inception_features_are_independent_of_batch(network):
 
 
 def test_inception_spatial_features_are_mixed_6_channels_last(network):
-    """TensorFlow flattens row, column, channel: the order of the moments of ADM's reference batches."""
+    """Features have the order row, column, channel of TensorFlow, like the moments in ADM's reference batches."""
     maps = []
     hook = network.Mixed_6d.branch1x1.register_forward_hook(lambda module, inputs, output: maps.append(output))
-    spatial = compute_inception_features(network, pictures()).spatial
+    spatial = compute_inception_features(network, make_pictures()).spatial
     hook.remove()
-    assert maps[0].shape == (2, 192, 17, 17) and maps[0].min() == 0  # after the ReLU
+    assert maps[0].shape == (2, 192, 17, 17) and maps[0].min() == 0  # the features are outputs of a ReLU
     for row, column, channel in ((0, 0, 0), (0, 0, 6), (0, 1, 0), (3, 5, 2), (16, 16, 6)):
         np.testing.assert_array_equal(spatial[:, (row * 17 + column) * 7 + channel], maps[0][:, channel, row, column])
 
@@ -245,8 +247,8 @@ def golden_network() -> Inception:
     return network
 
 
-def golden_difference(network: Inception) -> dict[str, float]:
-    """Per layer the largest difference to torch-fidelity's features, as a share of the layer's largest feature."""
+def compute_golden_difference(network: Inception) -> dict[str, float]:
+    """Return the largest difference to torch-fidelity per layer, as a share of the largest feature of the layer."""
     layers: dict[str, list[torch.Tensor]] = {"64": [], "192": [], "768": []}
     hooks = [
         getattr(network, module).register_forward_hook(lambda m, i, x, layer=layer: layers[layer].append(x))
@@ -268,8 +270,8 @@ def golden_difference(network: Inception) -> dict[str, float]:
 
 
 def test_inception_features_equal_torch_fidelity(golden_network):
-    """Every layer that torch-fidelity returns, for enlarged and reduced images, to 1e-5 of its scale."""
-    difference = golden_difference(golden_network)
+    """Each layer of torch-fidelity agrees to 1e-5 of its largest feature, for enlarged and reduced images."""
+    difference = compute_golden_difference(golden_network)
     assert max(difference.values()) < 1e-5, difference
 
 
@@ -281,11 +283,11 @@ def test_inception_layers_distinguish_golden_pictures():
 
 
 def test_inception_parity_detects_half_pixel_shift(golden_network, monkeypatch):
-    def torchs_own(x, size):
+    def resize_like_torch(x, size):
         return F.interpolate(x, (size, size), mode="bilinear", align_corners=False)
 
-    monkeypatch.setattr(inception, "resize_like_tensorflow1", torchs_own)
-    assert min(golden_difference(golden_network).values()) > 1e-3
+    monkeypatch.setattr(inception, "resize_like_tensorflow1", resize_like_torch)
+    assert min(compute_golden_difference(golden_network).values()) > 1e-3
 
 
 @pytest.mark.parametrize("mistake", ["7c averages", "padding counts", "epsilon"])
@@ -299,18 +301,18 @@ def test_inception_parity_detects_layer_variants(golden_network, monkeypatch, mi
         for module in golden_network.modules():
             if isinstance(module, torch.nn.BatchNorm2d):
                 monkeypatch.setattr(module, "eps", 1e-5)
-    assert golden_difference(golden_network)["2048"] > 1e-3
+    assert compute_golden_difference(golden_network)["2048"] > 1e-3
 
 
 # ------------------------------------------------------------------------------------------ weight files
 
 
 def test_inception_loads_pth_and_safetensors(network, tmp_path):
-    # Converted files were written before batch norm counted its batches.
+    # Converted weight files contain no num_batches_tracked because they are older than this buffer.
     state = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
     torch.save(state, tmp_path / "weights.pth")
     safetensors.torch.save_file(state, tmp_path / "weights.safetensors")
-    images = pictures(1)
+    images = make_pictures(1)
     expected = compute_inception_features(network, images)
     for name in ("weights.pth", "weights.safetensors"):
         with pytest.warns(UserWarning, match="scores are not comparable with published scores"):
@@ -355,7 +357,7 @@ def test_inception_gpu_convolutions_use_full_precision(network):
     allowed = []
     hook = network.Mixed_7c.register_forward_hook(lambda *_: allowed.append(torch.backends.cudnn.allow_tf32))
     before = torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled
-    compute_inception_features(network, pictures(1))
+    compute_inception_features(network, make_pictures(1))
     hook.remove()
     assert allowed == [False]
     assert (torch.backends.cudnn.allow_tf32, torch.backends.cudnn.enabled) == before
@@ -363,7 +365,7 @@ def test_inception_gpu_convolutions_use_full_precision(network):
 
 def test_inception_rejects_images_of_another_kind(network):
     with pytest.raises(ValueError, match="uint8"):
-        compute_inception_features(network, pictures().astype(np.float32))
+        compute_inception_features(network, make_pictures().astype(np.float32))
     with pytest.raises(ValueError, match="uint8"):
         network(torch.zeros(1, 3, 8, 8, dtype=torch.uint8))
 
@@ -372,7 +374,7 @@ def test_inception_rejects_images_of_another_kind(network):
 
 
 def test_random_features_are_fixed_finite_and_discriminative():
-    images = pictures(5)
+    images = make_pictures(5)
     features = compute_random_features(images)
     assert features.shape == (5, 480) and np.isfinite(features).all()
     np.testing.assert_array_equal(features, compute_random_features(images))
@@ -380,7 +382,7 @@ def test_random_features_are_fixed_finite_and_discriminative():
     assert np.abs(features - compute_random_features(images, seed=1)).max() > 0.01
     black, white = np.zeros_like(images), np.full_like(images, 255)
     assert np.abs(compute_random_features(black) - compute_random_features(white)).max() > 0.1
-    # Fixed, so that results of older reports remain comparable.
+    # Fixed features keep results comparable with older reports.
     np.testing.assert_allclose(
         compute_random_features(white[:1])[0, [0, 100, 300, 479]], [2.72897, 0.675502, 0.103905, 1.17206], rtol=1e-4
     )
