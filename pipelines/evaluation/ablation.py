@@ -1,7 +1,8 @@
-"""Run the paper's ablations as Ray graphs, and build their tables and charts. No function reads a dataset.
+"""Run the paper's ablations as Ray graphs, and build their tables and charts.
 
-`reconstruct_boxes` compares encodings of a box, `compute_yaw_losses` measures the cost of a lost yaw, and the variants
-compare branches of the layout VAE.
+The studies of box encodings read no dataset.
+`reconstruct_boxes` compares the encodings of a box. `compute_yaw_losses` measures the IoU3D that errors of the yaw
+cost. The variants compare branches of the layout VAE.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from pipelines.runtime.ray_tasks import map_dataset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
-SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # of width to length; scores of the "any" boxes are also given per bin
+SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Bins of width / length; the "any" boxes also have a score per bin.
 
 
 def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray:
-    """(n,) exact IoU3D of boxes centred at zero."""
+    """Return the exact IoU3D (n,) of boxes that are centred at zero."""
     center = np.zeros_like(truth.size_m)
     return compute_iou3d_pairs(make_boxes(center, *truth), make_boxes(center, *other))
 
@@ -42,7 +43,15 @@ def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray
 
 @dataclass(frozen=True)
 class Trial:
-    """One autoencoder to train: kind of boxes, encoding, training size, seed, and regressed numbers (all or moving)."""
+    """One autoencoder to train.
+
+    Attributes:
+        things: Kind of boxes.
+        encoding: Encoding of a box.
+        count: Number of training boxes.
+        seed: Seed of boxes and weights.
+        numbers: Numbers that the autoencoder regresses: all, or only those that vary (moving).
+    """
 
     things: str
     encoding: str
@@ -52,28 +61,34 @@ class Trial:
 
     @property
     def name(self) -> str:
+        """Return the name of the trial, which names its file of scores."""
         return f"{self.things}-{self.encoding}-{self.numbers}-{self.count:05d}-seed{self.seed}"
 
 
 def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
-    """List trials of every encoding at every training size, seed by seed, the largest size first.
+    """List the trials of each encoding at each training size, ordered by seed and then by decreasing training size.
 
     Raises:
-        ValueError: There is no training size of 2 or more, or no seed.
+        ValueError: A training size is below 2, or there is no training size or no seed.
     """
     if not counts or min(counts) < 2 or seeds < 1:
-        raise ValueError(f"training sizes {list(counts)} and {seeds} seeds: expected sizes of 2 or more, and a seed")
+        raise ValueError(
+            f"training sizes {list(counts)} and {seeds} seeds; expected sizes of at least 2 and at least 1 seed"
+        )
     sizes = sorted(set(counts), reverse=True)
     return [Trial(things, e, count, seed, numbers) for seed in range(seeds) for count in sizes for e in ENCODINGS]
 
 
 def draw_training_boxes(trial: Trial) -> CenteredBoxes:
-    """Draw the training boxes of a trial. The larger set of a seed begins with the smaller one."""
+    """Draw the training boxes of a trial. With the same seed, a larger set begins with the boxes of a smaller set."""
     return draw_boxes(THINGS[trial.things], trial.count, TRAIN_KEY, trial.seed)
 
 
 def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int) -> dict:
-    """Row in: a Trial. Row out: its name. Trains, scores on the shared test set and writes DIRECTORY/<name>.json."""
+    """Train one trial, score it on the shared test set and write DIRECTORY/<name>.json.
+
+    The input row holds the fields of a Trial. The output row holds the name of the trial.
+    """
     torch.set_num_threads(1)
     trial, started = Trial(**row), time.perf_counter()
     moving_only = trial.numbers == "moving"
@@ -103,7 +118,7 @@ def reconstruct_boxes(
     parallel: int | None = None,
     on_trial: Callable[[], None] | None = None,
 ) -> list[dict]:
-    """Return the scores of all trials. Scores in `directory` are read; the other trials are trained.
+    """Return the scores of all trials. Existing scores in `directory` are read, and all other trials are trained.
 
     Args:
         wanted: Trials.
@@ -112,6 +127,9 @@ def reconstruct_boxes(
         test_count: Number of test boxes.
         parallel: Maximum number of concurrent tasks (default: no limit). Each trial is one task on one CPU.
         on_trial: Called after each trial.
+
+    Returns:
+        Scores in the order of the trials.
     """
     paths = {trial: storage.join_uri(directory, f"{trial.name}.json") for trial in wanted}
     missing = [trial for trial in wanted if not storage.exists(paths[trial])]
@@ -133,7 +151,7 @@ def reconstruct_boxes(
 
 
 def average_by_size(scores: Iterable[dict]) -> list[dict]:
-    """Return mean IoU3D and its spread over seeds, per kind of boxes, regressed numbers, encoding and training size."""
+    """Return mean IoU3D and its variation over seeds, per kind of boxes, numbers, encoding and training size."""
 
     def key(row: dict) -> tuple:
         return list(THINGS).index(row["things"]), row["numbers"], list(ENCODINGS).index(row["encoding"]), row["count"]
@@ -165,31 +183,32 @@ def average_by_size(scores: Iterable[dict]) -> list[dict]:
 
 # ----------------------------------------------------------------------------------------------------- lost yaw
 
-NOISES = (0.001, 0.003, 0.01, 0.03)  # of each entry's range
+NOISES = (0.001, 0.003, 0.01, 0.03)  # Noise relative to the range of each entry.
 SHARES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
-LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # 0.7935: mean IoU of a square with itself at a random yaw
+LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # Mean IoU of a square with itself at a random yaw: 0.7935.
 
 
 def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
-    """Return the IoU of a square (or of an upright box on it) with itself turned by 0 <= turn <= pi/2: 1 / (sin + cos).
+    """Return the IoU of a square with itself after a rotation by 0 <= turn <= pi/2: 1 / (sin + cos).
 
-    Its mean over all turns is LOST_YAW_IOU3D, the IoU3D of a square footprint with an arbitrary yaw.
+    An upright box with a square footprint has the same IoU3D. The mean over all rotations is LOST_YAW_IOU3D.
     """
     return 1 / (np.sin(turn_rad) + np.cos(turn_rad))
 
 
 @cache
 def find_ranges(encoding: str) -> np.ndarray:
-    """(entries,) range of each number of an encoding over "any" boxes."""
+    """Return the range (entries,) of each number of an encoding over "any" boxes."""
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(THINGS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
 def compute_yaw_loss(row: dict, count: int) -> dict:
-    """Row in: encoding, width_share, noise. Row out: the same with the IoU3D that `count` such boxes lose.
+    """Compute the IoU3D that `count` boxes lose when noise is added to their encoding.
 
-    The noise is Gaussian, in shares of each entry's range over "any" boxes; constant entries remain exact.
-    `iou3d_lost_with_yaw` is IoU3D with the truth's axes minus IoU3D as decoded: the cost of the angle alone. The
-    extents along the truth's axes come from the decoded scatter matrix.
+    The input row holds encoding, width_share and noise. The output row adds the scores. The noise is Gaussian and
+    relative to the range of each entry over "any" boxes, so constant entries remain exact. `iou3d_lost_with_yaw` is the
+    IoU3D with the true axes minus the IoU3D as decoded: the cost of the yaw error alone. The extents along the true
+    axes come from the decoded scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -198,13 +217,13 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     rng = np.random.default_rng(0)
     noisy = encoding.encode(*truth) + row["noise"] * scale * rng.standard_normal((count, encoding.entries))
     decoded = CenteredBoxes(*encoding.decode(noisy))
-    turned = np.swapaxes(truth.rotation, 1, 2) @ decoded.rotation  # decoded axes in the truth's frame
+    turned = np.swapaxes(truth.rotation, 1, 2) @ decoded.rotation  # Decoded axes in the frame of the true box.
     along = np.einsum("nij,nj,nij->ni", turned, decoded.size_m, turned)
     iou, iou_aligned = (
         compute_mean_iou3d(truth, decoded),
         compute_mean_iou3d(truth, CenteredBoxes(truth.rotation, along)),
     )
-    flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # a horizontal axis
+    flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # Index of a horizontal axis.
     x, y = (turned[np.arange(count), k, flat] for k in (0, 1))
     error = np.abs((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
     return dict(row) | {
@@ -215,7 +234,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
 
 
 def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
-    """Return `compute_yaw_loss` of every encoding, footprint and noise; one task per encoding and footprint."""
+    """Return `compute_yaw_loss` of each encoding, footprint and noise. One task computes one encoding and footprint."""
     rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
     graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
     found = list(map_dataset(graph, compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
@@ -227,9 +246,12 @@ def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Seq
 
 @dataclass(frozen=True)
 class Variant:
-    """Differences from the preset: entries of its architecture, options of its training (jobs/train_lvae.py).
+    """Differences between a variant and the preset.
 
-    Entries of a branch are nested, as in `LayoutVAEConfig`: {"ground": {"channels": (16,)}}.
+    Attributes:
+        architecture: Changed entries of `LayoutVAEConfig`. Entries of a branch are nested: {"ground": {"channels":
+            (16,)}}.
+        options: Changed options of the training (jobs/train_lvae.py).
     """
 
     architecture: Mapping[str, object] = field(default_factory=dict)
@@ -242,13 +264,14 @@ BRANCHES = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# The paper's decoder between the same branches and latents. It diverges at the learning rate of the cells.
+# The DETR decoder of the paper has the same branches and latents. It diverges at the learning rate of the cell decoder.
 DECODERS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Variants of the ground branch alone; town has (32,) after pixel unshuffle by 8. Linear start: models/vae/ground.py.
+# Variants of the ground branch alone. The preset town has channels (32,) after pixel unshuffle by 8.
+# models/vae/ground.py explains the linear start.
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {
@@ -276,13 +299,13 @@ MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
 
 
 def average_measurements(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
-    """Return the scores of `evaluate_reconstruction` for a variant; None for a branch that it lacks."""
+    """Return the scores of `evaluate_reconstruction` for a variant. The scores of a missing branch are None."""
     kept = variant.architecture.get("branches", "both")
     return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
-    """Return mean, lowest and highest value of each measure over seeds, per variant."""
+    """Return mean, minimum and maximum of each measure over seeds, per variant."""
     rows, scores = [], list(scores)
     for variant in dict.fromkeys(row["variant"] for row in scores):
         found = [row for row in scores if row["variant"] == variant]
@@ -304,15 +327,18 @@ def group_by_variant(scores: Iterable[dict]) -> list[dict]:
 
 def build_encoding_table(rows: Sequence[dict]) -> Table:
     columns = ("boxes", "numbers", "encoding", "training size", "seeds")
-    columns += ("mean IoU3D", "± std", "lowest", "highest", "worst tenth")
+    columns += ("mean IoU3D", "± std", "minimum", "maximum", "worst tenth")
     names = ("boxes", "numbers", "encoding", "training_size", "seeds")
     names += ("iou3d_mean", "iou3d_std", "iou3d_min", "iou3d_max", "iou3d_worst_tenth")
-    note = "IoU3D on the shared test set: mean over boxes, and over the worst tenth of them; then over seeds."
+    note = (
+        "The IoU3D on the shared test set is averaged over all boxes, and over the worst tenth of the boxes. Mean, "
+        "standard deviation, minimum and maximum are taken over seeds."
+    )
     return Table("Encodings", columns, [[_round_values(row[name]) for name in names] for row in rows], note=note)
 
 
 def build_share_table(rows: Sequence[dict]) -> Table | None:
-    """Tabulate mean IoU3D by width / length, for kinds of boxes with a value in every bin; None if there is none."""
+    """Tabulate mean IoU3D by width / length for the kinds of boxes with a value in each bin; None if there are none."""
     kept = [row for row in rows if None not in row["iou3d_per_share"]]
     if not kept:
         return None
@@ -322,25 +348,28 @@ def build_share_table(rows: Sequence[dict]) -> Table | None:
         for row in kept
     ]
     columns = ("boxes", "encoding", "training size", *bins)
-    return Table("Encodings by footprint", columns, cells, note="Mean IoU3D by width / length of the true box.")
+    return Table(
+        "Encodings by footprint", columns, cells, note=("The table shows mean IoU3D by width / length of the true box.")
+    )
 
 
 def build_yaw_table(rows: Sequence[dict]) -> Table:
-    """Tabulate, per encoding, footprint and noise, the IoU3D that is lost with the angle and the error of the angle."""
+    """Tabulate, per encoding, footprint and noise, the IoU3D that a yaw error costs and the mean yaw error."""
     noises = sorted({row["noise"] for row in rows})
     columns = ["encoding", "width / length"]
-    columns += [f"lost, {100 * n:g} %" for n in noises] + [f"yaw°, {100 * n:g} %" for n in noises]
+    columns += [f"IoU3D loss, {100 * n:g} % noise" for n in noises]
+    columns += [f"yaw error (deg), {100 * n:g} % noise" for n in noises]
     cells = []
     for (encoding, share), found in groupby(rows, lambda row: (row["encoding"], row["width_share"])):
         found = list(found)
         lost = [_round_values(row["iou3d_lost_with_yaw"]) for row in found]
         cells.append([encoding, share, *lost, *(round(row["yaw_error_deg"], 2) for row in found)])
     note = (
-        "Per noise (in shares of each number's range): IoU3D with the true axes minus IoU3D as decoded, and the mean"
-        f" error of the yaw in degrees. A square whose yaw is arbitrary keeps an IoU3D of {LOST_YAW_IOU3D:.4f} and"
-        f" loses {1 - LOST_YAW_IOU3D:.4f}."
+        "The noise is relative to the range of each encoded number. The loss is the IoU3D with the true axes minus the "
+        f"IoU3D as decoded. With a random yaw, a square has a mean IoU3D of {LOST_YAW_IOU3D:.4f}, which is a loss of "
+        f"{1 - LOST_YAW_IOU3D:.4f}."
     )
-    return Table("What the angle costs", columns, cells, note=note)
+    return Table("IoU3D loss by yaw error", columns, cells, note=note)
 
 
 def build_variant_table(rows: Sequence[dict]) -> Table:
@@ -363,19 +392,20 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
             cell.append("{} ({} to {})".format(*(format(100 * v, digits) for v in values)) if known else None)
         cells.append(cell)
     note = (
-        "Mean (lowest to highest) over seeds, of scenes rebuilt from the latent mean. GFLOP: encode and decode a scene."
+        "Scores are given as mean (minimum to maximum) over seeds. Scenes are reconstructed from the latent mean. "
+        "GFLOP is the cost to encode and decode one scene."
     )
     return Table("Variants of the layout VAE", columns, cells, note=note)
 
 
 def draw_curve_chart(scores: Sequence[dict]) -> Chart:
-    """Chart AP3D on the first held-out scenes during training, against minutes: a line per variant and seed."""
+    """Chart AP3D on the first held-out scenes during training against minutes, with a line per variant and seed."""
     series = {}
     for row in scores:
         per_step = row["training_seconds"] / 60 / row["steps"]
         steps, values = zip(*row["curve"], strict=True) if row["curve"] else ((), ())
         series[f"{row['variant']}, seed {row['seed']}"] = ([per_step * step for step in steps], values)
-    return Chart("AP3D while training", series, "minutes", "AP3D of 32 held-out scenes")
+    return Chart("AP3D during training", series, "minutes", "AP3D of 32 held-out scenes")
 
 
 def _round_values(value: float | str | None) -> float | str | None:
@@ -383,20 +413,20 @@ def _round_values(value: float | str | None) -> float | str | None:
 
 
 def draw_size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> Chart:
-    """Chart mean IoU3D against training size (the paper's figure): a line per encoding with whiskers over seeds."""
+    """Chart mean IoU3D against training size (paper's figure), with a line per encoding and whiskers over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (things, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
         chosen = [row for row in rows if row["encoding"] == encoding]
-        aside = 1 + 0.012 * (k - 1)  # so that whiskers do not hide each other
+        aside = 1 + 0.012 * (k - 1)  # A small shift per encoding prevents overlapping whiskers.
         points = [p for row in chosen for p in _draw_whisker(row["training_size"] * aside, row)]
         series[encoding] = tuple(zip(*points, strict=True)) if points else ((), ())
-    title = f"mean IoU3D of rebuilt boxes ({things}, {numbers} numbers): mean, lowest and highest over seeds"
+    title = f"IoU3D of reconstructed boxes ({things}, {numbers} numbers): mean, minimum and maximum over seeds"
     return Chart(title, series, "training samples", "mean IoU3D")
 
 
 def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
-    """Yield points up to the highest value, down to the lowest and back to the mean, where the line continues."""
+    """Yield the points mean, maximum, minimum and mean of a whisker, so that the line continues at the mean."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
@@ -405,7 +435,7 @@ def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
     chosen = [row for row in rows if row["boxes"] == things and row["training_size"] == count]
     series = {row["encoding"]: (middle, [np.nan if v is None else v for v in row["iou3d_per_share"]]) for row in chosen}
     return Chart(
-        f"mean IoU3D of rebuilt boxes ({things}, {count:,} samples) by footprint",
+        f"Mean IoU3D of reconstructed boxes ({things}, {count:,} samples) by footprint",
         series,
         "width / length",
         "mean IoU3D",
@@ -413,7 +443,7 @@ def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """Chart IoU3D lost with the angle against width / length: Cholesky at each noise, others at the largest noise."""
+    """Chart the IoU3D loss by yaw error: Cholesky at each noise, all other encodings at the largest noise."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"
@@ -423,7 +453,7 @@ def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
         chosen = [row for row in rows if row["encoding"] == encoding and row["noise"] == noise]
         label = f"{encoding}, {100 * noise:g} % noise"
         series[label] = ([row["width_share"] for row in chosen], [row["iou3d_lost_with_yaw"] for row in chosen])
-    return Chart("IoU3D lost with the angle, by footprint", series, "width / length", "IoU3D lost")
+    return Chart("IoU3D loss by yaw error and footprint", series, "width / length", "IoU3D loss")
 
 
 def render_page(
@@ -436,4 +466,4 @@ def render_page(
         else []
     )
     sections += list(tables)
-    return render_page_html(title, [*sections, *([Text("How", list(text))] if text else [])], subtitle)
+    return render_page_html(title, [*sections, *([Text("Method", list(text))] if text else [])], subtitle)

@@ -1,6 +1,6 @@
-"""Score any source against any other, from the features of each scene (features.py).
+"""Score generated scenes against real scenes, or any two sources, from the features of each scene (features.py).
 
-Every score has a 95 % interval over scenes (metrics/intervals.py). Only scores of Inception features have the usual
+Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of Inception features have the usual
 names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have a prefix: `layout_` for layout
 statistics, `random_` for an untrained network. reconstruction.py scores reconstructions.
 """
@@ -40,8 +40,8 @@ from pipelines.metrics.neighbours import (
 
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
-NEIGHBOURS = 3  # of each generated scene that are named
-MEMORISED_QUANTILE = 0.01  # of real scenes' distances to their nearest other
+NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
+MEMORISED_QUANTILE = 0.01  # Quantile of the distances of real scenes to their nearest other real scene.
 
 
 def compare_datasets(
@@ -58,10 +58,10 @@ def compare_datasets(
         generated: Features of the generated scenes, by name.
         ground_classes: Ground classes of the layout statistics.
         k: Neighbourhood sizes of precision and recall.
-        reference: Moments of all real pictures; fid and sfid are then computed against them, as in ADM's evaluator.
+        reference: Moments of all real pictures. With it, fid and sfid are computed against them, as in ADM's evaluator.
 
     Returns:
-        Nested scores; the leaves are Estimates where an interval exists.
+        Nested scores. A leaf is an Estimate if the score has an interval.
     """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
     if "statistics" in real and "statistics" in generated:
@@ -89,6 +89,7 @@ def compare_datasets(
 
 
 def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
+    """Estimate the Frechet distance of two sets of features; both sides vary."""
     a, b = compute_moments(real), compute_moments(generated)
     between = compute_transport(a, b)
     by_real, by_generated = compute_influence_maps(b, between)
@@ -111,7 +112,7 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
     """Compute frechet, mmd and `compute_neighbourhood_scores`.
 
     Raises:
-        ValueError: Features are not finite; the message names side and sample.
+        ValueError: Features are not finite. The message names side and sample.
     """
     real, generated = require_comparable(real, generated, at_least=2)
     found = {"frechet": estimate_frechet(real, generated), "mmd": compute_kernel_distance(real, generated)}
@@ -119,9 +120,10 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
 
 
 def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """Compute precision_k3, recall_k3, density_k3 and coverage_k3, for each k.
+    """Compute precision_k3, recall_k3, density_k3 and coverage_k3, and the same for each other k.
 
-    Intervals are over the judged samples. The balls are fixed, because a sample drawn twice would be its own neighbour.
+    Intervals are over the judged samples. The balls are fixed, because a sample that is drawn twice would be its own
+    neighbour.
 
     Raises:
         ValueError: There are too few samples for the largest k.
@@ -129,7 +131,7 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
     if max(k) >= min(len(real), len(generated)):
         raise ValueError(
             f"--k {max(k)} needs more than {max(k)} scenes on each side, got {len(real)} and {len(generated)}; "
-            "give a smaller one or more scenes"
+            "give a smaller k or more scenes"
         )
     found = {}
     for one in map_neighbourhoods(real, generated, k):
@@ -141,7 +143,7 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
 
 
 def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
-    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows each, which share one copy of the features."""
+    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows, which share one copy of the features."""
     sides = prepare_features(real, generated, k)
     shared = [ray.put(side) for side in sides]
     radii = [
@@ -173,12 +175,13 @@ def find_within_task(
 
 
 def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
-    """Compare distances from generated samples to real ones with those between real samples (paper, supplement).
+    """Compare distances from generated to real samples with distances between real samples (paper, supplement).
 
     Returns:
         `generated` and `real`: statistics of the distance to the nearest (other) real sample. `memorised`: share of
-        generated samples that are nearer to a real one than all but 1 % of real samples are to another. `copies`:
-        share at distance 0. `nearest` (m, 3): real rows of each generated sample, nearest first. `distance` (m, 3).
+        generated samples whose distance is below the 1 % quantile of the real distances. `copies`: share of generated
+        samples at distance 0. `nearest` (m, 3): nearest real samples of each generated sample, in order of distance.
+        `distance` (m, 3): their distances.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
@@ -208,7 +211,7 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
     means = {side: compute_scene_means(part["statistics"]) for side, part in sides.items()}
     rates = {side: compute_pair_ratios(part["validity"]) for side, part in sides.items()}
     categories = slice(0, len(CATEGORIES))
-    # The distance between two halves of the real scenes: about the lowest value that a source can reach.
+    # The distance between two halves of the real scenes is about the lowest distance that a source can reach.
     halves = real["statistics"][::2], real["statistics"][1::2]
     floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
     distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
@@ -227,13 +230,13 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
 
 
 def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
-    """Estimate column means over the scenes with a value (NaN: no value); None if no scene has one."""
+    """Estimate column means over the scenes with a value. NaN means no value; a column without values gives None."""
     known = np.isfinite(values)
     return estimate_ratios(np.where(known, values, 0), known)
 
 
 def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
-    """Estimate rates of measures from records (n, 2 measures) that alternate numerator and denominator."""
+    """Estimate the rates of measures from records (n, 2 measures) in which numerators and denominators alternate."""
     return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 
@@ -241,7 +244,7 @@ def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
 
 
 def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
-    """Flatten nested scores, with names joined by dots; leaves out None, arrays and numbers that are not finite."""
+    """Flatten nested scores to names joined by dots. None, arrays and numbers that are not finite are skipped."""
     flat: dict[str, Estimate | float] = {}
     for name, value in scores.items():
         if isinstance(value, Mapping):
@@ -254,7 +257,10 @@ def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | fl
 
 
 def convert_estimates(scores: Mapping) -> dict:
-    """Convert nested scores to JSON: an Estimate to value, low and high, NaN and infinity to null; drop arrays."""
+    """Convert nested scores to JSON values.
+
+    An Estimate becomes value, low and high. NaN and infinity become null, and arrays are skipped.
+    """
 
     def number(value: float) -> float | None:
         return value if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Pictures of the sides of a comparison, scenes of tables or an .npz: which of them the page shows."""
+"""Select the pictures of both sides of a comparison that the page shows, from scenes of tables or from an .npz."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pipelines.rendering.render import render_bev
 from pipelines.reporting.evaluation_report import ExamplePictures
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 
-SHOWN = 12  # pictures of either side on the page
+SHOWN = 12  # Number of pictures per side on the page.
 
 
 def select_example_images(side: SceneSet, indices: np.ndarray) -> list[np.ndarray]:
-    """Pictures (H, W, 3) uint8 of a side's scenes by their number in what is described, drawn smoothly."""
+    """Return the pictures (H, W, 3) uint8 of a side's scenes at `indices`, with antialiasing."""
     if isinstance(side, SceneSubset):
         return [render_bev(scene, supersample=2) for scene in load_scenes(side.shards(), indices)]
     wanted = set(indices.tolist())
@@ -29,9 +29,16 @@ def select_example_images(side: SceneSet, indices: np.ndarray) -> list[np.ndarra
 def select_shown_images(
     real: SceneSet, generated: SceneSet, described: Mapping[str, np.ndarray], memorised: Mapping
 ) -> ExamplePictures:
-    """Evenly chosen pictures, generated ones nearest to real ones, and those with most faults.
+    """Select evenly spaced pictures, the generated pictures nearest to real ones, and the pictures with most faults.
 
-    `described` are the generated scenes; `memorised` is what `evaluate.compute_memorisation` found.
+    Args:
+        real: Real side.
+        generated: Generated side.
+        described: Features of the generated scenes.
+        memorised: Result of `evaluate.compute_memorisation`.
+
+    Returns:
+        Pictures for the page.
     """
     count = len(described["scene_id"])
     even = select_evenly(count, min(SHOWN, count))
@@ -44,7 +51,7 @@ def select_shown_images(
     ]
     worst = []
     if "validity" in described:
-        faults = described["validity"][:, :-2:2].sum(axis=1)  # the last, road connectivity, is no fault
+        faults = described["validity"][:, :-2:2].sum(axis=1)  # The last measure, road connectivity, counts no faults.
         most = np.argsort(-faults, kind="stable")[: SHOWN // 2]
         reasons = [f"{faults[index]:.0f} faults" for index in most]
         worst = list(zip(select_example_images(generated, most), reasons, strict=True))

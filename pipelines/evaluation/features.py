@@ -1,7 +1,7 @@
-"""Compute the features that scores need, of scenes or of pictures of an .npz, as a Ray Data graph.
+"""Compute the features that scores need, for scenes or for pictures of an .npz, as a Ray Data graph.
 
-Each part becomes a Parquet file with a row per scene; FEATURE_TYPES names the columns. Finished parts are kept, so an
-interrupted run resumes.
+Each part becomes a Parquet file with a row per scene. FEATURE_TYPES lists the columns. Finished parts are kept, so that
+an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from pipelines.schema.tables import Shard
 
 READER_CPUS = 0.5
 PICTURES_PER_PART = 512
-VERSION = 1  # of the features; files of another version are regenerated
-PICTURE_PX = 256  # paper, Sec. 4.1 Metrics
-# The columns besides scene_id: rows of numbers, of these types.
+VERSION = 1  # Version of the features; files of another version are computed again.
+PICTURE_PX = 256  # Paper, Sec. 4.1, Metrics.
+# Types of the columns other than scene_id. Each cell is a row of numbers.
 FEATURE_TYPES = {
     "statistics": np.float64,
     "histograms": np.uint32,
@@ -45,7 +45,12 @@ FEATURE_TYPES = {
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """How pictures are rendered (mean of supersample^2 points per pixel), and the file of Inception weights, if any."""
+    """Options of the features.
+
+    Attributes:
+        supersample: Each pixel of a picture is the mean of supersample^2 points.
+        inception: File of Inception weights; "" for none.
+    """
 
     supersample: int = 1
     inception: str = ""
@@ -53,21 +58,22 @@ class FeatureConfig:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """The first `limit` pictures of an .npz in ADM's form."""
+    """The first `limit` pictures of an .npz in ADM's format."""
 
     path: str
     limit: int
 
     @property
     def root(self) -> str:
+        """Return the path of the file."""
         return self.path
 
 
-SceneSet = SceneSubset | ImageFile  # of a comparison
+SceneSet = SceneSubset | ImageFile  # One side of a comparison.
 
 
 def compute_features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
-    """Compute features of pictures (n, H, W, 3) uint8, by name: random (n, 480), and Inception's if given a network."""
+    """Compute the features of pictures (n, H, W, 3) uint8: random (n, 480), and Inception's if a network is given."""
     named = {"random": inception.compute_random_features(pictures)}
     if network is not None:
         named |= inception.compute_inception_features(network, pictures)._asdict()
@@ -75,7 +81,7 @@ def compute_features(pictures: np.ndarray, network: inception.Inception | None) 
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
-    """Compute statistics, histograms, validity (n, 14) and label fidelity (n, 6), over the dataset's ground classes."""
+    """Compute statistics, histograms, validity (n, 14) and label fidelity (n, 6), for the dataset's ground classes."""
     slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
     for scene in scenes:
@@ -90,7 +96,10 @@ def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.nd
 
 
 def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
-    """(3, 2) label fidelity; zeros, which mean not judged, for a scene without labels or without a dataset."""
+    """Return the label fidelity (3, 2) of a scene.
+
+    Zeros mean that the fidelity is not judged, because the scene has no label or the dataset is None.
+    """
     if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
         return np.zeros((len(validity.LABEL_MEASURES), 2))
     return validity.compute_label_fidelity(scene, dataset.vegetation, dataset.vehicle)
@@ -99,7 +108,7 @@ def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
 def compute_part(
     number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: FeatureConfig, directory: str
 ) -> dict:
-    """Ray task: write the file of a part, a shard with rows; return the number of its scenes."""
+    """Compute and write the features of one part (rows of a shard), as a Ray task; return the number of its scenes."""
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
@@ -112,19 +121,21 @@ def compute_part(
 
 
 def load_network(looks: FeatureConfig) -> inception.Inception | None:
-    """Load the Inception network, if any; once per process until the file changes."""
+    """Load the Inception network, if any. Each process loads the network once, and again if the file changes."""
     return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
 
 
 @lru_cache(maxsize=1)
 def load_cached_inception(path: str, *_: str | int) -> inception.Inception:
+    """Load the Inception network. The fingerprint of the file is the key of the cache."""
     return inception.load_inception(path)
 
 
 class ImageFeatureExtractor:
-    """Actor. Row in: number of a part, a range of pictures of an .npz. Row out: their number. Writes the part's file.
+    """Actor that computes and writes the features of one part, a range of pictures of an .npz.
 
-    An actor reads the file forward and skips the parts of other actors; an earlier part restarts from the beginning.
+    The input row holds the number of the part. The output row holds the number of its pictures. An actor reads the file
+    in order and skips the parts of other actors. For an earlier part, it reads the file from the beginning again.
     """
 
     def __init__(self, path: str, parts: list[range], looks: FeatureConfig, directory: str) -> None:
@@ -147,11 +158,12 @@ class ImageFeatureExtractor:
 
 
 def make_part_path(directory: str, number: int) -> str:
+    """Return the path of a part's file."""
     return storage.join_uri(directory, f"part-{number:05d}.parquet")
 
 
 def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
-    """One row per scene: its id and lists of numbers."""
+    """Write the file of a part: one row per scene with its id and its lists of numbers."""
     arrays = {"scene_id": pa.array(scene_ids, pa.string())}
     for name, values in columns.items():
         flat = pa.array(np.ascontiguousarray(values, FEATURE_TYPES[name]).ravel())
@@ -160,7 +172,7 @@ def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[
 
 
 def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
-    """All parts, in order: scene_id (n,) and the columns (n, width)."""
+    """Read all parts in order: scene_id (n,) and the columns (n, width)."""
     table = pa.concat_tables([storage.read_parquet(make_part_path(directory, number)) for number in range(count)])
     described = {"scene_id": table["scene_id"].to_numpy()}
     for name in table.column_names[1:]:
@@ -177,18 +189,18 @@ def compute_scene_features(
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Compute the features of each scene of a side, or read the parts that `directory` already holds.
+    """Compute the features of each scene of a side, or read the parts that `directory` already contains.
 
-    One Ray task computes the part of a shard; one actor call computes a part of PICTURES_PER_PART pictures.
+    One Ray task computes the part of a shard. One actor call computes a part of PICTURES_PER_PART pictures.
 
     Args:
         side: Scenes, or pictures of an .npz.
-        dataset: Dataset with the ground classes and label thresholds that scenes are judged by; without one, as for
-            pictures, there are features of pictures only.
-        looks: How pictures are rendered.
-        directory: Directory for a Parquet file per part. Files of another side or other options are deleted.
+        dataset: Dataset with the ground classes and label thresholds for scenes. Without a dataset, as for pictures,
+            only picture features are computed.
+        looks: Options of the features.
+        directory: Directory with a Parquet file per part. Files of another side or of other options are deleted.
         num_actors: Maximum number of concurrent tasks or actors.
-        on_scenes: Receives the number of scenes of each finished part.
+        on_scenes: Called with the number of scenes of each finished part.
 
     Returns:
         scene_id (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
@@ -234,7 +246,7 @@ def compute_scene_features(
 
 
 def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
-    """Load scenes by their numbers within the selection, in the order of `indices`."""
+    """Load scenes by their numbers within a selection, in the order of `indices`."""
     counts = np.array([len(rows) for _, rows in parts])
     starts = np.cumsum(counts) - counts
     scenes = {}
@@ -247,7 +259,7 @@ def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> li
 
 
 def make_options_record(looks: FeatureConfig) -> dict:
-    """Return the options that features depend on; weights are identified by their hash, not by name."""
+    """Return the options that features depend on. The hash identifies the weights, so the file may be renamed."""
     return asdict(looks) | {
         "version": VERSION,
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",

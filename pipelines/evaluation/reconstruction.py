@@ -1,6 +1,6 @@
-"""Evaluate layout-VAE reconstruction over Ray: actors encode and decode scenes, tasks score them.
+"""Evaluate layout-VAE reconstruction with Ray: actors encode and decode scenes, and tasks score them.
 
-The graph returns one record per scene. Records add up, and one function computes scores from their sum.
+The graph returns one record per scene. Records can be added, and one function computes the scores from their sum.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 from pipelines.training.latents import load_lvae
 
-Chunk = tuple[Shard, list[int]]  # scenes of one shard, by row
+Chunk = tuple[Shard, list[int]]  # A shard and rows of it.
 AP_VARIANTS = {
-    "ranked": {},  # every proposal, by existence
+    "ranked": {},  # All proposals are ranked by existence probability.
     "ranked_100": {"max_detections": MAX_DETECTIONS},
     "threshold": {"min_score": EXISTENCE_THRESHOLD},
     "threshold_100": {"min_score": EXISTENCE_THRESHOLD, "max_detections": MAX_DETECTIONS},
 }
-VOXEL_PX = 256  # paper, Tab. 1
+VOXEL_PX = 256  # Paper, Tab. 1.
 VOXEL_RANGE_M = (VoxelGrid.bottom_m, VoxelGrid.top_m)
 PICTURE_PX = 480
 SCENE_SCORES = pa.schema(
@@ -77,7 +77,7 @@ SCENE_SCORES = pa.schema(
 
 
 def make_voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
-    """Make the paper's grid of 256 x 256 x 32 voxels over the crop, regardless of the rasters' resolution."""
+    """Make the paper's grid of 256 x 256 x 32 voxels over the scene, regardless of the raster resolution."""
     return VoxelGrid(spec.with_resolution(VOXEL_PX).grid, *range_m)
 
 
@@ -87,7 +87,11 @@ def split_chunks(selection: SceneSubset, size: int) -> list[Chunk]:
 
 
 class Reconstructor:
-    """Actor. Row in: number of a chunk. Row out: the chunk's latent means and decoded layouts, stacked."""
+    """Actor that encodes and decodes one chunk per row.
+
+    The input row holds the number of a chunk. The output row holds the latent means and decoded layouts of its scenes,
+    stacked.
+    """
 
     def __init__(self, chunks: list[Chunk], lvae: str) -> None:
         self.chunks, self.model = chunks, load_lvae(lvae)
@@ -114,19 +118,31 @@ def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The sums of one scene that reconstruction scores are computed from."""
+    """The sums of one scene from which reconstruction scores are computed.
 
-    ground: GroundSums  # on the truth's pixels
-    raster: GroundSums  # on the model's own, to which the truth is resampled
+    Attributes:
+        ground: Ground sums at the resolution of the true scene.
+        raster: Ground sums at the resolution of the model, to which the true scene is resampled.
+        matches: Matched detections.
+        pairs: Sums over matched primitives.
+        confusion: (classes, classes) voxels.
+        outside: Ground pixels and objects outside the voxel grid.
+        memory: Bytes of each of MEMORY.
+        labels: (measures, 2) label fidelity: whether the reconstruction has the label of the true scene; zeros if
+            unknown.
+    """
+
+    ground: GroundSums
+    raster: GroundSums
     matches: Matches
     pairs: PairSums
-    confusion: np.ndarray  # (classes, classes) voxels
+    confusion: np.ndarray
     outside: OutsideCounts
-    memory: np.ndarray  # bytes of each of MEMORY
-    labels: np.ndarray  # (measures, 2) label fidelity: whether the reconstruction has the truth's label; zeros: unknown
+    memory: np.ndarray
+    labels: np.ndarray
 
     def to_row(self) -> dict:
-        """Return flat arrays, for Arrow."""
+        """Return the sums as flat arrays for Arrow."""
         out = {"confusion": self.confusion.ravel(), "memory": self.memory, "labels": self.labels.ravel()}
         for part in ("ground", "raster", "matches", "pairs", "outside"):
             value = getattr(self, part)
@@ -135,6 +151,8 @@ class SceneRecord:
 
     @classmethod
     def from_row(cls, row: dict) -> SceneRecord:
+        """Return the record of a row of flat arrays."""
+
         def part(name: str, kind: type, **shapes: tuple[int, ...]):
             values = {field: np.asarray(row[f"{name}_{field}"]) for field in kind.__dataclass_fields__}
             return kind(**{field: value.reshape(shapes.get(field, -1)) for field, value in values.items()})
@@ -159,10 +177,10 @@ def make_scene_record(
     voxels: VoxelGrid,
     dataset: Dataset | None = None,
 ) -> SceneRecord:
-    """Compare a scene with its reconstruction; the ground on the truth's pixels and on the model's.
+    """Compare a scene with its reconstruction, with the ground at the resolutions of the true scene and of the model.
 
-    Every true primitive counts, including those without a slot. AP3D ranks every proposal. Pairs and voxels come from
-    the decoded scene, which holds the proposals above the existence threshold.
+    All true primitives count, including those without a slot. AP3D ranks all proposals. Pairs and voxels come from the
+    decoded scene, which contains the proposals above the existence threshold.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     rebuilt = decode_layout(layout, spec, truth)
@@ -187,7 +205,7 @@ def make_scene_record(
 def score_chunk(
     row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
 ) -> list[dict]:
-    """Row in: a row from a Reconstructor. Rows out: one record per scene."""
+    """Compute one record per scene from a row of a Reconstructor."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
         | make_scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
@@ -196,7 +214,7 @@ def score_chunk(
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
-    """Row in: a row from a Reconstructor. Rows out: the pictures of each scene, (H, W, 3) uint8, all of one size."""
+    """Render the pictures of each scene from a row of a Reconstructor, (H, W, 3) uint8, all of one size."""
     out = []
     for _, scene, layout, _ in unstack_layouts(row, chunks):
         sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}
@@ -207,7 +225,7 @@ def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
 
 
 def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
-    """Build the graph that reconstructs chunks: one actor per GPU, or CPU actors that take READER_CPUS each."""
+    """Build the graph that reconstructs chunks, with one actor per GPU or CPU actors of READER_CPUS each."""
     per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
     room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
     return map_dataset(
@@ -222,11 +240,17 @@ def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.d
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Reconstruction scores of a dataset, and of each scene."""
+    """Reconstruction scores of a dataset and of each scene.
 
-    scores: dict  # nested plain numbers
-    scenes: pa.Table  # a row per scene, best first: by voxel mIoU
-    places: list[Chunk]  # where each of them lies, a chunk of one
+    Attributes:
+        scores: Scores of the dataset as nested plain numbers.
+        scenes: Row of scores per scene, highest voxel mIoU first.
+        places: Chunk of one row for each scene, in the same order.
+    """
+
+    scores: dict
+    scenes: pa.Table
+    places: list[Chunk]
 
 
 def evaluate_reconstruction(
@@ -238,16 +262,19 @@ def evaluate_reconstruction(
     dataset: Dataset | None = None,
     on_scene: Callable[[], None] | None = None,
 ) -> Reconstruction:
-    """Compute the reconstruction scores of an LVAE on a selection (paper, Sec. 4.1), from the latent means.
+    """Compute the reconstruction scores of an LVAE from the latent means of selected scenes (paper, Sec. 4.1).
 
     Args:
         selection: Scenes.
         lvae: Directory of the layout VAE.
         num_actors: Maximum number of actors, each with a model.
         batch_size: Maximum number of scenes per forward pass.
-        voxel_range_m: Bottom and top of the voxel grid, in metres.
-        dataset: Dataset with the thresholds of density labels; without one, label fidelity is not scored.
+        voxel_range_m: Bottom and top of the voxel grid (m, scene frame).
+        dataset: Dataset with the thresholds of density labels. Without a dataset, label fidelity is not scored.
         on_scene: Called after each scene.
+
+    Returns:
+        Scores of the dataset and of each scene.
     """
     spec, chunks = load_lvae(lvae).spec, split_chunks(selection, batch_size)
     voxels = make_voxel_grid(spec, voxel_range_m)
@@ -267,14 +294,14 @@ def evaluate_reconstruction(
     scores = compute_reconstruction_scores(records, spec, voxels)
     scores["memory_bytes"]["tables"] = measure_table_bytes(chunks)
     table = compute_scene_scores([row["scene_id"] for row in rows], records)
-    order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")  # NaN, where all is empty, last
+    order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")  # Empty scenes, with NaN, are last.
     return Reconstruction(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
 
 
 def draw_scenes(
     places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None
 ) -> list[dict]:
-    """Draw scenes and their reconstructions, in order: truth and rebuilt, each from above and from an oblique view."""
+    """Draw scenes and their reconstructions, each from above and in an oblique view, in the order of `places`."""
     graph = flat_map_dataset(
         reconstruct_chunks(places, lvae, num_actors),
         draw_chunk,
@@ -290,7 +317,7 @@ def draw_scenes(
 
 
 def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
-    """Compute the scores over all scenes, as nested plain numbers; scores per class or category have such names."""
+    """Compute the scores over all scenes as nested plain numbers, with dictionaries of scores per class."""
     low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
     ground, raster = (
         compute_ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
@@ -350,7 +377,7 @@ def _sum(parts: Iterable):
 
 
 def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
-    """Return a row per scene; null where a score is undefined, such as a height error without ground."""
+    """Return a row of scores per scene. An undefined score, such as a height error without ground, is null."""
 
     def share(part: float, whole: float) -> float | None:
         return float(part / whole) if whole else None
@@ -381,7 +408,7 @@ def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa
 
 
 def measure_table_bytes(chunks: list[Chunk]) -> float:
-    """Return the mean bytes per scene of the Parquet files that hold the chunks' scenes, primitives and rasters."""
+    """Return the mean bytes per scene of the Parquet files with the scenes, primitives and rasters of the chunks."""
     total, scenes = 0.0, 0
     for shard, rows in chunks:
         written = sum(storage.measure_file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))

@@ -1,5 +1,7 @@
-"""How precision and recall depend on the reference: many scenes or few, chosen by pose in two ways (paper, supplement,
-Precision and Recall Metrics, and its figure on sampling strategies)."""
+"""Measure how precision and recall depend on the number of reference scenes and on their selection by pose.
+
+The paper studies this in its supplement (Precision and Recall Metrics, and the figure on sampling strategies).
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,26 @@ MEASURES = ("precision", "recall", "density", "coverage")
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSet:
-    """Real scenes, by row (n,), and how they were chosen."""
+    """A selection of real scenes.
 
-    strategy: str  # "farthest" or "apart"
-    setting: float  # number of scenes, or metres
+    Attributes:
+        strategy: "farthest" or "apart".
+        setting: Number of scenes for "farthest", minimum distance in metres for "apart".
+        rows: (n,) rows of the real scenes.
+    """
+
+    strategy: str
+    setting: float
     rows: np.ndarray
 
 
 def list_references(
     xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
 ) -> Iterator[ReferenceSet]:
-    """Choices among poses (n, 2) of `least` to `most` scenes; sizes beyond what there is are left out."""
+    """Yield the reference sets of `least` to `most` scenes among poses (n, 2).
+
+    Sizes above the number of poses are skipped.
+    """
     fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
     order = select_farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
     for size in fitting:
@@ -42,7 +53,10 @@ def list_references(
 def score_reference(
     reference: ReferenceSet, real: np.ndarray, generated: np.ndarray, labels: np.ndarray, k: Sequence[int]
 ) -> list[dict]:
-    """A row for each k: features (n, d) of the reference against as many generated ones, labels (m,) in equal parts."""
+    """Score the features of a reference set against an equal number of generated scenes; return a row for each k.
+
+    The generated scenes are selected so that their labels occur equally often.
+    """
     count = len(reference.rows)
     found = compute_neighbourhood_scores(real[reference.rows], generated[select_balanced(labels, count)], k)
     rows = []
@@ -56,16 +70,19 @@ def score_reference(
 
 
 def draw_sweep_charts(rows: Sequence[dict]) -> list[Chart]:
-    """Precision and recall over the number of scenes, a chart per strategy, as in the paper's figure."""
+    """Chart precision and recall over the number of scenes, with a chart per strategy as in the paper's figure."""
     charts = []
-    for strategy, title in (("apart", "Poses apart by a distance"), ("farthest", "Farthest poses")):
+    for strategy, title in (
+        ("apart", "Poses with a minimum distance"),
+        ("farthest", "Farthest-point selection of poses"),
+    ):
         series = {}
         for name in ("precision", "recall"):
             for k in sorted({row["k"] for row in rows}):
                 points = [(r["samples"], r[name]) for r in rows if (r["strategy"], r["k"]) == (strategy, k)]
                 points.sort()
                 series[f"{name}, k = {k}"] = tuple(map(list, zip(*points, strict=True))) if points else ([], [])
-        charts.append(Chart(title, series, "scenes on each side", "share"))
+        charts.append(Chart(title, series, "scenes per side", "share"))
     return charts
 
 
@@ -83,12 +100,13 @@ def build_sweep_table(rows: Sequence[dict]) -> Table:
         )
         for row in rows
     ]
-    return Table("Scores by reference", ("real scenes", "on each side", "k", *MEASURES), cells)
+    return Table("Scores by reference set", ("real scenes", "scenes per side", "k", *MEASURES), cells)
 
 
 def render_sweep_html(rows: Sequence[dict], how: Sequence[str]) -> str:
-    sections = [Charts("Precision and recall", draw_sweep_charts(rows)), build_sweep_table(rows), Text("How", how)]
-    return render_report_html("Precision and recall by reference", sections)
+    """Render the page."""
+    sections = [Charts("Precision and recall", draw_sweep_charts(rows)), build_sweep_table(rows), Text("Method", how)]
+    return render_report_html("Precision and recall by reference set", sections)
 
 
 def sweep_references(
@@ -99,11 +117,11 @@ def sweep_references(
     k: Sequence[int],
     on_reference: Callable[[], None] = lambda: None,
 ) -> list[dict]:
-    """`score_reference` of all; ValueError if there is none."""
+    """Score all reference sets. Raises ValueError if there is none."""
     if not chosen:
         raise ValueError(
-            f"no reference fits {len(real)} real and {len(generated)} generated scenes; "
-            "give smaller --reference-sizes or greater --min-distances-m, or generate more"
+            f"no reference set fits {len(real)} real and {len(generated)} generated scenes; "
+            "give smaller --reference-sizes or greater --min-distances-m, or generate more scenes"
         )
     rows = []
     for reference in chosen:

@@ -10,7 +10,7 @@ from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
-# Scores of `compare_datasets`: their keys in it, their name in words, and which values are better (one: close to 1).
+# Scores of `compare_datasets`: keys, name in words, and better direction ("one" means close to 1).
 MEASURES = {
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),
@@ -19,14 +19,17 @@ MEASURES = {
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
-    "count_ratio": (("count_ratio",), "count of a category, furthest from the data's", "one"),
+    "count_ratio": (("count_ratio",), "most deviating count ratio of a category", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
-COMMON = 3.0  # objects per scene; the counts of rarer categories vary too much
+COMMON = 3.0  # Minimum number of objects per scene; the counts of rarer categories vary too much.
 
 
 def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
-    """Return the common category whose mean count is furthest from the real one, and their ratio; None without one."""
+    """Return the common category with the most deviating ratio of generated to real mean count, and this ratio.
+
+    The result is None if no category has COMMON objects per real scene.
+    """
     ratios = {}
     for name, sides in statistics.items():
         if name.startswith("num_") and sides["real"].value >= COMMON:
@@ -35,14 +38,14 @@ def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
 
 
 def compute_deviation(ratio: float) -> float:
-    """How far a ratio is from 1, either way."""
+    """Return the absolute logarithm of a ratio, which is 0 for a ratio of 1."""
     return abs(math.log(ratio)) if ratio > 0 else math.inf
 
 
 def make_sampler_row(
     sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
-    """Make one row: each measure with the ends of its interval, and an actor's seconds per scene; None if unknown."""
+    """Make the row of one setting: measures with intervals, and seconds per scene of one actor; None if unknown."""
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
@@ -56,7 +59,7 @@ def make_sampler_row(
 
 
 def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
-    """Return whether every measure that both have is better than the reference's or within its interval."""
+    """Return whether each measure of both rows is better than the reference or within the interval of the reference."""
 
     def good(name: str, better: str) -> bool:
         if row[name] is None or reference[name] is None:
@@ -70,12 +73,12 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
 
 
 def name_settings(row: Mapping) -> str:
-    """Return the sampler, and its noise scaling where that is not 1."""
+    """Return the name of the sampler, with the noise scaling if it is not 1."""
     return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] != 1 else "")
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row of the paper's sampler with the most steps; without it, the row with the most steps."""
+    """Return the row of the paper's sampler with the most steps, or of any sampler if the paper's is missing."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 
@@ -92,17 +95,19 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
         seconds = "–" if row["seconds_per_scene"] is None else f"{row['seconds_per_scene']:.2f}"
         cells.append((name_settings(row), row["steps"], seconds, *scores, good))
     names = [words for _, words, _ in MEASURES.values()]
-    alike = f"as good as {name_settings(reference)} of {reference['steps']}"
+    alike = f"as good as {name_settings(reference)} with {reference['steps']} steps"
     note = (
-        "Sampler: / and a number where it divides the network's noise by that. In brackets: 95 % bootstrap intervals."
-        " Seconds: of one actor, weights loaded. Last column: is every score within the interval of"
-        f" {name_settings(reference)} of {reference['steps']} steps, or better?"
+        "A number after / is the noise scaling of a sampler. Brackets contain 95 % bootstrap intervals. Seconds are "
+        "measured for one actor with loaded weights. The last column states whether each score is better than "
+        f"{name_settings(reference)} with {reference['steps']} steps or within its interval."
     )
-    return Table("Scores by sampler and steps", ("sampler", "steps", "s per scene", *names, alike), cells, note=note)
+    return Table(
+        "Scores by sampler and steps", ("sampler", "steps", "time per scene, s", *names, alike), cells, note=note
+    )
 
 
 def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
-    """Make a chart per measure: a series per sampler, over the number of steps."""
+    """Make a chart per measure over the number of steps, with a series per sampler."""
     charts = []
     for name in CHARTED:
         series = {}
@@ -115,12 +120,12 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
 
 
 def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
-    """Render the page; each row of `pictures` shows the same scenes, `columns` of them."""
-    note = "One row per sampler and number of steps; the same scene numbers and labels in each."
+    """Render the page. Each row of `pictures` shows the same `columns` scenes."""
+    note = "Each row shows one sampler and number of steps. All rows have the same scene numbers and labels."
     sections = [
         build_sampler_table(rows),
-        Charts("By number of steps", draw_sampler_charts(rows)),
-        Pictures("Scenes", pictures, columns, note),
-        Text("How", how),
+        Charts("Scores by number of steps", draw_sampler_charts(rows)),
+        Pictures("Generated scenes", pictures, columns, note),
+        Text("Method", how),
     ]
     return render_report_html("Samplers", sections)

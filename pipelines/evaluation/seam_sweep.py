@@ -1,4 +1,4 @@
-"""How much seams show by steps, roll-back, resamplings and guidance: rows, table and page of `jobs/sweep_seams.py`."""
+"""Compare the visibility of seams by steps, jump length, resamplings and guidance, for `jobs/sweep_seams.py`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from models.scene import VEGETATION, Scene
 from pipelines.evaluation.seams import MEANINGS
 from pipelines.metrics.intervals import Estimate
 from pipelines.metrics.seams import MEASURES
-from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
+from pipelines.reporting.report import Picture, Pictures, Section, Table, Text, render_report_html
 
 
 def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
-    """How many objects other than plants stand on a hectare of all the ground that scenes cover."""
+    """Return the number of objects except vegetation per hectare of the area of the scenes."""
     objects, area_m2 = 0, 0.0
     for scene in scenes:
         objects += int((~np.isin(scene.category, VEGETATION)).sum())
@@ -26,7 +26,7 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 def make_seam_row(
     repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
 ) -> dict:
-    """Make one row: the setting, the cost of a block, and each ratio with the ends of its interval; None if unknown."""
+    """Make the row of one setting: options, cost per block, and each ratio with its interval; None if unknown."""
     row = {
         "steps": repaint.num_inference_steps,
         "jump_length": repaint.jump_length,
@@ -54,22 +54,24 @@ def build_seam_table(rows: Sequence[Mapping]) -> Table:
         "steps",
         "jump length",
         "resamplings",
-        "known guidance",
+        "guidance",
         "eta",
-        "evaluations a block",
-        "objects a hectare",
+        "network evaluations per block",
+        "objects per hectare",
         "seams",
         *(name.replace("_", " ") for name in MEASURES),
     )
     note = (
-        "1: the line does not show. In brackets: 95 % bootstrap intervals over scenes. With guidance an evaluation "
-        "costs about two. Objects: all but plants."
+        "A ratio of 1 means that seams are invisible. Brackets contain 95 % bootstrap intervals over scenes. With "
+        "pseudo-inverse guidance, one evaluation costs about as much as two evaluations without it. Objects exclude "
+        "vegetation."
     )
-    return Table("Across seams over nearby lines", columns, cells, note=note)
+    return Table("Seam ratios", columns, cells, note=note)
 
 
 def render_seam_sweep_html(rows: Sequence[Mapping], pictures: Sequence[Picture], how: Sequence[str]) -> str:
-    """Render the page; `pictures` are the first scene of every row."""
+    """Render the page. `pictures` are the first scene of each row."""
     meanings = [f"{name.replace('_', ' ').capitalize()}: {words}." for name, words in MEANINGS.items()]
-    sections = [build_seam_table(rows), Pictures("Scenes", pictures, columns=3), Text("How", [*how, *meanings])]
-    return render_report_html("Seams by effort", sections)
+    sections: list[Section] = [build_seam_table(rows), Pictures("Generated scenes", pictures, columns=3)]
+    sections.append(Text("Method", [*how, *meanings]))
+    return render_report_html("Seams by sampling effort", sections)

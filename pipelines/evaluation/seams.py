@@ -1,4 +1,4 @@
-"""Measure the seams of a source's scenes over Ray, and render the page that shows them."""
+"""Measure the seams of a source's scenes with Ray, and render the page."""
 
 from __future__ import annotations
 
@@ -19,43 +19,56 @@ from pipelines.runtime.ray_tasks import flat_map_dataset
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
-BLOCK_M = 64.0  # the middle of an outpainted scene
+BLOCK_M = 64.0  # Side of the middle block of an outpainted scene.
 MEANINGS = {
-    "class_changes": "pixels that change their ground class across the line",
-    "height_step": "step of the ground's height across the line",
-    "cut_objects": "objects at the line that end there",
-    "doubled_objects": "objects at the line that overlap one of their kind from the other side",
+    "class_changes": "share of pixel pairs across the line that differ in ground class",
+    "height_step": "mean height difference of the ground across the line",
+    "cut_objects": "share of objects at the line that end at the line",
+    "doubled_objects": "share of objects at the line that overlap an object of their category from the other side",
 }
 
 
 @dataclass(frozen=True)
 class SeamLines:
-    """Seams in metres from a scene's far edge (rows) and left edge (cols); by default the edges of its middle block."""
+    """Positions of seams; by default the edges of the middle block of a scene.
+
+    Attributes:
+        rows_m: Distances of seams from the front edge of the scene (m).
+        cols_m: Distances of seams from the left edge of the scene (m).
+    """
 
     rows_m: tuple[float, ...] = ()
     cols_m: tuple[float, ...] = ()
 
     def pixels(self, grid: Grid) -> tuple[list[int], list[int]]:
-        """Return the pixel rows and columns after the seams. Raises ValueError for a scene too small for any seam."""
+        """Return the pixel rows and columns after the seams. Raises ValueError if the scene is too small for seams."""
         sides = [(self.rows_m, grid.rows), (self.cols_m, grid.cols)]
         if not (self.rows_m or self.cols_m):
             sides = [(find_middle_m(count * grid.resolution_m), count) for _, count in sides]
         found = [[round(line / grid.resolution_m) for line in lines] for lines, _ in sides]
         if not any(found):
             raise ValueError(
-                f"scenes of {grid.rows} x {grid.cols} pixels have no seams; name them with --rows-m or --cols-m"
+                f"scenes of {grid.rows} x {grid.cols} pixels have no seams by default; pass their positions with"
+                " --rows-m or --cols-m"
             )
         return found[0], found[1]
 
 
 def find_middle_m(extent_m: float) -> tuple[float, ...]:
+    """Return the two edges of the middle block along an extent (m), or nothing if the extent is a single block."""
     margin_m = (extent_m - BLOCK_M) / 2
     return (margin_m, extent_m - margin_m) if margin_m > 0 else ()
 
 
 @dataclass(frozen=True, eq=False)
 class SeamMeasurement:
-    """Records (n, 4, 2, 2) of scenes, their ids, and the number of seams of each."""
+    """Records of the seams of scenes.
+
+    Attributes:
+        scene_ids: Scene ids.
+        records: (n, 4, 2, 2) records of `measure_scene_seams`.
+        seams: (n,) number of seams of each scene.
+    """
 
     scene_ids: list[str]
     records: np.ndarray
@@ -63,7 +76,7 @@ class SeamMeasurement:
 
 
 def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines) -> list[dict]:
-    """Row in: number of a shard with rows. Rows out: one per scene, its flat record."""
+    """Measure the seams of the selected scenes of one shard; return one row with a flat record per scene."""
     shard, rows = parts[row["id"]]
     out = []
     for scene in shard.scenes(rows):
@@ -80,9 +93,12 @@ def measure_seams(
 
     Args:
         selection: Scenes.
-        lines: Their seams.
+        lines: Positions of their seams.
         num_tasks: Maximum number of concurrent tasks.
         on_scene: Called after each scene.
+
+    Returns:
+        Records of all scenes.
     """
     parts = selection.shards()
     graph = flat_map_dataset(
@@ -105,7 +121,7 @@ def measure_seams(
 
 
 def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
-    """Return the ratios of each side per measure, and the numbers of scenes and seams behind them."""
+    """Return the ratios of each side per measure, and the numbers of scenes and seams of each side."""
     ratios = {side: estimate_seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
     return {
         "scenes": {side: len(found.scene_ids) for side, found in measured.items()},
@@ -128,7 +144,7 @@ def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
 
 
 def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
-    """Return each measure's name and the formatted ratios of both sides."""
+    """Return the name of each measure and the formatted ratios of both sides."""
     return [
         (name.replace("_", " "), *(format_value(sides[side]) or "–" for side in ("generated", "real")))
         for name, sides in scores["ratios"].items()
@@ -136,7 +152,7 @@ def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
 
 
 def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray:
-    """Render the scene from above with ticks at the ends of its seams: (H, W, 3) uint8."""
+    """Render the scene from above with marks at the ends of its seams: (H, W, 3) uint8."""
     picture = render_bev(scene, size_px, supersample=2).copy()
     scale = picture.shape[0] / scene.grid.rows
     tick = size_px // 24
@@ -149,21 +165,24 @@ def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray
 
 
 def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines, count: int) -> str:
-    """Render the page: ratios with their meaning, and some scenes with their seams marked at the edges."""
+    """Render the page: ratios with their meaning, and example scenes whose seams are marked at the edges."""
     parts = selection.shards()
     total = sum(len(rows) for _, rows in parts)
     scenes = load_scenes(parts, select_evenly(total, min(count, total)))
     pictures = [Picture(scene.scene_id, draw_lines(scene, lines), "generated") for scene in scenes]
     table = Table(
-        "Across seams over nearby lines",
+        "Seam ratios",
         ("measure", "generated", "real"),
         select_shown_rows(scores),
         meanings=list(MEANINGS.values()),
-        note="1: the line does not show. In brackets: 95 % bootstrap intervals over scenes.",
+        note="Each ratio is the rate across seams divided by the rate across nearby lines. A ratio of 1 means that "
+        "seams are invisible. Brackets contain 95 % bootstrap intervals over scenes.",
     )
     how = (
-        f"{scores['seams']['generated']} seams of {scores['scenes']['generated']} generated scenes; "
-        f"{scores['seams']['real']} lines across the street in {scores['scenes']['real']} real ones. "
-        f"Nearby lines are parallel ones {NEAR_M:g} to {FAR_M:g} m away, at least {NEAR_M:g} m from every seam."
+        f"The generated side has {scores['seams']['generated']} seams in {scores['scenes']['generated']} scenes. "
+        f"The real side has {scores['seams']['real']} lines across the driving direction in "
+        f"{scores['scenes']['real']} scenes. Nearby lines are parallel to a seam, {NEAR_M:g} to {FAR_M:g} m away from "
+        f"it, and at least {NEAR_M:g} m away from each seam."
     )
-    return render_report_html("Seams", [table, Pictures("Scenes", pictures, columns=3), Text("How", [how])])
+    pages = [table, Pictures("Generated scenes", pictures, columns=3), Text("Method", [how])]
+    return render_report_html("Seams", pages)

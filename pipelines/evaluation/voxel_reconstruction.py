@@ -1,7 +1,7 @@
-"""Score any method's reconstructed voxels against the truth on the full grid (paper, Sec. 4.1, Tab. 1) over Ray.
+"""Score the reconstructed voxels of any method against true voxels on the full grid (paper, Sec. 4.1, Tab. 1) with Ray.
 
-The truth is voxel files, or scenes of a dataset, which this module voxelises. Scores come from one confusion matrix,
-summed over all voxels of all scenes.
+True voxels come from voxel files, or from scenes of a dataset, which this module voxelises. Scores come from one
+confusion matrix, summed over all voxels of all scenes.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from pipelines.schema.palette import EMPTY
 from pipelines.schema.tables import Shard, find_shards
 
 CHUNK_SCENES = 16
-SHOWN = 5  # names in an error
+SHOWN = 5  # Maximum number of names in an error message.
 SCENE_SCORES = pa.schema(
     [
         ("scene_id", pa.string()),
-        ("voxel_iou", pa.float64()),  # null where both sides are empty
+        ("voxel_iou", pa.float64()),  # Null where both sides are empty.
         ("voxel_miou", pa.float64()),
-        ("rebuilt_bytes", pa.int64()),  # of the reconstruction's file
-        ("stored_bytes", pa.int64()),  # of what the method keeps of the scene; null if not given
+        ("rebuilt_bytes", pa.int64()),  # Size of the file of the reconstruction.
+        ("stored_bytes", pa.int64()),  # Size of the method's stored representation; null if not given.
     ]
 )
 
 
 @dataclass(frozen=True)
 class GroundTruthVoxels:
-    """Location of a scene's true voxels: a file, or a row of a shard."""
+    """Location of the true voxels of a scene: a file, or a row of a shard."""
 
     uri: str = ""
     shard: Shard | None = None
@@ -47,7 +47,14 @@ class GroundTruthVoxels:
 
 @dataclass(frozen=True)
 class VoxelPair:
-    """One scene to score."""
+    """True voxels and reconstruction of one scene.
+
+    Attributes:
+        name: Scene id.
+        truth: Location of the true voxels.
+        rebuilt: URI of the reconstruction.
+        stored: URI of the method's stored representation; "" if not given.
+    """
 
     name: str
     truth: GroundTruthVoxels
@@ -66,12 +73,15 @@ def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]
             for k, name in enumerate(names)
         }
     if split:
-        raise ValueError(f"{root}: split {split!r} asked for, but no dataset here; leave it out to score .npz files")
+        raise ValueError(
+            f"{root}: a split ({split!r}) needs a dataset, but the directory holds none; omit the split to"
+            " score .npz files"
+        )
     return {name: GroundTruthVoxels(uri) for name, uri in group_files_by_scene(root, ".npz").items()}
 
 
 def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
-    """Return scene name -> URI of the files in a directory or of a pattern."""
+    """Return the URI by scene id of the files in a directory or of a pattern."""
     base, files = find_files(pattern, suffix)
     return {make_scene_id(file): storage.join_uri(base, file) for file in files}
 
@@ -82,13 +92,16 @@ def pair_files(
     """Pair the scenes that all sides have, by name.
 
     Args:
-        truth: True voxels by scene name.
-        rebuilt: Files of the reconstructions by scene name.
-        stored: Files of the method's stored representation by scene name, if any.
+        truth: True voxels by scene id.
+        rebuilt: Files of the reconstructions by scene id.
+        stored: Files of the method's stored representation by scene id, if any.
         partial: Whether scenes may be missing on some sides.
 
+    Returns:
+        Pairs in the order of the scene ids.
+
     Raises:
-        ValueError: No scene is common, or some are missing and `partial` is false; the message lists them.
+        ValueError: No scene is common, or scenes are missing and `partial` is false. The message lists them.
     """
     sides = {"truth": truth, "reconstructions": rebuilt} | ({} if stored is None else {"stored files": stored})
     every, common = set().union(*sides.values()), set(truth).intersection(*sides.values())
@@ -103,7 +116,7 @@ def pair_files(
 
 
 def split_chunks(pairs: list[VoxelPair]) -> list[list[VoxelPair]]:
-    """Split pairs into chunks of at most CHUNK_SCENES whose truths lie in one shard."""
+    """Split pairs into chunks of at most CHUNK_SCENES. The true scenes of a chunk are in one shard."""
     by_shard: dict[Shard | None, list[VoxelPair]] = {}
     for pair in pairs:
         by_shard.setdefault(pair.truth.shard, []).append(pair)
@@ -111,7 +124,7 @@ def split_chunks(pairs: list[VoxelPair]) -> list[list[VoxelPair]]:
 
 
 def load_true_voxels(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes) -> list[np.ndarray]:
-    """(256, 256, 32) class ids of each truth of a chunk."""
+    """Return the class ids (256, 256, 32) of each true scene of a chunk."""
     shard = chunk[0].truth.shard
     if shard is None:
         return [read_voxels(pair.truth.uri, axes) for pair in chunk]
@@ -119,7 +132,7 @@ def load_true_voxels(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes) -> lis
 
 
 def score_chunk(row: dict, chunks: list[list[VoxelPair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
-    """Row in: number of a chunk. Rows out: per scene its confusion matrix, flat, and bytes on disk."""
+    """Compute, for each scene of a chunk, its flat confusion matrix and its bytes on disk."""
     chunk = chunks[row["id"]]
     return [
         {
@@ -139,7 +152,7 @@ def score_voxels(
     truth_axes: Axes,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[dict, pa.Table]:
-    """Return the scores over all scenes, as nested plain numbers, and a table with a row per scene, by name."""
+    """Return the scores over all scenes as nested plain numbers, and a table with a row per scene, by name."""
     chunks = split_chunks(pairs)
     graph = flat_map_dataset(
         ray.data.range(len(chunks), override_num_blocks=len(chunks)),
@@ -172,6 +185,7 @@ def score_voxels(
 
 
 def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
+    """Return the voxel scores of one scene; None if both sides are empty."""
     if confusion.sum() == confusion[EMPTY, EMPTY]:
         return {"voxel_iou": None, "voxel_miou": None}
     scores = compute_voxel_scores(confusion)
@@ -179,5 +193,5 @@ def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
 
 
 def spread_evenly(sizes: list[int]) -> dict[str, float]:
-    """Return mean, standard deviation, minimum and maximum of sizes in bytes."""
+    """Return mean, standard deviation, minimum and maximum of sizes (bytes)."""
     return {name: float(getattr(np, name)(sizes)) for name in ("mean", "std", "min", "max")}
