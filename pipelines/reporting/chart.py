@@ -1,5 +1,4 @@
-"""Line charts as inline SVG: axes, ticks, legend; linear or logarithmic. Colours come from the page's
-style."""
+"""Draw line charts as inline SVG with axes, ticks and a legend. Colours come from the style of the page."""
 
 from __future__ import annotations
 
@@ -14,17 +13,17 @@ import numpy as np
 from pipelines.reporting.report_style import STYLE
 
 WIDTH, HEIGHT = 640, 360
-LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 46  # margins around the axes
+LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 46  # Margins around the axes.
 MAX_POINTS = 600
-NUM_COLORS = 6  # the style's classes series-0 ..
+NUM_COLORS = 6  # Classes series-0 to series-5 of the style.
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Named series of (x, y), with as many x as y.
+    """Line chart of named series (x, y).
 
-    Values that are not finite, or not positive on a logarithmic axis, are left out. A series of 200 points or more is
-    drawn faintly under its running mean.
+    Values that are not finite are skipped. On a logarithmic axis, values that are not positive are skipped too. A
+    series of 200 points or more is drawn faintly, with its moving average on top.
     """
 
     title: str
@@ -35,7 +34,7 @@ class Chart:
 
 
 def draw_chart_svg(chart: Chart) -> str:
-    """Draw the chart as an <svg> element. Raises ValueError if a series has not as many x as y."""
+    """Draw the chart as an <svg> element. Raises ValueError if x and y of a series differ in length."""
     series = {name: _find_drawable(x, y, chart.log_y) for name, (x, y) in chart.series.items()}
     points = [np.stack(pair) for pair in series.values() if len(pair[0])]
     head = f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">'
@@ -55,7 +54,7 @@ def draw_chart_svg(chart: Chart) -> str:
 
 
 def make_standalone_svg(chart: Chart) -> str:
-    """Make a separate SVG file of the chart, with its XML namespace and the page's style."""
+    """Make a standalone SVG file of the chart, with the XML namespace and the style of the page."""
     face = 'svg { font-family: system-ui, "Liberation Sans", sans-serif; background: var(--card); }'
     head, rest = draw_chart_svg(chart).split(">", 1)
     space = head.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
@@ -63,7 +62,7 @@ def make_standalone_svg(chart: Chart) -> str:
 
 
 def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Choose round numbers (1, 2 or 5 times a power of ten) from at most `low` to at least `high`."""
+    """Choose round numbers (1, 2 or 5 times a power of ten) that cover the range from `low` to `high`."""
     if high <= low:
         high = low + max(abs(low), 1.0)
     raw = (high - low) / about
@@ -74,7 +73,7 @@ def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Choose powers of ten around [low, high], with 2s and 5s if they span two decades or less."""
+    """Choose powers of ten around [low, high], and also 2 and 5 times these powers for at most two decades."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
     factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)
@@ -86,7 +85,7 @@ def choose_log_ticks(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class _Axis:
-    """Values to pixels."""
+    """Map from values to pixels."""
 
     low: float
     high: float
@@ -106,7 +105,7 @@ def _find_drawable(
 ) -> tuple[np.ndarray, np.ndarray]:
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     if xs.shape != ys.shape:
-        raise ValueError(f"a series has {xs.size} x values and {ys.size} y values")
+        raise ValueError(f"a series has {xs.size} x values but {ys.size} y values")
     keep = np.isfinite(xs) & np.isfinite(ys)
     if log_y:
         keep &= ys > 0

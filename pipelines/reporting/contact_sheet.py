@@ -1,6 +1,6 @@
-"""Pictures to look at a dataset by: which scenes there are, one scene in every view, sheets of many.
+"""Draw pictures of a dataset directory: a plate of one scene in all views, and sheets of many scenes.
 
-Works on any dataset directory, real or generated. Only `paint` uses Ray.
+The functions accept real and generated scenes. Only `paint_scene` uses Ray.
 """
 
 from __future__ import annotations
@@ -22,12 +22,9 @@ from pipelines.reporting.scene_index import Catalogue
 from pipelines.schema.palette import COLOR_HEX, parse_rgb
 from pipelines.schema.tables import Shard
 
-CHUNK = 4  # scenes per Ray task
+CHUNK = 4  # Scenes per Ray task.
 
 INK, SOFT, LINE = "#1b2130", "#5d6675", "#d5dae2"
-
-
-# -------------------------------------------------------------------------------------------------- which scenes
 
 
 # -------------------------------------------------------------------------------------------- pictures, by Ray
@@ -35,20 +32,33 @@ INK, SOFT, LINE = "#1b2130", "#5d6675", "#d5dae2"
 
 @dataclass(frozen=True)
 class View:
-    """How a scene is drawn: `bev` (from above, the longer side size_px) or `3d` (size_px wide, 4 : 3)."""
+    """Kind and size of a picture of a scene.
+
+    Attributes:
+        kind: `bev` for a view from above, `3d` for an oblique view.
+        size_px: Length of the longer side for `bev`; width for `3d`, with aspect 4 : 3 (px).
+    """
 
     kind: Literal["bev", "3d"]
     size_px: int
 
     def picture(self, scene: Scene) -> np.ndarray:
-        """(H, W, 3) uint8."""
+        """Render a scene as (H, W, 3) uint8."""
         if self.kind == "bev":
             return render_bev(scene, self.size_px, supersample=2)
         return render_3d(scene, self.size_px, 3 * self.size_px // 4)
 
 
 def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
-    """Row in: a shard, rows in it and their places. Rows out: per scene and view its place and picture, as bytes."""
+    """Render the scenes of a row.
+
+    Args:
+        row: Row with a shard, rows of the shard and their places in the result.
+        views: Views to render.
+
+    Returns:
+        Rows with place, view, shape and bytes of each picture.
+    """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
@@ -61,7 +71,17 @@ def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
 def paint_scene(
     catalogue: Catalogue, indices: np.ndarray, views: tuple[View, ...], on_picture: Callable[[], None] | None = None
 ) -> list[list[np.ndarray]]:
-    """Pictures of the scenes at `indices`: per scene one per view. Drawn by Ray, a task per few scenes of a shard."""
+    """Render selected scenes with Ray; one task renders up to CHUNK scenes of a shard.
+
+    Args:
+        catalogue: Scenes of a dataset directory.
+        indices: Indices of the scenes.
+        views: Views to render.
+        on_picture: Called after each picture.
+
+    Returns:
+        One list per scene, with one picture per view.
+    """
     import ray.data
 
     from pipelines.runtime.ray_tasks import flat_map_dataset
@@ -84,12 +104,13 @@ def paint_scene(
 
 
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Pillow's own face: no font file is looked for, every machine draws the same."""
-    return cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))  # with a size it is never a bitmap font
+    """Load the font that is included in Pillow, so that all machines draw the same text."""
+    # With a size, Pillow never returns a bitmap font.
+    return cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))
 
 
 def fit_text(text: str, size: int, width_px: float) -> str:
-    """The text, or as much of its two ends as is no wider than width_px."""
+    """Return the text, shortened in the middle if it is wider than `width_px`."""
     face, shown = load_font(size), text
     for kept in range(len(text) - 1, 3, -1):
         if face.getlength(shown) <= width_px:
@@ -99,7 +120,10 @@ def fit_text(text: str, size: int, width_px: float) -> str:
 
 
 def write_text(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: int = 18, fill: str = SOFT) -> float:
-    """Text from x rightwards, centred on y; returns where it ends. Draws ² and ³ itself: the face lacks them."""
+    """Write text to the right of x, vertically centred on y, and return the x position of its end.
+
+    The font lacks ² and ³, so the function draws them as small raised digits.
+    """
     for k, part in enumerate(re.split("([²³])", text)):
         raised = k % 2 == 1
         face, part = load_font(round(0.65 * size) if raised else size), part.translate({ord("²"): "2", ord("³"): "3"})
@@ -109,13 +133,13 @@ def write_text(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: i
 
 
 def draw_swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int = 16) -> None:
-    """The colour of a ground class or category, centred on y."""
+    """Draw the colour of a ground class or category, vertically centred on y."""
     draw.rectangle((x, y - size / 2, x + size, y + size / 2), fill=parse_rgb(COLOR_HEX[name]), outline=LINE)
 
 
 # ------------------------------------------------------------------------------------------- one scene, every view
 
-# viridis, at equal steps
+# Colours of the viridis map at equal steps.
 RAMP = np.array(
     [
         parse_rgb(c)
@@ -125,9 +149,16 @@ RAMP = np.array(
 
 
 def draw_heights(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, float]]:
-    """The fused ground's height in the colours of RAMP, white where there is none; and the heights of its ends.
+    """Draw the height of the fused ground in the colours of RAMP, and white where there is no ground.
 
-    The ends are the 1st and 99th percentile: single slabs far off would leave no contrast. (0, 1) without ground.
+    The ends of the ramp are the 1st and 99th percentile, because single distant slabs would reduce the contrast.
+
+    Args:
+        scene: Scene.
+        size_px: Length of the longer side (px).
+
+    Returns:
+        (H, W, 3) uint8 picture, and the heights of the ends of the ramp (m); (0, 1) without ground.
     """
     surface, winner = scene.surface()
     known = winner >= 0
@@ -140,19 +171,19 @@ def draw_heights(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, f
 
 
 def make_color_ramp(share: np.ndarray) -> np.ndarray:
-    """(..., 3) float sRGB of values (...) from 0 to 1, clipped."""
+    """Return the colours (..., 3) float sRGB of values (...). Values are clipped to [0, 1]."""
     share = np.clip(share, 0, 1) * (len(RAMP) - 1)
     return np.stack([np.interp(share, np.arange(len(RAMP)), channel) for channel in RAMP.T], axis=-1)
 
 
 def compute_footprints_m(scene: Scene) -> list[np.ndarray]:
-    """The outline (k, 2) of each primitive's shadow from above, in metres."""
+    """Compute the outline (k, 2) of each primitive from above (m, scene frame)."""
     transform = compute_placements(scene)
     outlines = []
     turn = np.linspace(0, 2 * np.pi, 33)[:-1]
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1) / 2
     for axes, center, category in zip(transform[:, :2, :3], transform[:, :2, 3], scene.category, strict=True):
-        if category == ELLIPSOID:  # of the points axes @ s with |s| = 1/2 the outermost
+        if category == ELLIPSOID:  # The outline is the boundary of the points axes @ s with |s| = 1/2.
             outlines.append(center + circle @ np.linalg.cholesky(axes @ axes.T).T)
             continue
         edges = axes.T * np.where(axes[1] < 0, -1, 1)[:, None]
@@ -163,9 +194,17 @@ def compute_footprints_m(scene: Scene) -> list[np.ndarray]:
 
 
 def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndarray:
-    """The primitives alone from above: see-through footprints, higher ones over lower ones, (H, W, 3) uint8.
+    """Draw the transparent footprints of the primitives from above, higher primitives over lower ones.
 
-    A line from the centre shows the heading where it is known.
+    A line from the centre shows the heading of a primitive if it is known.
+
+    Args:
+        scene: Scene.
+        size_px: Length of the longer side (px).
+        supersample: Each pixel is the mean of supersample^2 points.
+
+    Returns:
+        (H, W, 3) uint8 picture.
     """
     grid, scale = scene.grid, size_px * supersample / (max(scene.grid.rows, scene.grid.cols) * scene.grid.resolution_m)
     shape = [round(n * grid.resolution_m * scale) for n in (grid.cols, grid.rows)]
@@ -188,7 +227,7 @@ def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndar
 
 
 class LayoutBox(NamedTuple):
-    """Where a picture lies on a plate, in pixels."""
+    """Position of a picture on a plate (px)."""
 
     left: int
     top: int
@@ -196,10 +235,11 @@ class LayoutBox(NamedTuple):
     height: int
 
     def of(self, plate: np.ndarray) -> np.ndarray:
+        """Return the part of a plate inside this box."""
         return plate[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
-MARGIN, GAP, LARGE, WIDE, SMALL, SCALE = 56, 40, 720, 1060, 420, 64  # WIDE x LARGE is the 3D picture
+MARGIN, GAP, LARGE, WIDE, SMALL, SCALE = 56, 40, 720, 1060, 420, 64  # The 3D picture has WIDE x LARGE pixels.
 PLATE_WIDTH = 2 * MARGIN + LARGE + GAP + WIDE
 TOP_ROW = 190
 BOTTOM_ROW = TOP_ROW + LARGE + 92
@@ -211,9 +251,15 @@ LEGEND_X = PRIMITIVES_X + SMALL + GAP
 
 
 def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
-    """One scene in every view with its names, labels and counts: (H, W, 3) uint8, and where each picture lies.
+    """Draw one scene in all views with its names, labels and counts.
 
-    Pictures: bev, 3d, ground, heights, primitives. The first is `render_bev` as it is.
+    The pictures are bev, 3d, ground, heights and primitives. The first equals the result of `render_bev`.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        (H, W, 3) uint8 plate, and the position of each picture.
     """
     bare = replace(scene, height_m=np.zeros_like(scene.height_m), occupied=np.zeros_like(scene.occupied))
     heights, span_m = draw_heights(scene, SMALL)
@@ -224,9 +270,9 @@ def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
             MARGIN,
             TOP_ROW,
             LARGE,
-            f"From above, {extent} m, forward is up",
+            f"View from above, {extent} m, forward at the top",
         ),
-        "3d": (render_3d(scene, WIDE, LARGE), MARGIN + LARGE + GAP, TOP_ROW, LARGE, "From behind"),
+        "3d": (render_3d(scene, WIDE, LARGE), MARGIN + LARGE + GAP, TOP_ROW, LARGE, "Oblique view"),
         "ground": (
             render_bev(scene.select(np.zeros(0, int)), SMALL, supersample=2),
             GROUND_X,
@@ -235,7 +281,7 @@ def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
             "Ground classes",
         ),
         "heights": (heights, HEIGHTS_X, BOTTOM_ROW, SMALL, "Ground height, m"),
-        "primitives": (draw_footprints(bare, SMALL), PRIMITIVES_X, BOTTOM_ROW, SMALL, "Primitives, seen through"),
+        "primitives": (draw_footprints(bare, SMALL), PRIMITIVES_X, BOTTOM_ROW, SMALL, "Primitives, transparent"),
     }
     plate = Image.new("RGB", (PLATE_WIDTH, PLATE_HEIGHT), "white")
     draw = ImageDraw.Draw(plate)
@@ -276,7 +322,7 @@ def _draw_header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
 
 
 def _format_metres(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> None:
-    """Ticks of x at the left and of y below a picture from above."""
+    """Draw ticks of x at the left of a view from above, and ticks of y below it."""
     grid = scene.grid
     for x in choose_ticks(grid.back_m, grid.front_m, 4):
         if grid.back_m <= x <= grid.front_m:
@@ -291,7 +337,7 @@ def _format_metres(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> N
 
 
 def _draw_scale(plate: Image.Image, draw: ImageDraw.ImageDraw, box: LayoutBox, span_m: tuple[float, float]) -> None:
-    """The colours of heights with their metres, right of a picture."""
+    """Draw the colour scale of heights in metres to the right of a picture."""
     low, high = span_m
     left = box.left + box.width + 14
     strip = make_color_ramp(np.linspace(1, 0, box.height))[:, None].repeat(16, axis=1)
@@ -304,7 +350,7 @@ def _draw_scale(plate: Image.Image, draw: ImageDraw.ImageDraw, box: LayoutBox, s
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, scene: Scene, left: int, top: int) -> None:
-    """Categories with their counts, ground classes with their share of the grid."""
+    """Draw the categories with their counts, and the ground classes with their shares of the grid."""
     size, step, right = 17, 25, PLATE_WIDTH - MARGIN
     share = scene.occupied.mean(axis=(1, 2))
     counts = [(name, format_number(int(n))) for name, n in zip(CATEGORIES, scene.counts(), strict=True)]
@@ -326,7 +372,17 @@ def _draw_legend(draw: ImageDraw.ImageDraw, scene: Scene, left: int, top: int) -
 def draw_scene_sheet(
     pictures: Sequence[np.ndarray], captions: Sequence[tuple[str, str]], title: str, columns: int | None = None
 ) -> np.ndarray:
-    """Pictures of one size, two lines under each, a title above and the colours below: (H, W, 3) uint8."""
+    """Draw a sheet of pictures with a title above and the class colours below.
+
+    Args:
+        pictures: (H, W, 3) uint8 pictures.
+        captions: Two lines of text per picture.
+        title: Title.
+        columns: Pictures per row; None chooses the number.
+
+    Returns:
+        (H, W, 3) uint8 sheet.
+    """
     height, width = (max(sizes) for sizes in zip(*(picture.shape[:2] for picture in pictures), strict=True))
     size, gap = max(11, round(width / 20)), max(12, width // 14)
     tiles = []
@@ -343,7 +399,15 @@ def draw_scene_sheet(
 
 
 def choose_columns(count: int, aspect: float) -> int:
-    """Columns for a sheet about 5 : 4, the last row as full as can be; aspect is a picture's width / height."""
+    """Choose the number of columns for a sheet of about 5 : 4 whose last row is as full as possible.
+
+    Args:
+        count: Number of pictures.
+        aspect: Width / height of a picture.
+
+    Returns:
+        Number of columns.
+    """
     middle = round(np.sqrt(count * 1.25 / aspect))
     near = range(max(1, round(0.75 * middle)), round(1.25 * middle) + 2)
     return min(near, key=lambda c: (-count % c, abs(c - middle)))
@@ -357,7 +421,7 @@ def _draw_title(text: str, width: int, margin: int) -> np.ndarray:
 
 
 def _draw_colors(width: int, margin: int) -> np.ndarray:
-    """A strip with the colour of every class, in as many lines as it takes."""
+    """Draw a strip with the colour of each class, in one or more lines."""
     size = min(22, max(13, width // 90))
     places, x, line = [], margin, 0
     for name in COLOR_HEX:
@@ -376,7 +440,7 @@ def _draw_colors(width: int, margin: int) -> np.ndarray:
 
 
 def make_captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[tuple[str, str]]:
-    """Per scene its id, and its label, number of primitives and what it is sorted by."""
+    """Make captions for scenes: the scene id, then the number of primitives and the value of the sort column."""
     names, totals = catalogue.column("scene_id"), catalogue.column("num_primitives")
     column = None if sort in ("drive", "random", "primitives", "num_primitives") else catalogue.sort_column(sort)
     values = None if column is None else catalogue.column(column)
@@ -390,7 +454,7 @@ def make_captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[
 
 
 def _format_quantity(column: str, value: float) -> str:
-    """A column's value with its name and unit."""
+    """Format a value with the name and unit of its column."""
     for ending, unit in (("_m3", " m³"), ("_m2", " m²"), ("_rad", " rad"), ("_m", " m")):
         if column.endswith(ending):
             name = column.removesuffix(ending).removesuffix("_volume").removesuffix("_area")
@@ -400,11 +464,11 @@ def _format_quantity(column: str, value: float) -> str:
 
 
 def make_sheet_title(catalogue: Catalogue, count: int, sort: str, pick: str) -> str:
-    """What a sheet shows, in one line."""
+    """Describe a sheet in one line: sources, splits, number of scenes and order."""
     parts = (", ".join(sorted({getattr(shard, name) for shard in catalogue.shards})) for name in ("source", "split"))
     order = {"random": "at random", "drive": "along the drives"}.get(
         sort, f"by {spell_name(sort.removeprefix('num_'))}"
     )
     if sort != "random":
-        order += {"uniform": "", "lowest": ", the first", "highest": ", the last first"}[pick]
+        order += {"uniform": "", "lowest": ", ascending", "highest": ", descending"}[pick]
     return "  ·  ".join([*parts, f"{format_number(count)} of {format_number(len(catalogue))} scenes", order])

@@ -1,6 +1,6 @@
-"""Drawings of a dataset as inline SVG: histograms, ranges of sizes, bars, label matrices and maps of drives.
+"""Draw a dataset as inline SVG: histograms, ranges of sizes, bars, label matrices and maps of drives.
 
-As in chart.py the colours of text, lines and series come from the page's style; class colours are the palette's.
+Text, lines and series have the colours of the page's style. Classes have the colours of the palette.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pipelines.reporting.chart import choose_log_ticks, choose_ticks, format_num
 from pipelines.schema.palette import COLOR_HEX
 
 MAX_BINS = 25
-LEAST_SPAN = 10  # counts on the axis of a histogram: a few wide bars would shout
-PAGE_PX = 1140  # width of a drawing that fills the page
+LEAST_SPAN = 10  # Minimum range of counts on the axis of a histogram, so that single bars are not too wide.
+PAGE_PX = 1140  # Width of a drawing that fills the page.
 
 
 def spell_name(name: str) -> str:
-    """A category's or class's name as people write it."""
+    """Return the name of a category or class with spaces instead of underscores."""
     return name.replace("_", " ")
 
 
@@ -53,13 +53,29 @@ def _draw_swatch(x: float, y: float, name: str) -> str:
 
 
 def count_bins(counts: np.ndarray) -> tuple[int, np.ndarray]:
-    """Width of equal bins from 0 on (whole numbers), and how many of the counts (n,) lie in each."""
+    """Count values in bins of equal width.
+
+    Args:
+        counts: (n,) whole numbers, at least 0.
+
+    Returns:
+        Width of a bin, and the number of values per bin. The first bin starts at 0.
+    """
     width = int(counts.max(initial=0)) // MAX_BINS + 1
     return width, np.bincount(counts.astype(int) // width)
 
 
 def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, float]) -> str:
-    """How many scenes have how many primitives of a category; a line at each mark (name -> count)."""
+    """Draw the number of scenes by their number of primitives of a category.
+
+    Args:
+        category: Category.
+        counts: (n,) primitives per scene.
+        marks: Counts to mark by a line, by name.
+
+    Returns:
+        <svg> element.
+    """
     width, height, left, right, top, bottom = 300, 190, 40, 12, 44, 24
     bin_width, scenes = count_bins(counts)
     beyond = max([LEAST_SPAN, len(scenes) * bin_width, *(value + 1 for value in marks.values())])
@@ -96,7 +112,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
 
 
 def _is_same(marks: Mapping[str, float]) -> dict[float, str]:
-    """Value -> the names of the marks there."""
+    """Return the joined names of the marks by value."""
     names: dict[float, list[str]] = {}
     for name, value in marks.items():
         names.setdefault(value, []).append(name)
@@ -107,10 +123,16 @@ def _is_same(marks: Mapping[str, float]) -> dict[float, str]:
 
 
 def draw_size_ranges(percentiles_m: Mapping[str, np.ndarray]) -> str:
-    """Lengths, widths and heights per category on one logarithmic axis.
+    """Draw the ranges of length, width and height per category on one logarithmic axis.
 
-    category -> (5, 3): 5th, 25th, 50th, 75th, 95th percentile of length, width, height, in metres. Thin line 5 to
-    95, thick line 25 to 75, dot 50.
+    A thin line extends from the 5th to the 95th percentile, a thick line from the 25th to the 75th. A dot marks the
+    median.
+
+    Args:
+        percentiles_m: (5, 3) 5th, 25th, 50th, 75th and 95th percentile of length, width and height, by category (m).
+
+    Returns:
+        <svg> element.
     """
     left, right, top, bottom, row, group = 190, 30, 34, 28, 13, 50
     height = top + group * len(percentiles_m) + bottom
@@ -151,7 +173,15 @@ def draw_size_ranges(percentiles_m: Mapping[str, np.ndarray]) -> str:
 
 
 def draw_share_bars(title: str, shares: Mapping[str, Mapping[str, float]]) -> str:
-    """Shares from 0 to 1 as bars in class colours: ground class -> label -> share."""
+    """Draw shares as bars in class colours.
+
+    Args:
+        title: Title.
+        shares: Shares in [0, 1] by ground class and label.
+
+    Returns:
+        <svg> element.
+    """
     width, left, right, top, row, gap = 560, 180, 62, 30, 20, 12
     rows = sum(len(by_label) for by_label in shares.values())
     largest = max((value for by_label in shares.values() for value in by_label.values()), default=0) or 1
@@ -171,7 +201,17 @@ def draw_share_bars(title: str, shares: Mapping[str, Mapping[str, float]]) -> st
 
 
 def draw_label_matrix(title: str, counts: np.ndarray, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Scenes per pair of labels as shaded cells with their counts and shares; counts (rows, columns)."""
+    """Draw the number of scenes per pair of labels as shaded cells.
+
+    Args:
+        title: Title.
+        counts: (rows, columns) scenes.
+        rows: Names of the rows.
+        columns: Names of the columns.
+
+    Returns:
+        <svg> element.
+    """
     left, top, wide, tall = 80, 74, 66, 46
     total, largest = max(int(counts.sum()), 1), max(int(counts.max(initial=0)), 1)
     width, height = left + wide * len(columns) + 4, top + tall * len(rows) + 4
@@ -198,12 +238,20 @@ def draw_label_matrix(title: str, counts: np.ndarray, rows: Sequence[str], colum
 
 # --------------------------------------------------------------------------------------------------------- map
 
-SPLIT_STYLE = {"unused": "axis", "train": "series-1", "test": "series-3"}  # drawn in this order
-MAX_NAMED = 60  # sequences; more are too small for names
+SPLIT_STYLE = {"unused": "axis", "train": "series-1", "test": "series-3"}  # Styles in the order of drawing.
+MAX_NAMED = 60  # Maximum number of sequences with names; frames of more sequences are too small for names.
 
 
 class _Shelf(NamedTuple):
-    """How sequences are set: least width, space below and between them, most height of one and of all, in pixels."""
+    """Sizes for the arrangement of sequences in rows (px).
+
+    Attributes:
+        least: Minimum width of a sequence.
+        below: Space below a sequence.
+        gap: Space between sequences.
+        cell: Maximum height of a sequence.
+        total: Maximum height of all rows.
+    """
 
     least: int
     below: int
@@ -217,9 +265,15 @@ PADDING_PX, LEGEND_PX = 7, 34
 
 
 def draw_track_map(positions_m: Mapping[str, Mapping[str, np.ndarray]]) -> str:
-    """Where the scenes of each sequence lie, all at one scale: sequence -> split -> (n, 2) world x and y.
+    """Draw the positions of the scenes of each sequence at one scale, with x to the right and y upwards.
 
-    x to the right, y up; a dot per scene. Sequences stand in frames on shelves, in their order.
+    Each scene is a dot. Each sequence has a frame, and the frames are arranged in rows.
+
+    Args:
+        positions_m: (n, 2) x and y by sequence and split (m, world frame).
+
+    Returns:
+        <svg> element.
     """
     everything = [np.concatenate(list(by_split.values())) for by_split in positions_m.values()]
     middle_m = np.array([(xy.max(axis=0) + xy.min(axis=0)) / 2 for xy in everything])
@@ -241,7 +295,7 @@ def draw_track_map(positions_m: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     for split in sorted(dots, key=_draw_order):
         kind = SPLIT_STYLE.get(split, "series-0")
         parts.append(f'<path class="{kind}" {style} data-split="{escape(split)}" d="{"".join(dots[split])}"/>')
-    return _make_svg("where the scenes lie", PAGE_PX, LEGEND_PX + height, parts, min_width=760)
+    return _make_svg("positions of the scenes", PAGE_PX, LEGEND_PX + height, parts, min_width=760)
 
 
 def _draw_order(split: str) -> tuple[int, str]:
@@ -249,7 +303,7 @@ def _draw_order(split: str) -> tuple[int, str]:
 
 
 def _draw_frame(sequence: str, scenes: int, corner_px: np.ndarray, cell_px: np.ndarray, shelf: _Shelf) -> list[str]:
-    """A sequence's frame, and its name below if there is room."""
+    """Draw the frame of a sequence, and its name below the frame if there is room."""
     x, y = corner_px - PADDING_PX
     outline = 'rx="6" fill="none" stroke="var(--line)"'
     width, height = cell_px + 2 * PADDING_PX
@@ -261,7 +315,7 @@ def _draw_frame(sequence: str, scenes: int, corner_px: np.ndarray, cell_px: np.n
 
 
 def _draw_map_legend(positions_m: Mapping[str, Mapping[str, np.ndarray]], px_per_m: float) -> list[str]:
-    """Splits with their colours and scenes, and a bar of a round number of metres."""
+    """Draw the colours and numbers of scenes of the splits, and a scale bar with a round number of metres."""
     found: Counter = Counter()
     for by_split in positions_m.values():
         found.update({split: len(xy) for split, xy in by_split.items()})
@@ -283,7 +337,7 @@ def _draw_map_legend(positions_m: Mapping[str, Mapping[str, np.ndarray]], px_per
 
 
 def _draw_scale(extent_m: np.ndarray, shelf: _Shelf) -> float:
-    """Pixels per metre, the most at which every sequence fits its cell and all of them the map."""
+    """Return the maximum pixels per metre at which each sequence fits its cell and all sequences fit the map."""
     low, high = 1e-6, 20.0
     for _ in range(40):
         middle = (low * high) ** 0.5
@@ -295,7 +349,7 @@ def _draw_scale(extent_m: np.ndarray, shelf: _Shelf) -> float:
 
 
 def _pack_shelves(cells_px: np.ndarray, shelf: _Shelf) -> tuple[np.ndarray, float]:
-    """Top left corners (n, 2) of cells (n, 2) set side by side in rows, standing on each row's floor; the height."""
+    """Arrange cells (n, 2) in bottom-aligned rows; return their top left corners (n, 2) and the total height."""
     places, rows, x = np.zeros_like(cells_px), [[]], PADDING_PX + 1.0
     for k, (width, _) in enumerate(cells_px):
         if rows[-1] and x + width > PAGE_PX - PADDING_PX - 1:

@@ -1,7 +1,7 @@
 """Render a dataset directory as one page: numbers, sizes, places and labels of its scenes, and rejected scenes.
 
-All figures come from the tables. Slots, thresholds and the readers' reports come from dataset.json and are optional, so
-that directories of generated scenes have a page as well.
+All figures come from the tables. Slots, thresholds and the reports of the readers come from dataset.json. The file is
+optional, so that directories of generated scenes have a page as well.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pipelines.schema.tables import find_shards
 
 PERCENTILES = (5, 25, 50, 75, 95)
 SHOWN_REASONS, SHOWN_DEFECTS, SHOWN_SEQUENCES = 30, 50, 60
-NBSP = "\u00a0"  # keeps numbers that belong together on one line
+NBSP = "\u00a0"  # Non-breaking space.
 SPLITS = ("train", "test", "unused", "generated")
 
 
@@ -40,28 +40,39 @@ SPLITS = ("train", "test", "unused", "generated")
 
 @dataclass(frozen=True, eq=False)
 class DatasetFacts:
-    """Contents of the page."""
+    """Contents of the page.
+
+    Attributes:
+        catalogue: Scenes of the dataset directory.
+        grid_area_m2: (n,) area of the grid of each scene (m^2).
+        sizes_m: Length, width and height (k, 3) of all primitives by category (m).
+        labels: Number of primitives by category and label of the dataset.
+        rejects: Rows of the rejects table.
+        description: Content of dataset.json, if any.
+        records: Options of each generated source, by source.
+    """
 
     catalogue: Catalogue
-    grid_area_m2: np.ndarray  # (n,) of each scene
-    sizes_m: dict[str, np.ndarray]  # category -> (k, 3) length, width, height of every primitive
-    labels: Counter  # (category, the dataset's own label) -> primitives
-    rejects: list[dict]  # rows of the rejects table
-    description: dict | None  # dataset.json
-    records: dict[str, dict]  # generated source -> how it was made
+    grid_area_m2: np.ndarray
+    sizes_m: dict[str, np.ndarray]
+    labels: Counter
+    rejects: list[dict]
+    description: dict | None
+    records: dict[str, dict]
 
     @property
     def counts(self) -> np.ndarray:
-        """(n, 11) primitives per scene and category."""
+        """Return the number of primitives (n, 11) per scene and category."""
         return np.stack([self.catalogue.column(f"num_{name}") for name in CATEGORIES], axis=1)
 
     @property
     def categories(self) -> list[str]:
-        """Those that occur."""
+        """Return the categories that occur."""
         return [name for name in CATEGORIES if name in self.sizes_m]
 
     @property
     def slots(self) -> dict[str, int]:
+        """Return the number of slots by category; empty without dataset.json."""
         layout = self.description["layout"] if self.description else {"categories": (), "slots": ()}
         return dict(zip(layout["categories"], layout["slots"], strict=True))
 
@@ -69,9 +80,19 @@ class DatasetFacts:
 def read_facts(
     root: str, source: str | None = None, split: str | None = None, on_shard: Callable[[int, int], None] | None = None
 ) -> DatasetFacts:
-    """Reads every table of a dataset directory once; `on_shard` hears how many shards are done, of how many.
+    """Read all tables of a dataset directory once.
 
-    Raises ValueError if it holds no scenes of this source and split.
+    Args:
+        root: Dataset directory.
+        source: Source to read; None reads all.
+        split: Split to read; None reads all.
+        on_shard: Called after each shard with the number of finished shards and the number of all shards.
+
+    Returns:
+        Contents of the page.
+
+    Raises:
+        ValueError: The directory holds no scenes of this source and split.
     """
     catalogue = Catalogue.read(root, source, split)
     sizes: dict[str, list[np.ndarray]] = {name: [] for name in CATEGORIES}
@@ -103,7 +124,7 @@ def read_facts(
 
 
 def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]:
-    """Rows of the rejects table; none if there is no such table."""
+    """Return the rows of the rejects table; the list is empty if there is no such table."""
     if not storage.list_files(storage.join_uri(root, "rejects"), ".parquet"):
         return []
     shards = [s for s in find_shards(root, "rejects") if s.source == (source or s.source)]
@@ -114,7 +135,15 @@ def read_rejects(root: str, source: str | None, split: str | None) -> list[dict]
 
 
 def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Picture]] = ()) -> str:
-    """The whole page; `scenes` are pairs of pictures to show, oblique and from above."""
+    """Render the whole page.
+
+    Args:
+        facts: Contents of the page.
+        scenes: Pairs of pictures of a scene: oblique view, and view from above.
+
+    Returns:
+        HTML page.
+    """
     root = facts.catalogue.root.rstrip("/")
     sections = [
         make_totals(facts),
@@ -132,6 +161,7 @@ def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Pic
 
 
 def make_totals(facts: DatasetFacts) -> KeyFigures:
+    """Make the key figures of the page."""
     catalogue, counts = facts.catalogue, facts.counts
     per_scene = counts.sum(axis=1)
     low, high = np.percentile(per_scene, [5, 95])
@@ -142,35 +172,37 @@ def make_totals(facts: DatasetFacts) -> KeyFigures:
             "scenes",
             ", ".join(f"{format_number(n)} {split}" for split, n in group_by_split(facts).items()),
         ),
-        Figure(int(per_scene.sum()), "primitives", f"in {len(facts.categories)} of {len(CATEGORIES)} categories"),
-        Figure(float(round(per_scene.mean(), 1)), "primitives per scene", f"{low:.0f} to {high:.0f} in nine of ten"),
+        Figure(int(per_scene.sum()), "primitives", f"of {len(facts.categories)} from {len(CATEGORIES)} categories"),
+        Figure(
+            float(round(per_scene.mean(), 1)), "primitives per scene", f"{low:.0f} to {high:.0f} in 90 % of the scenes"
+        ),
         Figure(sequences, "sequence" if sequences == 1 else "sequences"),
     ]
     if facts.description:
-        figures.append(Figure(sum(facts.slots.values()), "slots of the tensors", f"{len(facts.slots)} categories"))
+        figures.append(Figure(sum(facts.slots.values()), "slots in the tensors", f"{len(facts.slots)} categories"))
         share = len(facts.rejects) / (len(facts.rejects) + len(catalogue))
         figures.append(Figure(len(facts.rejects), "rejected scenes", f"{100 * share:.1f} % of all poses"))
-    return KeyFigures("In short", figures)
+    return KeyFigures("Summary", figures)
 
 
 def group_by_split(facts: DatasetFacts) -> dict[str, int]:
-    """Scenes per split, in the order of SPLITS."""
+    """Return the number of scenes per split, in the order of SPLITS."""
     found = Counter(facts.catalogue.column("split"))
     return {name: found[name] for name in sorted(found, key=lambda s: (SPLITS.index(s) if s in SPLITS else 9, s))}
 
 
 def draw_scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
-    """Rows of oblique pictures, each over a row of the same scenes from above."""
+    """Make rows of oblique pictures, each above a row of the same scenes from above."""
     columns, pictures = min(len(scenes), 4), []
     for start in range(0, len(scenes), columns):
         row = scenes[start : start + columns]
         pictures += [oblique for oblique, _ in row] + [above for _, above in row]
-    note = "From behind, and below it the same scene from above, forward is up."
-    return Pictures("A few scenes", pictures, columns=columns, note=note)
+    note = "Each oblique view looks forward. Below it, the same scene is shown from above, with forward at the top."
+    return Pictures("Example scenes", pictures, columns=columns, note=note)
 
 
 def make_split_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
-    """How many scenes lie where; the map only where poses are known."""
+    """Make the table of splits, and the map of splits if the poses are known."""
     catalogue = facts.catalogue
     source, split, sequence = (catalogue.column(name) for name in ("source", "split", "sequence"))
     per_scene, rows = catalogue.column("num_primitives"), []
@@ -201,20 +233,20 @@ def make_split_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
         for name in sorted(set(sequence))
     }
     note = (
-        "A dot per scene at the pose it was cut at, world x to the right and y up. Every sequence is drawn at the same "
-        "scale; where sequences lie to one another is not shown."
+        "Each dot is the pose of a scene in the world frame, with x to the right and y upwards. All sequences have the "
+        "same scale. The map does not show where sequences lie relative to each other."
     )
     return [*sections, DrawingsSection("Split map", [CaptionedSvg(draw_track_map(tracks))], "wide", note)]
 
 
 def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
-    """Scenes by count, per category, with the slots of dataset.json and the 95th percentile they come from."""
+    """Draw the number of scenes by count, per category, with the slots and the 95th percentile that defines them."""
     training, drawings = facts.catalogue.column("split") == "train", []
     for k, name in enumerate(CATEGORIES):
         counts = facts.counts[:, k]
         marks, words = {}, [f"mean {counts.mean():.1f}"]
         if (counts == 0).any():
-            words.append(f"none in {100 * (counts == 0).mean():.0f} %")
+            words.append(f"zero in {100 * (counts == 0).mean():.0f} %")
         if name in facts.slots and training.any():
             marks["p95"] = float(np.ceil(np.percentile(counts[training], 95)).clip(1))
             marks["slots"] = float(facts.slots[name])
@@ -225,23 +257,26 @@ def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
                     draw_count_histogram(name, counts, marks), " · ".join(part.replace(" ", NBSP) for part in words)
                 )
             )
-    note = "How many scenes (upwards) have how many primitives of a category (to the right)."
+    note = (
+        "Each histogram shows the number of scenes (vertical) by the number of primitives of a category (horizontal)."
+    )
     if facts.description:
         note += (
-            " p95 is the 95th percentile of the training split; a tensor holds as many primitives of a category as it "
-            "has slots, the nearest first. Over slots: the share of training scenes that have more."
+            " The mark p95 is the 95th percentile of the training split. The mark slots is the maximum number of "
+            "primitives of a category in a tensor, which keeps the nearest primitives. Over slots is the share of "
+            "training scenes with more primitives than slots."
         )
     return DrawingsSection("Primitives per scene", drawings, "small", note)
 
 
 def make_size_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
-    """Ranges of length, width and height per category, as a drawing and in numbers."""
+    """Show the ranges of length, width and height per category, as a drawing and as a table."""
     percentiles = {name: np.percentile(facts.sizes_m[name], PERCENTILES, axis=0) for name in facts.categories}
     if not percentiles:
-        return [Text("Sizes", ["There is not one primitive."])]
+        return [Text("Sizes", ["The scenes contain no primitives."])]
     note = (
-        "Length is the longer side of the footprint. Thin lines reach from the 5th to the 95th percentile, thick ones "
-        "from the 25th to the 75th, the dot is the median. Of all splits."
+        "Length is the longer side of the footprint. Thin lines extend from the 5th to the 95th percentile over all "
+        "splits. Thick lines extend from the 25th to the 75th percentile, and dots mark the median."
     )
     rows = []
     for name, values in percentiles.items():
@@ -254,10 +289,10 @@ def make_size_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
             else ""
         )
         rows.append((spell_name(name).replace(" ", NBSP), total, round(total / len(facts.catalogue), 2), *spans, text))
-    columns = ("category", "primitives", "per scene", "length, m", "width, m", "height, m", "the dataset's own labels")
+    columns = ("category", "primitives", "per scene", "length, m", "width, m", "height, m", "labels of the dataset")
     return [
         DrawingsSection("Sizes", [CaptionedSvg(draw_size_ranges(percentiles))], "wide", note),
-        Table("Categories", columns, rows, note="Sizes: 5th percentile · median · 95th percentile."),
+        Table("Categories", columns, rows, note="Each size is given as 5th percentile · median · 95th percentile."),
     ]
 
 
@@ -266,7 +301,7 @@ def _format_metres(value: float) -> str:
 
 
 def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
-    """Mean share of the grid per ground class and density label."""
+    """Draw the mean share of the grid per ground class and density label."""
     drawings = []
     for group in ("vegetation", "vehicle"):
         labels = facts.catalogue.column(f"{group}_density")
@@ -277,14 +312,14 @@ def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
             shares[name] = {label or "no label": share[rows].mean() for label, rows in chosen.items() if rows.any()}
         drawings.append(CaptionedSvg(draw_share_bars(f"by {group} density", {n: by for n, by in shares.items() if by})))
     note = (
-        "Mean share of a scene's area that each ground class covers. Classes may overlap, and some of the area has "
-        "none."
+        "Each bar is the mean share of the area of a scene that a ground class covers. Classes may overlap, and a part "
+        "of the area may have no class."
     )
-    return DrawingsSection("Ground", drawings, "pairs", note)
+    return DrawingsSection("Ground classes", drawings, "pairs", note)
 
 
 def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
-    """Label pairs per split, and the thresholds behind them."""
+    """Show the number of scenes per pair of density labels and split, and the thresholds of the labels."""
     columns = [facts.catalogue.column(f"{group}_density") for group in ("vegetation", "vehicle")]
     names = [[*DENSITIES, *([None] if None in set(values) else [])] for values in columns]
     split, drawings = facts.catalogue.column("split"), []
@@ -295,18 +330,20 @@ def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
             CaptionedSvg(draw_label_matrix(f"{part}, {format_number(total)} scenes", counts, *_name_rows(names)))
         )
     note = (
-        "Scenes per pair of labels. low: count and volume both below their p25; high: both above their p75; else "
+        "Each cell is the number of scenes with a pair of density labels. A scene has label low if count and volume "
+        "are both below their p25. A scene has label high if both are above their p75. All other scenes have label "
         "medium."
     )
     if not facts.description:
-        return [DrawingsSection("Labels", drawings, "small", "Scenes per pair of labels: what was asked for.")]
+        note = "Each cell is the number of scenes with a pair of requested density labels."
+        return [DrawingsSection("Density labels", drawings, "small", note)]
     found = {group: facts.description[f"{group}_thresholds"] for group in ("vegetation", "vehicle")}
     keys = list(found["vegetation"])
     heads = ("label", *(key.replace("_m3", ", m³").replace("_", " ") for key in keys))
     rows = [(group, *(values[key] for key in keys)) for group, values in found.items()]
     return [
-        DrawingsSection("Labels", drawings, "small", note),
-        Table("Label thresholds", heads, rows, note="Of the training split."),
+        DrawingsSection("Density labels", drawings, "small", note),
+        Table("Thresholds of density labels", heads, rows, note="The thresholds come from the training split."),
     ]
 
 
@@ -316,9 +353,9 @@ def _name_rows(names: Sequence[Sequence[str | None]]) -> tuple[list[str], list[s
 
 
 def make_reject_sections(facts: DatasetFacts) -> list[Section]:
-    """Why scenes were left out."""
+    """Tabulate the reasons for rejected scenes."""
     if not facts.rejects:
-        return [Text("Rejected scenes", ["Every pose became a scene."])] if facts.description else []
+        return [Text("Rejected scenes", ["No pose was rejected."])] if facts.description else []
     reasons: dict[str, list[dict]] = {}
     for row in facts.rejects:
         reasons.setdefault(row["reason"], []).append(row)
@@ -327,12 +364,13 @@ def make_reject_sections(facts: DatasetFacts) -> list[Section]:
         (len(found), reason, len({row["sequence"] for row in found}), found[0]["scene_id"])
         for reason, found in ordered[:SHOWN_REASONS]
     ]
-    more = f"The {SHOWN_REASONS} most frequent of {len(ordered)} reasons." if len(ordered) > SHOWN_REASONS else ""
-    return [Table("Rejected scenes", ("scenes", "reason", "sequences", "for example"), rows, note=more)]
+    more = f"The table shows the {SHOWN_REASONS} most frequent of {len(ordered)} reasons."
+    note = more if len(ordered) > SHOWN_REASONS else ""
+    return [Table("Rejected scenes", ("scenes", "reason", "sequences", "example"), rows, note=note)]
 
 
 def make_reader_sections(facts: DatasetFacts) -> list[Section]:
-    """What the readers of raw drives dropped, per sequence: numbers, labels without a category, defective objects."""
+    """Tabulate the objects that the readers of raw drives excluded, per sequence, label and defect."""
     reports: Mapping[str, Mapping] = (facts.description or {}).get("reports") or {}
     if not reports:
         return []
@@ -349,11 +387,11 @@ def make_reader_sections(facts: DatasetFacts) -> list[Section]:
         rows.insert(0, ("all", *(sum(found[name] or 0 for found in per_sequence.values()) for name in names)))
     sections: list[Section] = [
         Table(
-            "What the readers found",
+            "Objects in the raw files",
             ("sequence", *map(spell_name, names)),
             rows,
-            note="Objects in the raw files by what became of them. dropped: known labels of no category; unknown: "
-            "labels in no table; duplicates: objects written a second time; defects: objects that cannot be read.",
+            note="Dropped objects have a known label without a category. Unknown objects have a label that no table "
+            "lists. Duplicates are objects that a file contains twice. Defects are objects that cannot be read.",
         )
     ]
     labels: Counter = Counter()
@@ -363,25 +401,26 @@ def make_reader_sections(facts: DatasetFacts) -> list[Section]:
                 labels.update({(name, label): count for label, count in value.items()})
     if labels:
         rows = [(label, name, count) for (name, label), count in labels.most_common()]
-        sections.append(Table("Labels left out", ("label", "why", "objects"), rows))
+        sections.append(Table("Excluded labels", ("label", "reason", "objects"), rows))
     defects = [
         (s, d) for s, report in sorted(reports.items()) for v in report.values() if isinstance(v, list) for d in v
     ]
     if defects:
         columns = list(defects[0][1])
         rows = [(sequence, *(defect.get(name) for name in columns)) for sequence, defect in defects[:SHOWN_DEFECTS]]
-        note = f"The first {SHOWN_DEFECTS} of {len(defects)}." if len(defects) > SHOWN_DEFECTS else ""
+        more = f"The table shows the first {SHOWN_DEFECTS} of {len(defects)} objects."
+        note = more if len(defects) > SHOWN_DEFECTS else ""
         sections.append(Table("Defective objects", ("sequence", *columns), rows, note=note))
     return sections
 
 
 def make_provenance_sections(facts: DatasetFacts) -> list[Section]:
-    """The options each part was made with."""
+    """Tabulate the options of the run that wrote each source."""
     made = {facts.description["source"]: facts.description["options"]} if facts.description else {}
     sections: list[Section] = []
     for source, options in (made | facts.records).items():
         rows = [(name, _convert_to_plain(value)) for name, value in options.items()]
-        sections.append(Table(f"How {source} was made", ("option", "value"), rows))
+        sections.append(Table(f"Options of {source}", ("option", "value"), rows))
     return sections
 
 

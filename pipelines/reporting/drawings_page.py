@@ -1,4 +1,4 @@
-"""A report page with SVG drawings among its sections."""
+"""Render a report page with SVG drawings among its sections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipelines.reporting.report import Section, Text, render_report_html
 
 
 class CaptionedSvg(NamedTuple):
-    """An <svg> element, and words under it."""
+    """An <svg> element and its caption."""
 
     svg: str
     caption: str = ""
@@ -19,16 +19,23 @@ class CaptionedSvg(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawingsSection:
-    """A section of drawings: as wide as the page, two side by side, or as many small ones as fit."""
+    """A section of drawings.
+
+    Attributes:
+        title: Heading.
+        drawings: Drawings in reading order.
+        layout: `wide` for the full page width, `pairs` for two per row, `small` for many per row.
+        note: Text above the drawings.
+    """
 
     title: str
     drawings: Sequence[CaptionedSvg]
-    layout: str  # wide, pairs or small
+    layout: str
     note: str = ""
 
 
 def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
-    """`render_report_html` with drawings among the sections."""
+    """Render a page like `render_report_html`, with drawings among the sections."""
     plain = [
         Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
         for index, section in enumerate(sections)

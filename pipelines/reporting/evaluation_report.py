@@ -26,39 +26,53 @@ from pipelines.reporting.report import (
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
 MEANINGS = {
-    "fid": "Frechet distance of Inception's pool3 features; 0 is equal. Falls with the number of samples: compare at "
-           "equal numbers only",
-    "sfid": "the same of its spatial features, which see where things lie",
-    "kid": "kernel distance of the pool3 features, cubic kernel; 0 is equal, without bias from the number of samples",
-    "inception_score": "how sure Inception is of each picture, and how varied it finds them; made for photographs",
-    "inception_score_real": "the same of the real pictures",
-    "precision": "share of generated pictures that lie among the real ones",
-    "recall": "share of real pictures that lie among the generated ones",
-    "density": "real neighbourhoods that a generated picture lies in, over k; about 1 for equal sources",
-    "coverage": "share of real pictures with a generated one in their neighbourhood",
-    "layout_frechet": "Frechet distance of counts, sizes and areas of scenes; 0 is equal. Not an FID",
-    "layout_mmd": "kernel distance of the same; 0 is equal",
-    "random_frechet": "Frechet distance of pictures as a fixed, untrained network sees them; 0 is equal. Not an FID",
-    "random_mmd": "kernel distance of the same; 0 is equal. Not a KID",
-    "vegetation_fidelity": "share of scenes whose vegetation is as dense as was asked for",
-    "vehicle_fidelity": "share of scenes whose vehicles are as dense as was asked for",
-    "joint_fidelity": "share of scenes of which both hold",
+    "fid": "Frechet distance of Inception's pool3 features. 0 means equal. The distance falls with the number of "
+           "samples, so compare distances of equal numbers only",
+    "sfid": "Frechet distance of Inception's spatial features, which depend on the positions of objects",
+    "kid": "kernel distance of the pool3 features with a cubic kernel. 0 means equal. The number of samples causes no "
+           "bias",
+    "inception_score": "confidence and variety of Inception's class predictions. The score is designed for photographs",
+    "inception_score_real": "Inception score of the real pictures",
+    "precision": "share of generated pictures that lie in the neighbourhood of a real picture",
+    "recall": "share of real pictures that lie in the neighbourhood of a generated picture",
+    "density": (
+"mean number of real neighbourhoods that contain a generated picture, over k. Equal sources have"
+" about 1"
+),
+    "coverage": "share of real pictures whose neighbourhood contains a generated picture",
+    "layout_frechet": (
+"Frechet distance of object counts, object sizes and ground areas. 0 means equal. It is not an"
+" FID"
+),
+    "layout_mmd": "kernel distance of object counts, object sizes and ground areas. 0 means equal",
+    "random_frechet": "Frechet distance of the features of a fixed untrained network. 0 means equal. It is not an FID",
+    "random_mmd": "kernel distance of the features of a fixed untrained network. 0 means equal. It is not a KID",
+    "vegetation_fidelity": "share of scenes whose vegetation density matches the requested label",
+    "vehicle_fidelity": "share of scenes whose vehicle density matches the requested label",
+    "joint_fidelity": "share of scenes whose vegetation and vehicle densities both match the requested labels",
 }
 VALIDITY = {
-    "overlapping": "solid objects that stand in one another (IoU3D > 0.05)",
-    "floating": "standing objects more than half a metre above the ground",
-    "sunken": "standing objects more than half a metre below the ground",
-    "over_unknown_ground": "standing objects over no ground at all",
-    "off_road_vehicles": "vehicles off road and parking",
-    "buildings_on_road": "buildings in the road",
-    "road_connectivity": "road pixels that hang together in one piece",
+    "overlapping": "solid objects that overlap another solid object (IoU3D > 0.05)",
+    "floating": "standing objects more than 0.5 m above the ground",
+    "sunken": "standing objects more than 0.5 m below the ground",
+    "over_unknown_ground": "standing objects without any ground below them",
+    "off_road_vehicles": "vehicles outside roads and parking areas",
+    "buildings_on_road": "buildings on the road",
+    "road_connectivity": "road pixels in the largest connected component",
 }
 # fmt: on
 
 
 @dataclass(frozen=True, eq=False)
 class ExamplePictures:
-    """Pictures (H, W, 3) uint8 for the page: examples of both sides, and generated ones with the nearest real ones."""
+    """Pictures (H, W, 3) uint8 for the page.
+
+    Attributes:
+        real: Real examples.
+        generated: Generated examples.
+        neighbours: Generated pictures, each with its nearest real pictures and their distances.
+        worst: Generated pictures with most faults, each with a caption.
+    """
 
     real: Sequence[np.ndarray]
     generated: Sequence[np.ndarray]
@@ -69,11 +83,21 @@ class ExamplePictures:
 def render_evaluation_html(
     scores: Mapping, counts: Mapping[str, np.ndarray], shown: ExamplePictures, protocol: Sequence[str]
 ) -> str:
-    """Render the page from the scores of `convert_estimates` and the counts (n, 11) of both sides, if known."""
+    """Render the page.
+
+    Args:
+        scores: Scores of `convert_estimates`.
+        counts: (n, 11) objects per scene and category of both sides, if known.
+        shown: Pictures.
+        protocol: Paragraphs about the measurement.
+
+    Returns:
+        HTML page.
+    """
     sections: list[Section] = [
         make_summary(scores),
-        Pictures("Real", [Picture("", image, "real") for image in shown.real], columns=6),
-        Pictures("Generated", [Picture("", image, "generated") for image in shown.generated], columns=6),
+        Pictures("Real scenes", [Picture("", image, "real") for image in shown.real], columns=6),
+        Pictures("Generated scenes", [Picture("", image, "generated") for image in shown.generated], columns=6),
         build_score_table(scores),
     ]
     if "validity" in scores:
@@ -85,22 +109,23 @@ def render_evaluation_html(
         sections.append(build_distance_table(scores))
     if shown.worst:
         worst = [Picture(reason, image, "generated") for image, reason in shown.worst]
-        sections.append(Pictures("Where it fails", worst, columns=6, note="The generated scenes with most faults."))
+        note = "These generated scenes have the most faults."
+        sections.append(Pictures("Worst generated scenes", worst, columns=6, note=note))
     sections += [draw_neighbour_pictures(shown), build_memorisation_table(scores["memorisation"])]
-    sections.append(Text("How it was measured", [*protocol, INTERVALS]))
-    title = f"{scores['scenes']['generated']} generated scenes against {scores['scenes']['real']} real ones"
+    sections.append(Text("Protocol", [*protocol, INTERVALS]))
+    title = f"{scores['scenes']['generated']} generated scenes compared with {scores['scenes']['real']} real scenes"
     return render_report_html("Evaluation", sections, title)
 
 
 INTERVALS = (
-    "In brackets: 95 % bootstrap intervals over scenes. Those of precision, recall, density and coverage hold the "
-    "neighbourhoods fixed; those of Frechet distances are of first order and say nothing of their bias at small "
-    "numbers."
+    "Brackets contain 95 % bootstrap intervals over scenes. The intervals of precision, recall, density and coverage "
+    "keep the neighbourhoods fixed. The intervals of Frechet distances are first-order approximations. They do not "
+    "include the bias of Frechet distances at small numbers of samples."
 )
 
 
 def format_value(value: Mapping | float | None) -> str | None:
-    """`0.53 (0.49 to 0.57)`, or the number alone."""
+    """Format a score as `0.53 (0.49 to 0.57)`, or as a number if it has no interval."""
     if isinstance(value, Mapping):
         if value["value"] is None:
             return None
@@ -111,7 +136,7 @@ def format_value(value: Mapping | float | None) -> str | None:
 
 
 def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | float]]:
-    """Names joined by dots, and what `written` takes, of nested scores in plain form; words and nulls left out."""
+    """Yield the scores of nested plain scores with names joined by dots; words and nulls are skipped."""
     for name, value in scores.items():
         if isinstance(value, Mapping) and set(value) != {"value", "low", "high"}:
             yield from iterate_leaves(value, f"{prefix}{name}.")
@@ -120,11 +145,12 @@ def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Map
 
 
 def list_headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
-    """The leaves that are told in short lists: none of single categories, classes or thresholds."""
+    """Return the scores for short lists, without scores of single categories, classes or thresholds."""
     return ((name, value) for name, value in iterate_leaves(scores) if not any(part in name for part in DETAILS))
 
 
 def make_summary(scores: Mapping) -> KeyFigures:
+    """Make the key figures of the page."""
     names = ("fid", "kid", "layout_frechet", "precision_k3", "recall_k3", "random_precision_k3", "random_recall_k3")
     figures = [Figure(scores[name]["value"], name.replace("_", " ")) for name in names if name in scores]
     for name in ("overlapping", "road_connectivity"):
@@ -132,15 +158,15 @@ def make_summary(scores: Mapping) -> KeyFigures:
             sides = scores["validity"][name]
             note = "" if sides["real"] is None else f"{format_number(sides['real']['value'])} in real scenes"
             figures.append(Figure(sides["generated"]["value"], VALIDITY[name], note))
-    return KeyFigures("In short", figures)
+    return KeyFigures("Summary", figures)
 
 
 def explain_score(name: str) -> str:
-    """In words, what a score says; `random_precision_k5` and the like by their parts."""
+    """Explain a score in words. A name such as `random_precision_k5` is explained by its parts."""
     if name in MEANINGS:
         return MEANINGS[name]
     base, _, k = name.removeprefix("random_").rpartition("_k")
-    seen = ", as an untrained network sees them" if name.startswith("random_") else ""
+    seen = "; features of an untrained network" if name.startswith("random_") else ""
     return f"{MEANINGS[base]}{seen}; k = {k}"
 
 
@@ -151,7 +177,7 @@ def build_score_table(scores: Mapping) -> Table:
     note = (
         ""
         if "fid" in scores
-        else "FID, KID, Inception score and their like need local Inception weights: --inception FILE."
+        else "Scores of Inception features need a local file of Inception weights: pass --inception FILE."
     )
     return Table("Scores", ("score", "value"), rows, meanings=[explain_score(name) for name in flat], note=note)
 
@@ -161,8 +187,8 @@ def build_validity_table(validity: Mapping) -> Table:
         (words, *(format_value(validity[name][side]) for side in ("real", "generated")))
         for name, words in VALIDITY.items()
     ]
-    note = "Real scenes give the level to compare with; it is not zero."
-    return Table("Do scenes make sense?", ("share of", "real", "generated"), rows, note=note)
+    note = "Compare the shares with those of real scenes, because real scenes do not reach 0 either."
+    return Table("Validity", ("share of", "real", "generated"), rows, note=note)
 
 
 def build_statistics_table(statistics: Mapping) -> Table:
@@ -170,8 +196,8 @@ def build_statistics_table(statistics: Mapping) -> Table:
         (name.replace("_", " "), *(format_value(sides[side]) for side in ("real", "generated")))
         for name, sides in statistics.items()
     ]
-    note = "Numbers per scene, mean extents in metres, and shares of the scene's area."
-    return Table("What scenes are made of", ("mean per scene", "real", "generated"), rows, note=note)
+    note = "The rows are numbers of objects per scene, mean extents in metres, and shares of the area of a scene."
+    return Table("Layout statistics", ("mean per scene", "real", "generated"), rows, note=note)
 
 
 def build_distance_table(scores: Mapping) -> Table:
@@ -188,11 +214,12 @@ def build_distance_table(scores: Mapping) -> Table:
         for name, (found, unit) in sorted(named.items())
     ]
     note = (
-        "Wasserstein distances of distributions in the unit given, in bits Jensen-Shannon divergences. The last "
-        "column is "
-        "the distance of two halves of the real scenes: nothing comes nearer than about that."
+        "Rows with unit bits are Jensen-Shannon divergences. All other rows are Wasserstein distances in the given "
+        "unit. The last column is the distance between two halves of the real scenes, which is about the lowest "
+        "distance that generated scenes can reach."
     )
-    return Table("How distributions differ", ("of", "unit", "real to generated", "within real"), rows, note=note)
+    columns = ("distribution", "unit", "real to generated", "real to real")
+    return Table("Distances between distributions", columns, rows, note=note)
 
 
 def draw_count_charts(counts: Mapping[str, np.ndarray]) -> Charts:
@@ -204,28 +231,31 @@ def draw_count_charts(counts: Mapping[str, np.ndarray]) -> Charts:
             series[side] = (at.tolist(), np.percentile(values[:, index], at).tolist())
         if any(max(y) > 0 for _, y in series.values()):
             charts.append(Chart(spell_name(category), series, "percentile of scenes", "number per scene"))
-    return Charts("Numbers of objects", charts)
+    return Charts("Objects per scene", charts)
 
 
 def draw_neighbour_pictures(shown: ExamplePictures) -> Pictures:
     pictures = []
     for generated, nearest, distances in shown.neighbours:
         pictures.append(Picture("", generated, "generated"))
-        pictures += [Picture(f"at {d:.3g}", image, "real") for image, d in zip(nearest, distances, strict=True)]
+        pictures += [Picture(f"distance {d:.3g}", image, "real") for image, d in zip(nearest, distances, strict=True)]
     columns = 1 + max((len(nearest) for _, nearest, _ in shown.neighbours), default=0)
-    note = "The generated scenes that come nearest to a real one, each with its nearest real scenes and their distance."
-    return Pictures("Is it memorised?", pictures, columns=columns, note=note)
+    note = (
+        "The figure shows the generated scenes with the smallest distance to a real scene. Each is followed by its "
+        "nearest real scenes and their distances."
+    )
+    return Pictures("Nearest real scenes", pictures, columns=columns, note=note)
 
 
 def build_memorisation_table(found: Mapping) -> Table:
     rows = [
         (words, *(format_value(found[side][name]) for side in ("generated", "real")))
-        for name, words in (("mean", "mean"), ("median", "median"), ("minimum", "smallest"), ("maximum", "greatest"))
+        for name, words in (("mean", "mean"), ("median", "median"), ("minimum", "minimum"), ("maximum", "maximum"))
     ]
     note = (
-        f"In {found['features']} features. {format_value(found['memorised'])} of the generated scenes are nearer to "
-        "a real "
-        "one than all but 1 % of the real ones are to another; "
-        f"{format_value(found['copies'])} equal a real one."
+        f"Distances are measured in {found['features']} features. The limit is the 1 % quantile of the distances of "
+        "real scenes to their nearest other real scene. The share of generated scenes below the limit is "
+        f"{format_value(found['memorised'])}. The share of exact copies is {format_value(found['copies'])}."
     )
-    return Table("Distance to the nearest real scene", ("", "generated", "real, to another"), rows, note=note)
+    columns = ("statistic", "generated to real", "real to other real")
+    return Table("Distance to the nearest real scene", columns, rows, note=note)

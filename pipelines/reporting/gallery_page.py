@@ -1,6 +1,6 @@
-"""A gallery of scenes as one self-contained HTML page: filters by label and statistics, every scene in 3D.
+"""Render a gallery of scenes as one self-contained HTML page with filters by label and statistics, and scenes in 3D.
 
-Nothing is fetched and nothing has to be installed to look at it: put it online, or mail it.
+The page needs no download and no installation. It can be published as one file or sent by mail.
 """
 
 from __future__ import annotations
@@ -33,7 +33,14 @@ CAPTIONS = ("vegetation_density", "vehicle_density", "num_primitives")
 
 
 def pack_scenes(row: dict) -> list[dict]:
-    """Row in: a shard, rows in it and their places. Rows out: each scene's place, picture and viewer content."""
+    """Render and pack the scenes of a row.
+
+    Args:
+        row: Row with a shard, rows of the shard and their places in the result.
+
+    Returns:
+        Rows with place, picture and viewer content of each scene.
+    """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
     for place, scene in zip(row["places"], shard.scenes(list(row["rows"])), strict=True):
@@ -45,7 +52,7 @@ def pack_scenes(row: dict) -> list[dict]:
 def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
-    """Render the page, about 35 kB per scene. Ray tasks pack CHUNK scenes of a shard each."""
+    """Render the page, about 35 kB per scene. Each Ray task packs up to CHUNK scenes of a shard."""
     import ray.data
 
     tasks = [
@@ -82,25 +89,25 @@ def list_scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
 
 
 def read_script(name: str) -> str:
-    """A file of pipelines/web, as part of an inline module."""
+    """Return a file of pipelines/web as a part of an inline module."""
     return files("pipelines").joinpath("web", name).read_text(encoding="utf-8").replace("export class", "class")
 
 
 def _render_page(title: str, subtitle: str, data: dict) -> str:
-    content = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")  # cannot end its element
+    content = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")  # Escapes end tags.
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>
 <style>{STYLE}{GALLERY_STYLE}</style></head><body>
 <header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></header>
 <main><section id="filters">
-<label>name <input id="text" type="search" placeholder="part of it"></label><div id="choices"></div>
-<label>number <select id="number"></select></label>
-<label>from <input id="low" type="number"></label><label>to <input id="high" type="number"></label>
-<label>order <select id="sort"></select></label><button id="down" title="up or down">↑</button>
-<button id="clear">clear</button><strong id="count"></strong></section>
+<label>scene id <input id="text" type="search" placeholder="part of the id"></label><div id="choices"></div>
+<label>filter by value <select id="number"></select></label>
+<label>minimum <input id="low" type="number"></label><label>maximum <input id="high" type="number"></label>
+<label>sort by <select id="sort"></select></label><button id="down" title="ascending or descending">↑</button>
+<button id="clear">clear filters</button><strong id="count"></strong></section>
 <div id="cards"></div></main>
 <dialog id="dialog"><div class="bar"><strong id="name"></strong><span></span>
-<button id="previous" title="previous">←</button><button id="next" title="next">→</button>\
+<button id="previous" title="previous scene">←</button><button id="next" title="next scene">→</button>\
 <button id="close" title="close">✕</button></div>
 <div class="both"><canvas id="view"></canvas><dl id="values"></dl></div><p id="picked"></p></dialog>
 <script type="application/json" id="data">{content}</script>

@@ -1,4 +1,4 @@
-"""The page of an inpainting run: scenes before and after, and how far decoders are off outside the region."""
+"""Render the page of an inpainting run: scenes before and after, and the decoder errors in the known region."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pipelines.rendering.render import render_outlined_bev
 from pipelines.reporting.report import Picture, Pictures, Table, render_report_html
 
 PICTURE_PX = 512
-PER_ROW = 4  # pictures of a scene: as given, and its first variants
-SUBJECTS = {"both": "everything is", "ground": "the ground is", "objects": "the objects are"}
+PER_ROW = 4  # Pictures per scene: the given scene and its first variants.
+SUBJECTS = {"both": "Ground and objects are", "ground": "The ground is", "objects": "The objects are"}
 
 
 @dataclass(frozen=True)
 class InpaintExample:
-    """A scene as given, its regenerated region (rows, cols) and its variants."""
+    """A given scene, its generated region (rows, cols) and its variants."""
 
     given: Scene
     region: np.ndarray
@@ -33,26 +33,31 @@ def render_inpaint_html(
     examples: Iterable[InpaintExample],
     drift: Mapping[str, float | None],
 ) -> str:
-    """Render the page.
+    """Render the page of an inpainting run.
 
     Args:
-        run: Name of the run, the subtitle.
-        contents: What was regenerated.
+        run: Run name, shown as the subtitle.
+        contents: Contents that were regenerated.
         num_variants: Variants per scene.
         examples: Scenes to show.
-        drift: Scores of the decoders' output outside the region.
+        drift: Scores of the decoder output in the known region.
+
+    Returns:
+        HTML page.
     """
     shown: list[Picture] = []
     for example in examples:
         region, scenes = example.region, example.variants[: PER_ROW - 1]
         shown.append(Picture(example.given.scene_id, render_outlined_bev(example.given, region, PICTURE_PX), "given"))
         shown += [Picture(s.scene_id, render_outlined_bev(s, region, PICTURE_PX), "regenerated") for s in scenes]
-    note = f"Inside the red line {SUBJECTS[contents]} regenerated; the rest is the given scene's."
+    note = (
+        f"{SUBJECTS[contents]} regenerated inside the red line. The rest of the scene is copied from the given scene."
+    )
     how = (
-        "The latent outside the region is the given scene's, bit for bit, but decoders see the whole latent. The table "
-        "shows how far their output is off there. The scenes above and in the tables take that part from the given "
-        "scene."
+        "Outside the generated region, the latent equals the latent of the given scene. The decoders process the whole "
+        "latent, so their output may still differ there. The table shows these differences. The pictures and the "
+        "tables of scenes copy this part from the given scene."
     )
     pictures = Pictures("Scenes", shown, min(PER_ROW, 1 + num_variants), note)
-    table = Table("Drift outside the region", tuple(drift), [tuple(drift.values())], note=how)
+    table = Table("Decoder errors outside the region", tuple(drift), [tuple(drift.values())], note=how)
     return render_report_html("Inpainting", [pictures, table], run)

@@ -10,32 +10,45 @@ from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
 
-HIDDEN = ("stage", "dataset", "lvae")  # options of a run that are paths and digests, reported elsewhere
+HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; the card reports them elsewhere.
 
-Points = Sequence[Sequence[float]]  # steps and values
+Points = Sequence[Sequence[float]]  # Training steps and values.
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """One run of training, as recorded by MLflow or in the training.json of a published model."""
+    """One run of training, as MLflow or the training.json of a published model records it.
 
-    name: str  # lvae, dit; dit-2 where a second run began with the first one's weights
+    Attributes:
+        name: lvae or dit; dit-2 for a second run that continues from the weights of the first.
+        stage: Stage of the training.
+        weights: Digest of the resulting weights.
+        parameters: Number of weights of the network; None if unknown.
+        steps: Number of training steps.
+        hours: Duration of the training steps without start-up and validation (h).
+        options: Options of the run.
+        origin: Command, commit, machine and versions.
+        curves: Training steps and values by name of the loss.
+        data: Options of the dataset, as in its dataset.json.
+    """
+
+    name: str
     stage: str
-    weights: str  # digest of what it made
-    parameters: int | None  # numbers in the network; None where they are not known
+    weights: str
+    parameters: int | None
     steps: int
-    hours: float  # of training steps, without start-up and validation
+    hours: float
     options: Mapping[str, str]
-    origin: Mapping[str, str]  # command, commit, machine, versions
+    origin: Mapping[str, str]
     curves: Mapping[str, Points]
-    data: Mapping | None = None  # options of the dataset, as its dataset.json has them
+    data: Mapping | None = None
 
     @property
     def picture(self) -> str:
         return f"curves-{self.name}.svg"
 
     def record(self, data: Mapping) -> dict:
-        """Return the content of training.json, without paths of this machine and with the options of the dataset."""
+        """Return the content of training.json: options of the run and of the dataset, without paths of this machine."""
         known = {key: value for key, value in self.options.items() if key not in HIDDEN}
         return asdict(self) | {"options": known, "data": self.data or dict(data)}
 
@@ -46,15 +59,28 @@ class TrainingRecord:
     def rows(self) -> Iterator[tuple[str, str]]:
         if self.parameters is not None:
             yield "parameters", f"{self.parameters:,}"
-        yield "steps done", f"{self.steps:,}"
-        yield "hours of steps", f"{self.hours:.1f}"
+        yield "training steps", f"{self.steps:,}"
+        yield "training time, h", f"{self.hours:.1f}"
         yield from self.origin.items()
         yield "options", ", ".join(f"{key} {value}" for key, value in self.options.items() if key not in HIDDEN)
 
 
 @dataclass(frozen=True)
 class ModelCard:
-    """Content of a card. `scores` are those of metrics.json, `dataset` is dataset.json, `sampling` holds options."""
+    """Content of a model card.
+
+    Attributes:
+        name: Name of the model.
+        version: Version of the model.
+        label: Kind of label that the model is conditioned on.
+        labels: Labels of this kind.
+        trainings: Runs of training.
+        dataset: Content of dataset.json.
+        sampling: Options of sampling.
+        real_split: Split of the real scenes that generated scenes are compared with.
+        scores: Content of metrics.json.
+        checksums: SHA-256 by file name.
+    """
 
     name: str
     version: str
@@ -63,7 +89,7 @@ class ModelCard:
     trainings: Sequence[TrainingRecord]
     dataset: Mapping
     sampling: Mapping
-    real_split: str  # what generated scenes were scored against
+    real_split: str
     scores: Mapping
     checksums: Mapping[str, str]
 
@@ -75,8 +101,9 @@ class ModelCard:
         yield "tags: [3d, urban-scenes, primitives, layout, diffusion]\n---\n"
         yield f"# PrITTI on Ray: {self.name}\n"
         yield (
-            "Layout VAE and diffusion transformer that generate 3D semantic urban scenes of 64 m x 64 m as "
-            f"primitives on a rasterised ground. Version {self.version}, written by `jobs/publish_model.py`.\n"
+            "This model consists of a layout VAE and a diffusion transformer. It generates 3D semantic urban scenes of "
+            "64 m x 64 m, each with primitives and a rasterised ground. "
+            f"`jobs/publish_model.py` wrote this card for version {self.version}.\n"
         )
         yield "```python\nfrom models import PrITTIPipeline\n"
         yield f'pipeline = PrITTIPipeline.from_pretrained("{self.name}")'
@@ -85,19 +112,19 @@ class ModelCard:
             "num_inference_steps=20)\n```\n"
         )
         yield (
-            f"![The first scenes, not chosen](samples.png)\n\n*The first scenes of seed {self.sampling['seed']}, not "
-            f"chosen; labels in turn: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, "
-            f"{self.sampling['num_inference_steps']} steps, guidance {self.sampling['guidance_scale']:g}, the "
-            f"network's noise divided by {self.sampling.get('noise_scaling', 1):g}, primitives of an existence above "
+            f"![First scenes without selection](samples.png)\n\n*First scenes of seed {self.sampling['seed']}, without "
+            f"selection. Labels alternate: {', '.join(self.sampling['labels'])}. Sampler {self.sampling['sampler']}, "
+            f"{self.sampling['num_inference_steps']} steps, guidance scale {self.sampling['guidance_scale']:g}, "
+            f"noise scaling {self.sampling.get('noise_scaling', 1):g}, existence threshold "
             f"{self.sampling.get('existence_threshold', EXISTENCE_THRESHOLD):g}.*\n"
         )
-        yield f"Conditioned on: {self.label} ({', '.join(self.labels)}).\n"
+        yield f"Condition: {self.label} ({', '.join(self.labels)}).\n"
 
     def _training(self) -> Iterator[str]:
         scenes = ", ".join(f"{count:,} {split}" for split, count in sorted(self.dataset["scenes"].items()))
         yield (
-            f"## Data\n\n{self.dataset['source']}, {scenes}. Trained on the train split; scored against the "
-            f"{self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
+            f"## Data\n\nThe dataset is {self.dataset['source']} ({scenes} scenes). The model is trained on the train "
+            f"split and compared with the {self.real_split} split. Options of `jobs/preprocess_scenes.py`:\n"
         )
         yield f"```json\n{json.dumps({k: v for k, v in self.dataset['options'].items() if k != 'input'})}\n```\n"
         for training in self.trainings:
@@ -108,10 +135,10 @@ class ModelCard:
         generation = self.scores["generation"]
         sides = generation["scenes"]
         yield (
-            f"## Scores\n\n{sides['generated']:,} generated scenes against {sides['real']:,} real ones of split "
-            f"{self.real_split}, and the layout VAE's reconstructions of "
-            f"{self.scores['reconstruction']['scenes']:,}. In brackets: 95 % intervals over scenes. `metrics.json` "
-            "has every figure; docs/evaluation.md says what each is.\n"
+            f"## Scores\n\nThe table compares {sides['generated']:,} generated scenes with {sides['real']:,} real "
+            f"scenes of split {self.real_split}. It also scores the layout VAE's reconstructions of "
+            f"{self.scores['reconstruction']['scenes']:,} scenes. Brackets contain 95 % intervals over scenes. "
+            "`metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
         )
         yield from render_table(
             ("score", "value"), ((name, format_value(value)) for name, value in list_headlines(self.scores))
@@ -120,8 +147,8 @@ class ModelCard:
     def _limits(self) -> Iterator[str]:
         validity = self.scores["generation"]["validity"]
         yield (
-            "## Failures\n\n![Those of the generated scenes with most faults](failures.png)\n\n*Those with most "
-            "faults among the first scenes that were scored.*\n"
+            "## Failures\n\n![Generated scenes with the most faults](failures.png)\n\n*Scenes with the most faults "
+            "among the first generated scenes.*\n"
         )
         rows = [
             (VALIDITY[k], *(format_value(v[side]) or "–" for side in ("generated", "real")))
@@ -130,12 +157,12 @@ class ModelCard:
         yield from render_table(("share of", "generated", "real"), rows)
         yield "## Use and limits\n"
         yield (
-            "Meant for research on layouts, for trying the tools, and as a start for training on other data. It "
-            "knows nothing but the data named above: a procedural town is no survey of any real place, and scenes "
-            "must not be taken for one. Nothing here was tested for the safety of vehicles. Repair faults with "
-            "`jobs/edit_scenes.py repair`.\n"
+            "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
+            "training on other data. It is trained on the dataset above only. A procedural town does not represent "
+            "any real place, and neither do the generated scenes. The model is not tested for vehicle safety. "
+            "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
-        yield "Licence: Apache-2.0, weights and code.\n"
+        yield "The licence of weights and code is Apache-2.0.\n"
 
     def _files(self) -> Iterator[str]:
         yield "## SHA-256\n"
@@ -143,7 +170,7 @@ class ModelCard:
 
 
 def render_table(head: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Iterator[str]:
-    """Yield the lines of a Markdown table and an empty line."""
+    """Yield the lines of a Markdown table, and an empty line."""
     yield "| " + " | ".join(head) + " |"
     yield "|" + "---|" * len(head)
     for row in rows:

@@ -14,8 +14,8 @@ from pipelines.reporting.chart import Chart
 from pipelines.reporting.dataset_charts import spell_name
 from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, render_report_html
 
-MIB = 2**20  # the paper's MB
-# Paper, Tab. 1 and 2: KITTI-360, 1,233 test poses, three days of training on an A100.
+MIB = 2**20  # One MB of the paper.
+# Scores of the paper (Tab. 1 and 2): KITTI-360, 1,233 test poses, three days of training on an A100.
 PAPER = {
     "ground_iou": 0.9996,
     "height_mse_normalised": 0.0075,
@@ -26,31 +26,42 @@ PAPER = {
     "MiB": 2.52,
 }
 VARIANTS = {
-    "ranked": ("every proposal", "unlimited"),
-    "ranked_100": ("every proposal", str(MAX_DETECTIONS)),
-    "threshold": (f"above {EXISTENCE_THRESHOLD}", "unlimited"),
-    "threshold_100": (f"above {EXISTENCE_THRESHOLD}", str(MAX_DETECTIONS)),
+    "ranked": ("all", "unlimited"),
+    "ranked_100": ("all", str(MAX_DETECTIONS)),
+    "threshold": (f"existence above {EXISTENCE_THRESHOLD}", "unlimited"),
+    "threshold_100": (f"existence above {EXISTENCE_THRESHOLD}", str(MAX_DETECTIONS)),
 }
 MEMORY = {
-    "rasters": "ground rasters as float32 tensors, in the model's resolution",
-    "vectors": "primitives as float32 tensors, slots padded",
-    "vectors_filled": "primitives without the padding",
-    "tables": "rasters, primitives and the scene's row as Parquet on disk",
-    "latent": "latent mean, float32",
+    "rasters": "ground rasters as float32 tensors at the resolution of the model",
+    "vectors": "primitives as float32 tensors with all slots",
+    "vectors_filled": "primitives as float32 tensors with filled slots only",
+    "tables": "Parquet files on disk: rasters, primitives and the row of the scene",
+    "latent": "latent mean as a float32 tensor",
     "voxels": "256 x 256 x 32 voxels of one byte",
-    "voxels_32_bit": "256 x 256 x 32 voxels of four bytes, as the paper counts SemCity's 8.00 MB",
+    "voxels_32_bit": "256 x 256 x 32 voxels of four bytes, as the paper counts 8.00 MB for SemCity",
 }
 
 
 def render_reconstruction_html(
     scores: Mapping, scenes: pa.Table, best: Sequence[Mapping], worst: Sequence[Mapping], subtitle: str = ""
 ) -> str:
-    """Render the page from a `Reconstruction` and the pictures of its first and last scenes (`draw_scenes`)."""
+    """Render the page.
+
+    Args:
+        scores: Scores of a `Reconstruction`.
+        scenes: Scores of each scene, best first.
+        best: Pictures of the first scenes (`draw_scenes`).
+        worst: Pictures of the last scenes (`draw_scenes`).
+        subtitle: Text below the title.
+
+    Returns:
+        HTML page.
+    """
     sections = [
         make_key_figures(scores),
         *(
             draw_scene_pictures(name, shown, scenes)
-            for name, shown in (("Best scenes", best), ("Worst scenes", worst))
+            for name, shown in (("Best reconstructions", best), ("Worst reconstructions", worst))
             if shown
         ),
         draw_curves(scores, scenes),
@@ -66,9 +77,10 @@ def render_reconstruction_html(
 
 
 def make_key_figures(scores: Mapping) -> KeyFigures:
+    """Make the key figures of the page."""
     voxels, matched = scores["voxels"], scores["matched"]
     return KeyFigures(
-        "In short",
+        "Summary",
         [
             Figure(scores["scenes"], "scenes", "encoded and decoded"),
             Figure(_format_percent(scores["ground_iou"]), "ground IoU"),
@@ -91,7 +103,7 @@ def _format_percent(share: float | None, digits: int = 1) -> str:
 
 
 def draw_scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pictures:
-    """A row per scene: truth and reconstruction from above, then both oblique."""
+    """Make a row per scene: true scene and reconstruction from above, then both in an oblique view."""
     by_id, pictures = {row["scene_id"]: row for row in scenes.to_pylist()}, []
     for drawn in shown:
         row = by_id[drawn["scene_id"]]
@@ -105,7 +117,10 @@ def draw_scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) 
         }
         for name, caption in captions.items():
             pictures.append(Picture(caption, drawn[name], "truth" if name.startswith("truth") else "reconstruction"))
-    note = "By the mIoU of their voxels. The car stands at the bottom edge, looking up."
+    note = (
+        "Scenes are ranked by voxel mIoU. In the views from above, the ego vehicle is at the bottom edge and faces "
+        "upwards."
+    )
     return Pictures(title, pictures, columns=4, note=note)
 
 
@@ -115,7 +130,7 @@ def draw_curves(scores: Mapping, scenes: pa.Table) -> Charts:
             [float(t) for t in scores["detection"][name]["ap3d_at"]],
             list(scores["detection"][name]["ap3d_at"].values()),
         )
-        for name, label in (("ranked", "every proposal"), ("threshold", f"existence above {EXISTENCE_THRESHOLD}"))
+        for name, label in (("ranked", "all proposals"), ("threshold", f"existence above {EXISTENCE_THRESHOLD}"))
     }
     spread = {}
     for name, label in (
@@ -129,10 +144,10 @@ def draw_curves(scores: Mapping, scenes: pa.Table) -> Charts:
             at = np.linspace(0, 100, min(len(values), 101))
             spread[label] = (at.tolist(), np.percentile(values, at).tolist())
     return Charts(
-        "How scores spread",
+        "Score distributions",
         [
             Chart("Average precision by IoU3D threshold", thresholds, "IoU3D", "AP"),
-            Chart("Scenes from worst to best, each score on its own", spread, "percentile of scenes", "score"),
+            Chart("Scores by percentile of scenes, sorted per score", spread, "percentile of scenes", "score"),
         ],
     )
 
@@ -145,23 +160,24 @@ def build_overall_table(scores: Mapping) -> Table:
             "ground IoU",
             scores["ground_iou"],
             PAPER["ground_iou"],
-            "the truth's pixels on which both sides have a class, over those on which either has; all classes together",
+            "pixels that both sides occupy, over pixels that either side occupies, at the resolution of the true "
+            "scene and over all classes together",
         ),
         (
-            "ground IoU on the model's pixels",
+            "ground IoU, model resolution",
             scores["raster_ground_iou"],
             None,
-            f"the truth resampled to the model's rasters of {scores['raster_px']} x {scores['raster_px']}: what "
-            "their resolution costs is left out",
+            f"ground IoU after the true scene is resampled to {scores['raster_px']} x {scores['raster_px']} pixels, "
+            "which excludes the error of this resolution",
         ),
-        ("height RMSE, m", scores["height_rmse_m"], None, "over truly occupied pixels"),
-        ("height MAE, m", scores["height_mae_m"], None, "over truly occupied pixels"),
+        ("height RMSE, m", scores["height_rmse_m"], None, "over pixels that are occupied in the true scene"),
+        ("height MAE, m", scores["height_mae_m"], None, "over pixels that are occupied in the true scene"),
         (
             "height MSE, normalised",
             scores["height_mse_normalised"],
             PAPER["height_mse_normalised"],
-            f"heights scaled to [0, 1] by this model's bounds, {bounds['low']:.2f} to {bounds['high']:.2f} m; the "
-            "paper's bounds are not known",
+            f"heights scaled to [0, 1] by the bounds of this model, {bounds['low']:.2f} to {bounds['high']:.2f} m; the "
+            "paper does not state its bounds",
         ),
         ("AP3D", scores["ap3d"], PAPER["ap3d"], "mean over categories and ten IoU3D thresholds, 0.05 to 0.50"),
         ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at IoU3D 0.50"),
@@ -170,34 +186,34 @@ def build_overall_table(scores: Mapping) -> Table:
             "found",
             matched["found"],
             None,
-            "share of true boxes that overlap the reconstructed one they are matched with",
+            "share of true boxes that are matched with an overlapping reconstructed box",
         ),
         (
             "right",
             matched["right"],
             None,
-            "share of reconstructed boxes that overlap the true one they are matched with",
+            "share of reconstructed boxes that are matched with an overlapping true box",
         ),
-        ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty"),
-        ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over classes, empty left out"),
+        ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty voxels"),
+        ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over classes without the empty class"),
         (
-            "density labels kept",
+            "label fidelity",
             scores["label_fidelity"]["joint_fidelity"],
             None,
-            "share of scenes whose reconstruction has both density labels of the truth: what generated scenes can "
-            "reach",
+            "share of scenes whose reconstruction has both density labels of the true scene, which "
+            "approximately limits the score of generated scenes",
         ),
         (
             "size, MiB",
             (memory["rasters"] + memory["vectors"]) / MIB,
             PAPER["MiB"],
-            f"rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors of one scene, as tensors; "
-            "the paper's rasters have 256 x 256",
+            f"tensors of one scene: rasters of {scores['raster_px']} x {scores['raster_px']} pixels and vectors; the "
+            "rasters of the paper have 256 x 256 pixels",
         ),
     ]
     return Table(
-        "Overall",
-        ("measure", "here", "the paper, KITTI-360"),
+        "Overall scores",
+        ("measure", "this model", "paper, KITTI-360"),
         [row[:3] for row in rows],
         meanings=[row[3] for row in rows],
     )
@@ -208,7 +224,7 @@ def build_category_table(scores: Mapping) -> Table:
     columns = {
         "AP3D": ranked["category_ap3d"],
         "AP3D@50": ranked["category_ap3d_50"],
-        f"AP3D above {EXISTENCE_THRESHOLD}": kept["category_ap3d"],
+        f"AP3D, existence above {EXISTENCE_THRESHOLD}": kept["category_ap3d"],
         "mean IoU3D": matched["category_mean_iou3d"],
         "found": matched["category_found"],
         "right": matched["category_right"],
@@ -220,10 +236,10 @@ def build_category_table(scores: Mapping) -> Table:
         if name in scores["truths"] or name in matched["category_right"]
     ]
     note = (
-        "Ellipsoids have no AP3D, as in the paper; their IoU3D is that of ellipsoids, by sampling, and not part of "
-        "the overall mean."
+        "Ellipsoids have no AP3D, as in the paper. Their IoU3D is computed by sampling and is not part of the overall "
+        "mean."
     )
-    return Table("Categories", ("category", "in truth", *columns), rows, note=note)
+    return Table("Scores by category", ("category", "true primitives", *columns), rows, note=note)
 
 
 def build_ground_class_table(scores: Mapping) -> Table:
@@ -239,7 +255,7 @@ def build_ground_class_table(scores: Mapping) -> Table:
         for name in GROUND_CLASSES
         if name in scores["ground_class_iou"]
     ]
-    return Table("Ground", ("class", *columns), rows)
+    return Table("Scores by ground class", ("ground class", *columns), rows)
 
 
 def build_detection_table(scores: Mapping) -> Table:
@@ -248,9 +264,11 @@ def build_detection_table(scores: Mapping) -> Table:
         for name, words in VARIANTS.items()
     ]
     note = (
-        "Omni3D's protocol takes at most 100 detections per scene and category. The paper does not say what it takes."
+        "The protocol of Omni3D uses at most 100 detections per scene and category. The paper does not state which "
+        "proposals count as detections."
     )
-    return Table("AP3D by what counts as a detection", ("proposals", "at most", "AP3D", "AP3D@50"), rows, note=note)
+    columns = ("proposals", "detections per scene and category", "AP3D", "AP3D@50")
+    return Table("AP3D by choice of detections", columns, rows, note=note)
 
 
 def describe_voxel_range(scores: Mapping) -> Table:
@@ -260,35 +278,37 @@ def describe_voxel_range(scores: Mapping) -> Table:
     for name, partly in voxels["category_partly_outside"].items():
         rows.append((spell_name(name), partly, voxels["category_outside"][name]))
     note = (
-        f"Voxels reach from {voxels['bottom_m']:g} to {voxels['top_m']:g} m. Shares of the true scenes that lie "
-        "beyond and do not count."
+        f"The voxel grid extends from {voxels['bottom_m']:g} to {voxels['top_m']:g} m in height. The table shows the "
+        "shares of the true scenes outside this range, which voxel scores ignore."
     )
-    return Table("What the voxels leave out", ("of", "partly outside", "wholly outside"), rows, note=note)
+    columns = ("content", "partly outside", "completely outside")
+    return Table("Content outside the voxel grid", columns, rows, note=note)
 
 
 def build_memory_table(scores: Mapping) -> Table:
     found = scores["memory_bytes"]
     rows = [(name.replace("_", " "), round(found[name]), found[name] / MIB) for name in MEMORY]
-    note = "Mean per scene. The paper gives 2.50 MB for rasters and 0.02 MB for primitives, in units of 2^20 bytes."
-    return Table("Memory", ("form", "bytes", "MiB"), rows, meanings=list(MEMORY.values()), note=note)
+    note = (
+        "The values are means per scene. The paper states 2.50 MB for rasters and 0.02 MB for primitives, where 1 MB "
+        "is 2^20 bytes."
+    )
+    return Table("Memory", ("representation", "bytes", "MiB"), rows, meanings=list(MEMORY.values()), note=note)
 
 
 def list_definitions(scores: Mapping) -> Text:
     return Text(
-        "What is measured",
+        "Definitions",
         [
-            "Scenes are decoded from the mean of their latent, without noise, and compared on the truth's own pixels. "
-            "Every true primitive counts, those too that the tensors had no slot for.",
-            "AP3D: proposals of all scenes ranked by existence, greedily given the free truth of their scene and "
-            "category "
-            "that they overlap most, 101 recall points. IoU3D of boxes is exact.",
-            "Mean IoU3D: within a scene and category, reconstructed primitives above the existence threshold and "
-            "true ones "
-            "are matched one to one such that the sum of their IoU3D is greatest; pairs that do not overlap are no "
-            "pairs.",
-            "Voxels: a primitive fills a voxel whose centre lies in it, the finer category wins, and ground is the "
-            "voxel that "
-            "the highest surface passes through. One confusion matrix over all scenes; a class on neither side does "
-            "not count.",
+            "Scenes: The decoder receives the mean of the latent, without noise. Reconstructions are compared at the "
+            "resolution of the true scene. All true primitives count, including those without a slot in the tensors.",
+            "AP3D: The proposals of all scenes are ranked by existence probability. Each proposal is matched greedily "
+            "with the unmatched true primitive of its scene and category that has the highest IoU3D. The average "
+            "precision uses 101 recall points. The IoU3D of boxes is exact.",
+            "Mean IoU3D: Reconstructed primitives above the existence threshold are matched one-to-one with true "
+            "primitives of the same scene and category. The matching maximises the sum of IoU3D. Primitives that do "
+            "not overlap are not a pair.",
+            "Voxels: A primitive fills each voxel whose centre lies inside the primitive. If primitives overlap, the "
+            "finer category has priority. Ground fills the voxel that its highest surface crosses. One confusion "
+            "matrix covers all scenes, and a class that occurs on neither side does not count.",
         ],
     )

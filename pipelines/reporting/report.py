@@ -1,7 +1,7 @@
-"""A run as one self-contained HTML page: text, key figures, pictures, charts and tables.
+"""Render a report as one self-contained HTML page: text, key figures, pictures, charts and tables.
 
-No script and nothing fetched: style, charts and pictures are inside, so the file can be mailed, archived and
-opened anywhere. Everything that comes from outside is escaped.
+The page contains its style, charts and pictures, and it needs no script and no download. The file can be mailed,
+archived and opened offline. All text from outside is escaped.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Text:
 
 
 class Figure(NamedTuple):
-    """One large number with what it is, and a remark."""
+    """One large number with its label and a remark."""
 
     value: Cell
     label: str
@@ -51,7 +51,13 @@ class KeyFigures:
 
 
 class Picture(NamedTuple):
-    """image (H, W, 3) uint8; `tag` is a short word on the picture, such as "real" or "generated"."""
+    """An image with its caption.
+
+    Attributes:
+        caption: Text below the image.
+        image: (H, W, 3) uint8.
+        tag: Short word on the image, such as "real" or "generated".
+    """
 
     caption: str
     image: np.ndarray
@@ -60,7 +66,14 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """A grid of pictures: `columns` of them side by side (fewer on a narrow screen), or as many as fit."""
+    """A grid of pictures.
+
+    Attributes:
+        title: Heading.
+        pictures: Pictures in reading order.
+        columns: Pictures per row, fewer on a narrow screen; None fills the row.
+        note: Text above the pictures.
+    """
 
     title: str
     pictures: Sequence[Picture]
@@ -70,7 +83,7 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """Line charts side by side."""
+    """Line charts next to each other."""
 
     title: str
     charts: Sequence[Chart]
@@ -79,9 +92,16 @@ class Charts:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under column names; `meanings`, one per row, say in words what the row's numbers mean.
+    """Rows of cells under column names.
 
-    Numbers are written short and set to the right, booleans as a tick or a cross, None as a dash.
+    Numbers are shortened and right-aligned. Booleans are a tick or a cross, and None is a dash.
+
+    Attributes:
+        title: Heading.
+        columns: Column names.
+        rows: Cells of each row.
+        meanings: Explanation of each row, if any.
+        note: Text above the table.
     """
 
     title: str
@@ -103,7 +123,7 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
 
 
 def render_report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
-    """The whole page. Raises ValueError if a table's rows, or its meanings, do not fit its columns."""
+    """Render the whole page. Raises ValueError if the rows or meanings of a table do not fit its columns."""
     anchors = [f"{index}-{re.sub('[^a-z0-9]+', '-', s.title.lower())}" for index, s in enumerate(sections, 1)]
     links = [f'<a href="#{a}">{escape(s.title)}</a>' for a, s in zip(anchors, sections, strict=True)]
     bodies = [
@@ -165,7 +185,7 @@ def _render_picture(picture: Picture) -> str:
 
 
 def encode_data_uri(image: np.ndarray) -> str:
-    """(H, W, 3) uint8 as a data URI: exact PNG for up to 256 colours, WebP for pictures with shading."""
+    """Encode an image (H, W, 3) uint8 as a data URI: exact PNG for up to 256 colours, otherwise lossy WebP."""
     picture, file = Image.fromarray(image), io.BytesIO()
     flat = picture.getcolors(256) is not None
     if flat:
@@ -187,11 +207,11 @@ def _render_table(table: Table) -> str:
     rows = []
     for row, meaning in zip(table.rows, meanings, strict=True):
         if len(row) != len(table.columns):
-            raise ValueError(f"table {table.title!r} has {len(table.columns)} columns, a row has {len(row)} cells")
+            raise ValueError(f"table {table.title!r} has {len(table.columns)} columns, but a row has {len(row)} cells")
         last = "" if meaning is None else f'<td class="meaning">{escape(meaning)}</td>'
         rows.append(f"<tr>{''.join(map(_render_cell, row))}{last}</tr>")
     numeric = [all(not isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
-    head = "".join(map(_render_head, table.columns, numeric)) + ("<th>what it means</th>" if table.meanings else "")
+    head = "".join(map(_render_head, table.columns, numeric)) + ("<th>meaning</th>" if table.meanings else "")
     body = f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
     return f'<div class="scroll"><table>{body}</table></div>'
 
@@ -209,7 +229,7 @@ def _render_cell(value: Cell) -> str:
 
 
 def format_cell(value: Cell) -> str:
-    """A cell as people read it."""
+    """Format a cell for display."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool):

@@ -1,4 +1,4 @@
-"""Every scene of a dataset directory by its place in the tables, sorted and selected."""
+"""Index the scenes of a dataset directory by their place in the tables; select and sort them."""
 
 from __future__ import annotations
 
@@ -20,17 +20,37 @@ SORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """The scenes of a dataset directory, or of one source or split: their rows of the scenes table and their places."""
+    """Scenes of a dataset directory, or of one source or split.
+
+    Attributes:
+        root: Dataset directory.
+        scenes: Rows of the scenes table without world_from_imu, with source and split.
+        shards: Shards of the scenes.
+        shard: (n,) index of each scene's shard.
+        row: (n,) row of each scene in its shard.
+    """
 
     root: str
-    scenes: pa.Table  # n rows: the scenes table without world_from_imu, with source and split
+    scenes: pa.Table
     shards: tuple[Shard, ...]
-    shard: np.ndarray  # (n,) index into shards
-    row: np.ndarray  # (n,) row in that shard
+    shard: np.ndarray
+    row: np.ndarray
 
     @classmethod
     def read(cls, root: str, source: str | None = None, split: str | None = None) -> Catalogue:
-        """Raises ValueError if there is no such scene."""
+        """Read the scenes tables of a dataset directory.
+
+        Args:
+            root: Dataset directory.
+            source: Source to read; None reads all.
+            split: Split to read; None reads all.
+
+        Returns:
+            Catalogue of all scenes.
+
+        Raises:
+            ValueError: There is no such scene.
+        """
         shards = find_shards(root, "scenes", source, split)
         columns = [name for name in SCENES.names if name != "world_from_imu"]
         tables = []
@@ -41,7 +61,7 @@ class Catalogue:
             tables.append(table)
         lengths = [len(table) for table in tables]
         if sum(lengths) == 0:
-            raise ValueError(f"{root}: its scenes tables are empty; run the job that wrote them again")
+            raise ValueError(f"{root}: the scenes tables are empty; run the job that wrote them again")
         return cls(
             root=root,
             scenes=pa.concat_tables(tables),
@@ -54,32 +74,45 @@ class Catalogue:
         return len(self.scenes)
 
     def column(self, name: str) -> np.ndarray:
-        """(n,) a column: numbers with NaN for null, strings as objects."""
+        """Return a column (n,): numbers with NaN for null, or strings as objects."""
         return self.scenes[name].to_numpy()
 
     def find(self, scene_ids: Sequence[str]) -> np.ndarray:
-        """Indices of scenes by id. Raises ValueError for an id that is not there, with some that are."""
+        """Return the indices of scenes.
+
+        Args:
+            scene_ids: Scene ids.
+
+        Returns:
+            (k,) indices.
+
+        Raises:
+            ValueError: A scene does not exist. The message names some existing scenes.
+        """
         known = self.scenes["scene_id"].to_pylist()
         index = {scene_id: k for k, scene_id in enumerate(known)}
         for wanted in scene_ids:
             if wanted not in index:
                 alike = [name for name in known if wanted in name][:3]
                 some = alike or [known[k] for k in self.spread(np.arange(len(known)), 3)]
-                raise ValueError(f"{self.root}: no scene {wanted!r} among {len(known)}; there are: {', '.join(some)}")
+                raise ValueError(
+                    f"{self.root}: no scene {wanted!r} among {len(known)} scenes; existing scenes include"
+                    f" {', '.join(some)}"
+                )
         return np.array([index[wanted] for wanted in scene_ids], int)
 
     @staticmethod
     def spread(order: np.ndarray, count: int) -> np.ndarray:
-        """At most `count` entries of `order`, evenly spread."""
+        """Return at most `count` evenly spaced entries of `order`."""
         count = min(count, len(order))
         return order[np.floor((np.arange(count) + 0.5) * len(order) / max(count, 1)).astype(int)]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
-        """Indices of at most `count` scenes at random, none twice."""
+        """Return the indices of at most `count` random scenes without repetition."""
         return np.random.default_rng(seed).permutation(len(self))[:count]
 
     def sort_column(self, sort: str) -> str:
-        """The column that `sort` names. Raises ValueError if it names none."""
+        """Return the column for an order. Raises ValueError if there is no such column."""
         column = SORTS.get(sort, sort)
         if column not in SCENES.names or not pa.types.is_primitive(SCENES.field(column).type):
             raise ValueError(
@@ -89,10 +122,20 @@ class Catalogue:
         return column
 
     def choose(self, count: int, sort: str, pick: str = "uniform", seed: int = 0) -> np.ndarray:
-        """Indices of at most `count` scenes in the order of `sort`.
+        """Choose scenes in an order.
 
-        `pick` is uniform (evenly from least to most), lowest or highest; `sort` is random, drive (sequence and
-        frame) or what `sort_column` knows. Scenes without a value are left out.
+        Args:
+            count: Maximum number of scenes.
+            sort: random, drive (by sequence and frame) or an order that `sort_column` accepts. Scenes without a value
+                in the column are skipped.
+            pick: uniform (evenly from lowest to highest), lowest or highest.
+            seed: Seed of the random order.
+
+        Returns:
+            Indices of the scenes.
+
+        Raises:
+            ValueError: There is no such column, or no scene has a value in it.
         """
         if sort == "random":
             return self.draw(count, seed)
@@ -103,13 +146,13 @@ class Catalogue:
             values = self.column(self.sort_column(sort)).astype(float)
             order = np.argsort(values, kind="stable")[: np.isfinite(values).sum()]
             if len(order) == 0:
-                raise ValueError(f"--sort {sort}: no scene of {self.root} has a value there")
+                raise ValueError(f"--sort {sort}: no scene of {self.root} has a value in this column")
         if pick == "uniform":
             return self.spread(order, count)
         return order[:count] if pick == "lowest" else order[::-1][:count]
 
     def chunks(self, indices: np.ndarray, size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
-        """Yield chunks of at most `size` scenes at `indices` from one shard: shard, rows in it, places in `indices`."""
+        """Yield chunks of at most `size` scenes from one shard: shard, rows in the shard, and places in `indices`."""
         for shard in np.unique(self.shard[indices]):
             places = np.flatnonzero(self.shard[indices] == shard)
             for start in range(0, len(places), size):

@@ -59,6 +59,6 @@ def test_reconstruction_page_shows_truth_and_reconstruction(reconstruction_datas
     html = render_reconstruction_html(reconstruction.scores, reconstruction.scenes, drawn[:1], drawn[1:])
     counts = html.count("<img"), html.count('src="data:image/'), html.count("http")
     assert counts == (8, 8, 0)  # the page has no external links
-    wanted = ("AP3D@50", "voxel mIoU", "Memory", "What the voxels leave out", "vegetation ellipsoid")
+    wanted = ("AP3D@50", "voxel mIoU", "Memory", "Content outside the voxel grid", "vegetation ellipsoid")
     missing = [words for words in (*wanted, *(row["scene_id"] for row in drawn)) if words not in html]
     assert not missing

@@ -57,13 +57,13 @@ def test_catalogue_finds_scene_by_id(town_dataset):
 
 def test_catalogue_suggests_ids_for_unknown_id(town_dataset):
     catalogue = Catalogue.read(town_dataset)
-    with pytest.raises(ValueError, match=r"no scene 'town-9' among 12; there are: ") as error:
+    with pytest.raises(ValueError, match=r"no scene 'town-9' among 12 scenes; existing scenes include ") as error:
         catalogue.find(["town-9"])
-    named = str(error.value).split("there are: ")[1].split(", ")
+    named = str(error.value).split("scenes include ")[1].split(", ")
     assert len(named) == 3 and set(named) <= set(catalogue.column("scene_id"))
     with pytest.raises(ValueError, match="there are: ") as error:
         catalogue.find(["town-1000000"])
-    assert all("town-1000000" in name for name in str(error.value).split("there are: ")[1].split(", "))
+    assert all("town-1000000" in name for name in str(error.value).split("scenes include ")[1].split(", "))
 
 
 @pytest.mark.parametrize("sort, column", [("vegetation", "vegetation_volume_m3"), ("num_pole", "num_pole")])
@@ -86,7 +86,7 @@ def test_catalogue_chooses_scenes_evenly_or_randomly(town_dataset):
     assert not np.array_equal(drawn, catalogue.draw(5, 2))
     with pytest.raises(ValueError, match="--sort scene_id: expected drive, random, vegetation"):
         catalogue.choose(3, "scene_id")
-    with pytest.raises(ValueError, match=r"no scene of .* has a value there"):
+    with pytest.raises(ValueError, match=r"no scene of .* has a value in this column"):
         catalogue.choose(3, "crossing_area_m2")
 
 
@@ -256,7 +256,7 @@ def test_dataset_page_works_without_dataset_json(generated, tmp_path):
     path = write_dataset_report(Report(dataset=generated, num_examples=0, output=str(tmp_path / "page.html")))
     page = SvgPage(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
-    for absent in ("p95", "slots", "Split map", "Label thresholds", "Rejected"):
+    for absent in ("p95", "slots", "Split map", "Thresholds of density labels", "Rejected"):
         assert absent not in page.text
     cells = re.findall(r"<title>(\w+), (\w+): (\d+) scenes</title>", Path(path).read_text("utf-8"))
     assert ("low", "none", "4") in cells and len(cells) == 12

@@ -81,7 +81,7 @@ def test_write_report_is_atomic(tmp_path, sections):
 
 
 def test_report_rejects_table_of_wrong_shape():
-    with pytest.raises(ValueError, match="2 columns, a row has 1"):
+    with pytest.raises(ValueError, match="2 columns, but a row has 1"):
         render_report_html("Demo", [Table("T", ["a", "b"], [["x"]])])
     with pytest.raises(ValueError, match="1 rows and 2 meanings"):
         render_report_html("Demo", [Table("T", ["a"], [["x"]], ["one", "two"])])
@@ -109,7 +109,7 @@ def test_chart_omits_undrawable_values():
     for series in ({}, {"a": ([], [])}, {"a": ([1.0], [np.inf])}):
         assert "no data" in draw_chart_svg(Chart("c", series))
     assert "<circle" in draw_chart_svg(Chart("c", {"a": ([3], [4])}))
-    with pytest.raises(ValueError, match="2 x values and 1 y values"):
+    with pytest.raises(ValueError, match="2 x values but 1 y values"):
         draw_chart_svg(Chart("c", {"a": ([1, 2], [1])}))
 
 
