@@ -1,4 +1,4 @@
-"""The studio's HTTP interface: its page, the operations of a session, downloads, and who may ask for them."""
+"""HTTP interface of the studio: its page, the operations of a session, downloads and access control."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipelines.io.opendrive import export_opendrive
 from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRegionRequest, OpenRequest
 from pipelines.studio.session import Session, Studio, StudioBusyError
 
-MAX_BODY_BYTES = 256 * 1024  # of a request
+MAX_BODY_BYTES = 256 * 1024  # Maximum size of a request.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PAGE_FILES = {
     "/": ("studio.html", "text/html"),
@@ -31,10 +31,13 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
     """Build the HTTP interface.
 
     Args:
-        studio: Returns the one Studio.
-        token: Token that every request must send, the first one as ?token=; "" for none.
-        hosts: Host names that requests may use. Others are refused, so that a foreign page cannot reach the studio
-            through its own host name.
+        studio: Returns the studio, which all requests share.
+        token: Token that each request must send, the first request as ?token=; "" for none.
+        hosts: Host names that requests may use. Requests with other host names are refused, because a foreign page
+            could otherwise reach the studio through its own host name.
+
+    Returns:
+        FastAPI application.
     """
     app = FastAPI(title="PrITTI studio", docs_url=None, redoc_url=None, openapi_url=None)
     add_access_control(app, token, hosts)
@@ -48,20 +51,21 @@ def refuse(request: Request, token: str, hosts: tuple[str, ...]) -> Response | N
     host = urlsplit(f"//{request.headers.get('host', '')}").hostname
     if hosts and host not in hosts:
         return Response("unknown host", 421)
+    # Pages of other origins cannot set a custom header.
     if request.method not in ("GET", "HEAD") and request.headers.get("x-studio") != "1":
-        return Response("not from the studio's page", 403)  # other pages cannot set a custom header
+        return Response("the request does not come from the page of the studio", 403)
     chunked = "chunked" in request.headers.get("transfer-encoding", "")
     if chunked or int(request.headers.get("content-length") or 0) > MAX_BODY_BYTES:
         return Response("the request is too large", 413)
     if token:
         sent = request.query_params.get("token") or request.cookies.get("studio_token") or ""
         if not hmac.compare_digest(sent.encode(), token.encode()):
-            return Response("a token is needed: open the address that jobs/serve_studio.py printed", 401)
+            return Response("a token is needed; open the address that jobs/serve_studio.py printed", 401)
     return None
 
 
 def add_access_control(app: FastAPI, token: str, hosts: tuple[str, ...]) -> None:
-    """Refuse foreign requests; give every visitor a cookie."""
+    """Refuse requests from other origins, and give each visitor a cookie."""
 
     @app.middleware("http")
     async def guard(request: Request, call_next):
@@ -81,6 +85,7 @@ def add_access_control(app: FastAPI, token: str, hosts: tuple[str, ...]) -> None
 
 
 def serve_file(name: str, media_type: str) -> Callable[[], Response]:
+    """Return a route function that serves a file of pipelines/web."""
     content = files("pipelines").joinpath("web", name).read_bytes()
 
     def respond() -> Response:
@@ -107,13 +112,13 @@ def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
 
 
 def make_session_router(studio: Callable[[], Studio]) -> APIRouter:
-    """Return the routes of a visitor's session. Every operation returns the session's new state."""
+    """Return the routes of a visitor's session. Each operation returns the new state of the session."""
     router = APIRouter()
 
     def open_session(request: Request) -> Session:
         visitor = request.cookies.get("studio")
         if not visitor or len(visitor) > 64:
-            raise HTTPException(400, "no cookie; open the studio's page first")
+            raise HTTPException(400, "the request has no cookie; open the page of the studio first")
         return studio().open_session(visitor)
 
     def apply(request: Request, operation: Callable[[Session], None], busy_status: int = 409) -> dict:

@@ -1,4 +1,4 @@
-"""What a visitor of the studio can ask for, with the limits of every value."""
+"""Types of the requests to the studio, with the limits of all values."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from models.sampling.repaint import RePaintConfig
 
 
 class StudioRequest(BaseModel):
+    """Base of all requests; unknown fields are errors."""
+
     model_config = ConfigDict(extra="forbid")
 
 
@@ -20,7 +22,7 @@ class OpenRequest(StudioRequest):
 
 
 class SamplingRequest(StudioRequest):
-    label: str = Field("", max_length=40)  # "": the label of the scene, or the model's first
+    label: str = Field("", max_length=40)  # "" means the label of the scene, or else the first label of the model.
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
 

@@ -1,4 +1,4 @@
-"""The studio as a Ray Serve application: one replica, which holds the model and every visitor's session."""
+"""Serve the studio with Ray Serve: one replica holds the model and the sessions of all visitors."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ray.serve import Application
 from pipelines.studio.api import build_studio_app
 from pipelines.studio.session import Studio
 
-REQUESTS = 32  # concurrent requests; as many more may wait; further ones are refused
+REQUESTS = 32  # Maximum number of concurrent requests, and of waiting requests; others are refused.
 
 
 def make_deployment(
     model: str, datasets: list[str], token: str, hosts: tuple[str, ...], threads: int | None
 ) -> Application:
-    """The application for ray.serve.run. The studio is loaded when the replica starts."""
+    """Return the application for ray.serve.run. The replica loads the model when it starts."""
 
     def app() -> FastAPI:
         import torch

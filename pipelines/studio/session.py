@@ -1,6 +1,7 @@
-"""The studio without HTTP: each visitor generates, edits, inpaints and extends one scene, and can undo every step.
+"""Sessions of the studio, without HTTP.
 
-Long operations run in a thread, one at a time over all visitors, report their progress and can be cancelled.
+A visitor generates, edits, inpaints and extends one scene, and can undo each step.
+Long operations run in a thread, one at a time over all visitors. They report their progress and can be cancelled.
 """
 
 from __future__ import annotations
@@ -31,49 +32,67 @@ from pipelines.studio.requests import (
 )
 
 MAX_SESSIONS, MAX_HISTORY, MAX_WAITING = 16, 50, 4
-MAX_SIDE_M = 512.0  # maximum side length of an extended scene
+MAX_SIDE_M = 512.0  # Maximum side length of an extended scene.
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
 
 
 class Cancelled(Exception):
-    """The visitor has cancelled the task."""
+    """Raised when the visitor cancels a task."""
 
 
 class StudioBusyError(RuntimeError):
-    """The visitor already has a running task, or too many tasks are waiting."""
+    """Raised if the visitor already has a running task, or if too many tasks are waiting."""
 
 
 @dataclass
 class BackgroundTask:
-    """A sampling run in a thread, and its progress."""
+    """A sampling run in a thread, with its progress.
+
+    Attributes:
+        name: Name of the operation.
+        total: Number of network evaluations.
+        done: Number of finished network evaluations.
+        error: Error message, or "".
+        cancelled: Whether the visitor has cancelled the task.
+        finished: Whether the thread has ended.
+    """
 
     name: str
-    total: int  # evaluations of the network
+    total: int
     done: int = 0
     error: str = ""
     cancelled: bool = False
     finished: bool = False
 
     def step(self, pipeline: PrITTIPipeline, number: int, timestep: int, values: dict) -> dict:
-        """What the sampler calls after each step."""
+        """Count one step of the sampler. The sampler calls this function after each step."""
         if self.cancelled:
             raise Cancelled
         self.done += 1
         return values
 
     def state(self) -> dict:
+        """Return the state as plain values."""
         names = ("name", "total", "done", "error", "cancelled", "finished")
         return {name: getattr(self, name) for name in names}
 
 
 @dataclass
 class Session:
-    """A visitor's scene, its earlier states, and those that were undone."""
+    """A visitor's scene with its earlier states and its undone states.
+
+    Attributes:
+        scene: Current scene.
+        past: Earlier states: name of the following operation, scene and edits.
+        future: Undone states.
+        edits: Edits after the scene was opened or generated.
+        task: Last task.
+    """
 
     scene: Scene | None = None
     past: list[tuple[str, Scene | None, list]] = field(default_factory=list)
     future: list[tuple[str, Scene | None, list]] = field(default_factory=list)
-    edits: list = field(default_factory=list)  # since the scene was opened or generated
+    edits: list = field(default_factory=list)
     task: BackgroundTask | None = None
 
     def put(self, name: str, scene: Scene, edits: list) -> None:
@@ -82,30 +101,33 @@ class Session:
         self.scene, self.edits, self.future = scene, edits, []
 
     def undo(self) -> None:
+        """Restore the state before the last operation."""
         if self.past:
             name, scene, edits = self.past.pop()
             self.future.append((name, self.scene, self.edits))
             self.scene, self.edits = scene, edits
 
     def redo(self) -> None:
+        """Restore the last undone state."""
         if self.future:
             name, scene, edits = self.future.pop()
             self.past.append((name, self.scene, self.edits))
             self.scene, self.edits = scene, edits
 
     def require_scene(self) -> Scene:
+        """Return the current scene. Raises ValueError if no scene is open."""
         if self.scene is None:
             raise ValueError("no scene is open; open or generate one first")
         return self.scene
 
     def require_idle(self) -> Session:
-        """Raises StudioBusyError while the visitor's task runs."""
+        """Return the session. Raises StudioBusyError if a task of the visitor is running."""
         if self.task and not self.task.finished:
             raise StudioBusyError(f"{self.task.name} is still running; wait for it or cancel it")
         return self
 
     def state(self) -> dict:
-        """What the page shows."""
+        """Return the values that the page shows."""
         return {
             "scene": None
             if self.scene is None
@@ -118,10 +140,14 @@ class Session:
 
 
 class Studio:
-    """Sessions of all visitors, the datasets to open scenes from, and the model."""
+    """The model, the sessions of all visitors, and the datasets from which scenes can be opened."""
 
     def __init__(self, model: str, datasets: list[str]) -> None:
-        """Raises ValueError for a directory without a model, or a dataset without scenes."""
+        """Load the model and read the datasets.
+
+        Raises:
+            ValueError: A directory holds no model, or a dataset holds no scenes.
+        """
         self.pipeline = load_pipeline(model)
         self.default_scheduler = self.pipeline.scheduler_config
         self.catalogues = [Catalogue.read(root) for root in datasets]
@@ -129,7 +155,7 @@ class Studio:
         self.sampling, self.num_waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
     def open_session(self, visitor: str) -> Session:
-        """Return the visitor's session. Of more than MAX_SESSIONS, drop the least recently used idle one."""
+        """Return the visitor's session. Above MAX_SESSIONS, the least recently used idle session is deleted."""
         with self.lock:
             session = self.sessions.pop(visitor, None) or Session()
             self.sessions[visitor] = session
@@ -142,9 +168,11 @@ class Studio:
 
     @property
     def labels(self) -> tuple[str, ...]:
+        """Return the labels of the model."""
         return LABELS[self.pipeline.dit.config.label]
 
     def choose_label(self, request: SamplingRequest, scene: Scene | None) -> str:
+        """Return the requested label, the label of the scene, or the first label of the model."""
         kind = self.pipeline.dit.config.label
         if request.label:
             require_labels(kind, [request.label])
@@ -158,7 +186,7 @@ class Studio:
         """Run `make` in a thread and put its scene into the session.
 
         Raises:
-            StudioBusyError: The visitor has a task already, or too many others wait.
+            StudioBusyError: The visitor already has a running task, or too many tasks are waiting.
         """
         with self.lock:
             session.require_idle()
@@ -185,6 +213,7 @@ class Studio:
         threading.Thread(target=run, daemon=True).start()
 
     def generate(self, session: Session, request: GenerateRequest) -> None:
+        """Start the generation of a scene."""
         label = self.choose_label(request, None)
 
         def make(task: BackgroundTask) -> Scene:
@@ -203,10 +232,11 @@ class Studio:
         self.start_task(session, f"generate {label}, seed {request.seed}", request.steps, make)
 
     def inpaint(self, session: Session, request: InpaintRegionRequest) -> None:
+        """Start to regenerate a region of the scene. Raises ValueError if the region contains no pixel of the scene."""
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         region = select_polygon(scene.grid, request.polygon_m)
         if not region.any():
-            raise ValueError("the region holds no pixel of the scene; draw a larger region inside the scene")
+            raise ValueError("the region contains no pixel of the scene; draw a larger region inside the scene")
         label, repaint = self.choose_label(request, scene), request.repaint()
         blocks = len(split_region(self.pipeline, scene, region))
 
@@ -227,6 +257,7 @@ class Studio:
         self.start_task(session, f"inpaint {request.contents}", blocks * repaint.num_evaluations, make)
 
     def extend(self, session: Session, request: ExtendRequest) -> None:
+        """Start to extend the scene on one side. Raises ValueError if the scene already has the maximum size."""
         small = self.pipeline.spec.grid
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         rows, cols = scene.grid.rows, scene.grid.cols
@@ -244,10 +275,11 @@ class Studio:
         self.start_task(session, f"extend {request.side}", blocks * repaint.num_evaluations, make)
 
     def edit(self, session: Session, request: EditsRequest) -> None:
+        """Apply edits to the scene. Raises ValueError for an invalid edit and for SQL."""
         edits = parse_edits(request.edits)
         if any(edit.select.where for edit in edits):
             raise ValueError(
-                "the studio takes no SQL; select by number, category or polygon, or use jobs/edit_scenes.py"
+                "the studio accepts no SQL; select by number, category or polygon, or use jobs/edit_scenes.py"
             )
         for edit in edits:
             edit.check()
@@ -255,6 +287,7 @@ class Studio:
         session.put(", ".join(edit.name for edit in edits), scene, [*session.edits, *edits])
 
     def open_scene(self, session: Session, scene_id: str) -> None:
+        """Open a scene of a dataset. Raises ValueError if there is no such scene."""
         for catalogue in self.catalogues:
             if scene_id in catalogue.scenes["scene_id"].to_pylist():
                 session.put(f"open {scene_id}", read_scene(catalogue, catalogue.find([scene_id])[0]), [])
@@ -262,7 +295,7 @@ class Studio:
         raise ValueError(f"no scene {scene_id!r} in the datasets")
 
     def list_scenes(self, start: int, text: str) -> dict:
-        """A page of the scenes whose id contains `text`: ids, labels, thumbnails."""
+        """Return one page of the scenes whose id contains `text`: ids, labels and thumbnails."""
         found = []
         for catalogue in self.catalogues:
             rows = catalogue.scenes.select(["scene_id", "vegetation_density", "num_primitives"]).to_pylist()
@@ -273,10 +306,11 @@ class Studio:
 
 
 def read_scene(catalogue: Catalogue, index: int) -> Scene:
+    """Read one scene of a catalogue."""
     return catalogue.shards[catalogue.shard[index]].scenes([int(catalogue.row[index])])[0]
 
 
 @lru_cache(maxsize=512)
 def draw_thumbnail(catalogue: Catalogue, index: int) -> str:
-    """A data URI."""
+    """Return a thumbnail of a scene as a data URI."""
     return encode_data_uri(render_bev(read_scene(catalogue, index), THUMBNAIL_PX))

@@ -1,4 +1,5 @@
-// The gallery page: cards that filters and an order choose from; one scene at a time in 3D. Data: pipelines/reporting/gallery_page.py.
+// The gallery page shows cards of scenes with filters and an order, and one scene at a time in 3D.
+// pipelines/reporting/gallery_page.py writes its data.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
@@ -27,7 +28,7 @@ $("clear").onclick = () => {
 };
 
 const cards = data.scenes.map((scene, index) => {
-  const card = element("button", { className: "card", title: "show in 3D" });
+  const card = element("button", { className: "card", title: "show the scene in 3D" });
   card.append(element("img", { src: scene.picture, alt: scene.values.scene_id, loading: "lazy" }), element("span", { textContent: scene.values.scene_id }));
   card.append(element("small", { textContent: data.captions.map((name) => scene.values[name]).filter((value) => value !== null).join(" · ") }));
   card.onclick = () => open(index);
@@ -60,7 +61,7 @@ async function open(index) {
   const bytes = Uint8Array.from(atob(scene.packed), (letter) => letter.charCodeAt(0));
   const content = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).json();
   if (shown !== index) return;
-  $("picked").textContent = "Drag to turn, right drag to move, wheel to go nearer; click an object to know it.";
+  $("picked").textContent = "Click an object to see its values. Drag to rotate the view. Drag with the right button to move the view. Turn the wheel to zoom.";
   viewer ??= new Viewer($("view"));
   viewer.onpick = (number) => {
     viewer.choose(number);

@@ -1,4 +1,4 @@
-// The studio's page. What can be asked of the server: pipelines/studio/session.py.
+// The page of the studio. pipelines/studio/api.py lists the requests that the server accepts.
 import { Viewer } from "/viewer.js";
 
 const $ = (id) => document.getElementById(id);
@@ -10,7 +10,7 @@ async function ask(path, body) {
   const response = await fetch(path, options);
   if (!response.ok) {
     let reason = await response.text();
-    try { const detail = JSON.parse(reason).detail; reason = typeof detail === "string" ? detail : detail.map((d) => `${d.loc.at(-1)}: ${d.msg}`).join("; "); } catch { /* plain text */ }
+    try { const detail = JSON.parse(reason).detail; reason = typeof detail === "string" ? detail : detail.map((d) => `${d.loc.at(-1)}: ${d.msg}`).join("; "); } catch { /* The reason is plain text. */ }
     throw new Error(reason);
   }
   return response.json();
@@ -18,7 +18,7 @@ async function ask(path, body) {
 
 function say(text, wrong = false) { $("said").textContent = text; $("said").classList.toggle("wrong", wrong); }
 
-// Asks, shows the new state, and says what went wrong.
+// Sends a request, then shows the new state or the error.
 async function act(path, body, keep = false) {
   try { say(""); await show(await ask(path, body), keep); } catch (error) { say(error.message, true); }
 }
@@ -28,7 +28,7 @@ async function show(state, keep = false) {
   $("undo").disabled = !state.undo; $("undo").title = state.undo ?? "";
   $("redo").disabled = !state.redo; $("redo").title = state.redo ?? "";
   for (const id of ["glb", "xodr", "json"]) $(id).hidden = !scene;
-  $("name").textContent = scene ? `${scene.scene_id} · ${scene.primitives.length} primitives` : "no scene yet";
+  $("name").textContent = scene ? `${scene.scene_id} · ${scene.primitives.length} primitives` : "no scene";
   if (scene) {
     await viewer.show(scene);
     choose(keep && chosen < scene.primitives.length ? chosen : -1);
@@ -41,12 +41,12 @@ async function show(state, keep = false) {
 function choose(index) {
   chosen = index; viewer.choose(index);
   const p = scene?.primitives[index];
-  $("picked").textContent = p ? `${index}: ${p.category.replaceAll("_", " ")} (${p.label}), ${p.size_m.map((v) => v.toFixed(2)).join(" × ")} m, at ${p.center_m.map((v) => v.toFixed(2)).join(", ")} m` : "Click an object. Drag turns the view, right drag moves it, the wheel goes nearer.";
+  $("picked").textContent = p ? `${index}: ${p.category.replaceAll("_", " ")} (${p.label}), ${p.size_m.map((v) => v.toFixed(2)).join(" × ")} m, at ${p.center_m.map((v) => v.toFixed(2)).join(", ")} m` : "Click an object to select it. Drag to rotate the view. Drag with the right button to move the view. Turn the wheel to zoom.";
   for (const button of document.querySelectorAll("[data-edit], #drag")) button.disabled = !p;
 }
 viewer.onpick = choose;
 
-// ------------------------------------------------------------------------------------------------------ long work
+// ------------------------------------------------------------------------------------------------------ tasks
 
 async function watch() {
   if (watching) return;
@@ -55,14 +55,14 @@ async function watch() {
   let work;
   do {
     await new Promise((done) => setTimeout(done, 250));
-    work = await ask("/api/work").catch(() => ({ finished: true, error: "the studio does not answer" }));
+    work = await ask("/api/work").catch(() => ({ finished: true, error: "The studio does not answer." }));
     $("progress").max = work.total || 1; $("progress").value = work.done || 0;
     say(`${work.name ?? ""}: step ${work.done ?? 0} of ${work.total ?? 0}`);
   } while (!work.finished);
   watching = false;
   $("progress").hidden = $("cancel").hidden = true;
   await act("/api/state");
-  say(work.error || (work.cancelled ? "cancelled" : ""), Boolean(work.error));
+  say(work.error || (work.cancelled ? "The task is cancelled." : ""), Boolean(work.error));
   document.body.dataset.work = work.error ? "failed" : work.cancelled ? "cancelled" : "done";
 }
 $("cancel").onclick = () => ask("/api/cancel", {}).catch((error) => say(error.message, true));
@@ -96,8 +96,8 @@ addEventListener("keydown", (event) => {
   else if (keys[event.key] && !event.ctrlKey && !event.metaKey) { edit(keys[event.key]); event.preventDefault(); }
 });
 
-// Drag the chosen object over the level plane through its centre.
-$("drag").onclick = () => { dragging = viewer.busy = !dragging; $("drag").textContent = dragging ? "dragging: press on it" : "drag it"; };
+// Dragging moves the selected object in the horizontal plane through its centre.
+$("drag").onclick = () => { dragging = viewer.busy = !dragging; $("drag").textContent = dragging ? "Drag: press on the object" : "Drag"; };
 let from = null;
 const place = (event) => { const box = $("view").getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
 $("view").addEventListener("pointerdown", (event) => {
@@ -158,7 +158,7 @@ map.addEventListener("pointermove", (event) => {
 });
 map.addEventListener("pointerup", () => { drawing = false; paintMap(); });
 
-// ------------------------------------------------------------------------------------------------------------ tables
+// ------------------------------------------------------------------------------------------------------------ scenes of the datasets
 
 async function list() {
   try {

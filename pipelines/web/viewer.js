@@ -1,9 +1,9 @@
-// A scene in 3D: ground, boxes and ellipsoids in soft light, on WebGL2 alone. Frame of the scene: x ahead, y left, z up, metres.
+// Show a scene in 3D with WebGL2: ground, boxes and ellipsoids with shadows. Scene frame: x ahead, y left, z up (m).
 //
-//   const viewer = new Viewer(canvas); viewer.show(scene);   // scene: what pipelines/io/web_export.py makes
-//   viewer.onpick = index => ...                              // a click on a primitive, -1 elsewhere
+//   const viewer = new Viewer(canvas); viewer.show(scene);   // pipelines/io/web_export.py exports the scene.
+//   viewer.onpick = index => ...                              // Index of the clicked primitive, -1 for none.
 //
-// Drag turns, right drag or two fingers move, the wheel goes nearer.
+// Dragging rotates the view. Dragging with the right button or with two fingers moves the view. The wheel zooms.
 
 const CUBE = cube(), BALL = ball(24, 16);
 const SUN = normalised([0.45, -0.5, 0.78]);
@@ -42,8 +42,8 @@ void main() {
     sunlit += texture(shadow, vec3(s.xy + step * 1.5 * vec2(i, j), s.z - .0012)) / 9.;
   if (any(lessThan(s, vec3(0.))) || any(greaterThan(s, vec3(1.)))) sunlit = 1.;
   float light = .62 * max(dot(n, sun), 0.) / sun.z * sunlit + .38 * (.68 + .32 * n.z);
-  if (kind == 0) {  // a thin dark line along the edges of a box
-    vec3 d = (.5 - abs(local)) / max(fwidth(local), vec3(1e-6));  // across the face itself next to nothing
+  if (kind == 0) {  // Draw a thin dark line along the edges of a box.
+    vec3 d = (.5 - abs(local)) / max(fwidth(local), vec3(1e-6));  // The distance along the normal of the face is about 0.
     float a = min(d.x, d.y), b = max(d.x, d.y), second = d.z < a ? a : min(b, d.z);
     light *= mix(.6, 1., smoothstep(.4, 1.4, second));
   }
@@ -72,7 +72,7 @@ export class Viewer {
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
-  // Replaces what is shown; the camera stays unless the grid is another.
+  // Replace the scene. The camera changes only if the grid changes.
   async show(scene) {
     const gl = this.gl, grid = scene.grid;
     const key = JSON.stringify(grid);
@@ -96,7 +96,7 @@ export class Viewer {
 
   choose(index) { this.chosen = index; for (const part of this.parts) part.mark?.(index); this.draw(); }
 
-  // One primitive drawn elsewhere, before anybody has decided that it is there.
+  // Draw one primitive at another place as a preview.
   move(index, primitive) { for (const part of this.parts) part.place?.(index, primitive); this.draw(); }
 
   matrices() {
@@ -141,7 +141,7 @@ export class Viewer {
     for (const part of this.parts) { gl.uniform1i(at("kind"), part.kind); part.draw(); }
   }
 
-  // The ray under a point of the canvas (CSS pixels): where it starts and its direction, scene frame.
+  // Return the start and the direction (scene frame) of the ray through a point of the canvas (CSS pixels).
   ray(x, y) {
     const { eye, seen } = this.matrices(), back = inverse(seen);
     const clip = [(2 * x) / this.canvas.clientWidth - 1, 1 - (2 * y) / this.canvas.clientHeight, 1, 1];
@@ -149,7 +149,7 @@ export class Viewer {
     return { from: eye, way: normalised([0, 1, 2].map((i) => far[i] / far[3] - eye[i])) };
   }
 
-  // The number of the first primitive under a point of the canvas, -1 if there is none.
+  // Return the index of the first primitive under a point of the canvas, -1 if there is none.
   pick(x, y) {
     const { from, way } = this.ray(x, y);
     let best = Infinity, found = -1;
@@ -160,7 +160,7 @@ export class Viewer {
     return found;
   }
 
-  // Where the ray under a point of the canvas passes a level plane.
+  // Return the point where the ray through a point of the canvas intersects a horizontal plane.
   onPlane(x, y, z) {
     const { from, way } = this.ray(x, y), t = (z - from[2]) / way[2];
     return t > 0 ? from.map((f, i) => f + t * way[i]) : null;
@@ -238,7 +238,7 @@ function buffer(gl, data, location, size, each = 0) {
   return made;
 }
 
-// Columns of [R diag(size) | t], four numbers each.
+// Return the columns of [R diag(size) | t], four numbers each.
 function columns(p) {
   const r = p.rotation, s = p.size_m, found = [];
   for (const k of [0, 1, 2]) found.push([r[k] * s[k], r[3 + k] * s[k], r[6 + k] * s[k], 0]);
@@ -322,7 +322,7 @@ function shadowMap(gl) {
   return { texture, frame };
 }
 
-// Length along a ray at which it enters a primitive, Infinity if it does not.
+// Return the length along a ray at which the ray enters a primitive, or Infinity.
 function meets(p, from, way) {
   const r = p.rotation, s = p.size_m, d = from.map((f, i) => f - p.center_m[i]);
   const turn = (v) => [0, 1, 2].map((k) => (v[0] * r[k] + v[1] * r[3 + k] + v[2] * r[6 + k]) / s[k]);
@@ -339,14 +339,14 @@ function meets(p, from, way) {
   return enter <= leave && leave > 0 ? enter : Infinity;
 }
 
-// ------------------------------------------------------------------------------------------------ small mathematics
+// ------------------------------------------------------------------------------------------------ linear algebra
 
 function dot(a, b) { return a.reduce((sum, value, i) => sum + value * b[i], 0); }
 function normalised(v) { const length = Math.hypot(...v); return v.map((x) => x / length); }
 function cross(a, b) { return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]; }
 function linear(hex) { return [0, 2, 4].map((i) => (parseInt(hex.slice(i, i + 2), 16) / 255) ** 2.2); }
 
-// 4 x 4 matrices column by column, as WebGL has them.
+// 4 x 4 matrices are stored column by column, as in WebGL.
 function times(a, b) {
   const m = new Float32Array(16);
   for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) m[4 * c + r] += a[4 * k + r] * b[4 * c + k];
@@ -363,7 +363,7 @@ function looking(eye, target) {
   const x = normalised(cross(up, z)), y = cross(z, x);
   return new Float32Array([x[0], y[0], z[0], 0, x[1], y[1], z[1], 0, x[2], y[2], z[2], 0, -dot(x, eye), -dot(y, eye), -dot(z, eye), 1]);
 }
-function inverse(m) {  // Gauss-Jordan
+function inverse(m) {  // Gauss-Jordan elimination.
   const a = [0, 1, 2, 3].map((r) => [...[0, 1, 2, 3].map((c) => m[4 * c + r]), ...[0, 1, 2, 3].map((c) => +(c === r))]);
   for (let c = 0; c < 4; c++) {
     let best = c;

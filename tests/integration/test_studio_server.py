@@ -81,7 +81,7 @@ def test_studio_reports_progress_and_cancels(studio_url):
         ("generate", {"steps": 0}, 422, "greater than or equal to 1"),
         ("generate", {"step": 5}, 422, "Extra inputs"),
         ("edit", {"edits": [{"edit": "explode"}]}, 400, "expected one of: remove"),
-        ("edit", {"edits": [{"edit": "remove", "select": {"where": "true"}}]}, 400, "the studio takes no SQL"),
+        ("edit", {"edits": [{"edit": "remove", "select": {"where": "true"}}]}, 400, "the studio accepts no SQL"),
         ("edit", {"edits": [{"edit": "remove", "select": {"primitives": [99]}}]}, 400, "has 3 primitives"),
         ("inpaint", {"polygon_m": [[900, 0], [901, 0], [900, 1]]}, 400, "contains no pixel"),
         ("extend", {"side": "up"}, 422, "ahead"),
