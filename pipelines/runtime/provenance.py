@@ -1,4 +1,4 @@
-"""Describe where a result comes from: command, commit and machine, without host names and paths of this machine."""
+"""Describe the origin of a result: command, commit and machine, without host names and absolute paths."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def describe_machine() -> str:
 
 
 def find_commit() -> str:
-    """Return the commit of this code, with a + if files have changed since; "unknown" outside a git checkout."""
+    """Return the commit of this code, with a + if files differ from it; "unknown" outside a git checkout."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(
@@ -41,7 +41,7 @@ def find_commit() -> str:
 def format_command() -> str:
     """Return the command line with shortened paths.
 
-    Paths under $PRITTI_HOME and this checkout become relative to them; other absolute paths keep their last part only.
+    Paths under $PRITTI_HOME and under this checkout become relative. Other absolute paths keep their last part only.
     """
     roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
 
@@ -59,4 +59,5 @@ def format_command() -> str:
 
 
 def list_versions() -> str:
+    """Return the versions of Python and torch."""
     return f"Python {platform.python_version()}, torch {torch.__version__}"

@@ -1,4 +1,4 @@
-"""Run numbered pieces of work as Ray Data graphs: one task each, or a pool of actors that keep a model loaded."""
+"""Run numbered units of work as Ray Data graphs: one task per unit, or a pool of actors that keep a model loaded."""
 
 from __future__ import annotations
 
@@ -10,27 +10,31 @@ import ray
 import ray.data
 from ray.util.annotations import RayDeprecationWarning
 
-# Retries of a task whose worker died. Ray replaces a killed worker; a shard that always kills its worker stops the run.
+# Retries of a task whose worker died. Ray replaces a killed worker. A shard that kills every worker stops the run.
 MAX_RETRIES = 20
 
 
 def count_gpus_per_actor() -> int:
-    """Return 1 if the cluster has GPUs, even if the driver's machine has none; else 0."""
+    """Return 1 if the cluster has GPUs, even if the machine of the driver has none, and 0 otherwise."""
     return int(ray.cluster_resources().get("GPU", 0) > 0)
 
 
 def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:
-    """Rows {"id": number}, one row per block, so that each row becomes a task."""
+    """Make rows {"id": number} with one row per block, so that each row becomes a task."""
     return ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
 
 
 def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **options: Any) -> ray.data.Dataset:
-    """`Dataset.map` for a function or an actor class that takes more arguments than the row.
+    """Call `Dataset.map` with a function or an actor class that has more parameters than the row.
 
     Args:
-        dataset: Rows in.
-        function: Function of a row and of `fn_args` or `fn_kwargs`, or an actor class that returns such a function.
-        options: Options of `Dataset.map`. Ray's annotations allow functions of the row only.
+        dataset: Input rows.
+        function: Function of a row and of `fn_args` or `fn_kwargs`, or an actor class whose instances are such
+            functions.
+        options: Options of `Dataset.map`. The type annotations of Ray allow functions of the row only.
+
+    Returns:
+        Output rows.
     """
     return dataset.map(cast(Any, function), **options)
 
@@ -38,7 +42,7 @@ def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **optio
 def flat_map_dataset(
     dataset: ray.data.Dataset, function: Callable[..., list[dict]], **options: Any
 ) -> ray.data.Dataset:
-    """`Dataset.flat_map` for a function that takes more arguments than the row; see `map_dataset`."""
+    """Call `Dataset.flat_map` with a function that has more parameters than the row; see `map_dataset`."""
     return dataset.flat_map(cast(Any, function), **options)
 
 
@@ -48,13 +52,16 @@ def map_rows(
     """Run one Ray task per row, and retry a task whose worker died.
 
     Args:
-        dataset: Rows in.
+        dataset: Input rows.
         function: Returns the row that replaces a row.
-        num_cpus: CPUs of a task.
-        at_once: Maximum number of tasks that run concurrently (default: no limit). Tasks reuse worker processes.
+        num_cpus: CPUs per task.
+        at_once: Maximum number of concurrent tasks (default: no limit). Tasks reuse worker processes.
+
+    Returns:
+        Output rows.
     """
     compute = None if at_once is None else ray.data.TaskPoolStrategy(size=at_once)
-    with warnings.catch_warnings():  # Ray 2.64 announces another form of this option, which 2.60 does not have
+    with warnings.catch_warnings():  # Ray 2.64 deprecates this option, but Ray 2.60 lacks the replacement.
         warnings.simplefilter("ignore", RayDeprecationWarning)
         return map_dataset(dataset, function, num_cpus=num_cpus, compute=compute, max_retries=MAX_RETRIES)
 
@@ -62,14 +69,17 @@ def map_rows(
 def map_actors(
     numbers: Sequence[int], actor: type, arguments: tuple, num_actors: int, **resources: float
 ) -> Iterator[dict]:
-    """Yield the rows that actors return for {"id": number}, in order of completion. No numbers start no actor.
+    """Yield the rows that actors return for {"id": number}, in order of completion. Without numbers, no actor starts.
 
     Args:
-        numbers: Numbers of the pieces of work.
-        actor: Actor class; its instances take and return a row.
-        arguments: Arguments of its constructor.
+        numbers: Numbers of the units of work.
+        actor: Actor class. Its instances take a row and return a row.
+        arguments: Arguments of the constructor.
         num_actors: Maximum number of actors.
         resources: num_cpus or num_gpus of one actor (default: one GPU if the cluster has GPUs).
+
+    Yields:
+        Output rows.
     """
     if not numbers:
         return

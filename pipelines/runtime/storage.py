@@ -24,23 +24,25 @@ def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
 
 
 def join_uri(uri: str | os.PathLike, *parts: str) -> str:
+    """Join a URI or path and further parts with slashes."""
     return "/".join([os.fspath(uri).rstrip("/"), *parts])
 
 
 def exists(uri: str) -> bool:
+    """Return whether a file or directory exists."""
     fs, path = resolve_uri(uri)
     return fs.get_file_info(path).type != pafs.FileType.NotFound
 
 
 def fingerprint_file(uri: str) -> list[str | int]:
-    """Return path, size in bytes and modification time of a file; they change when the file is rewritten."""
+    """Return path, size in bytes and modification time of a file. A rewritten file has another fingerprint."""
     fs, path = resolve_uri(uri)
     info = fs.get_file_info(path)
     return [path, info.size, str(info.mtime)]
 
 
 def list_files(uri: str, suffix: str) -> list[str]:
-    """Return the sorted URIs of the files under a directory, without hidden and temporary ones; [] if it is missing."""
+    """Return the sorted URIs of the files under a directory, without hidden files; [] if the directory is missing."""
     fs, path = resolve_uri(uri)
     found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
     inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
@@ -51,12 +53,12 @@ def list_files(uri: str, suffix: str) -> list[str]:
 
 
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
-    """Create or replace a file by `write(stream)`: readers see the old file or the new one, never a part.
+    """Create or replace a file by `write(stream)`. Readers see the old file or the new file, never an incomplete one.
 
-    Deletes the temporary files that killed writers of the same file left.
+    Temporary files of killed writers of the same file are deleted.
 
     Raises:
-        OSError: The file cannot be written; the message names the file and the remedy.
+        OSError: The file cannot be written. The message names the file and the remedy.
     """
     fs, path = resolve_uri(uri)
     parent, name = path.rsplit("/", 1)
@@ -73,7 +75,7 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
         if isinstance(error, OSError):
             reason = os.strerror(error.errno) if error.errno else str(error)
             raise OSError(
-                f"{uri}: cannot be written ({reason}); make room there or give write permission, then run the same"
+                f"{uri}: cannot be written ({reason}); free disk space or give write permission, then run the same"
                 " command again"
             ) from error
         raise
@@ -81,10 +83,9 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
-    """Write a table as a Parquet file, zstd-compressed, with dictionaries for its string columns."""
-    dictionaries = cast(
-        Any, _list_dictionary_columns(table)
-    )  # pyarrow annotates a bool; its documentation allows names
+    """Write a table as a Parquet file with zstd compression and dictionaries for string columns."""
+    # The type annotation of pyarrow allows a bool only, but its documentation allows names.
+    dictionaries = cast(Any, _list_dictionary_columns(table))
     write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=dictionaries))
 
 
@@ -96,34 +97,38 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
     """Read a Parquet file.
 
     Args:
-        uri: The file.
+        uri: File.
         columns: Names of the columns to read (default: all).
         schema: Types that the columns must have (default: any).
 
+    Returns:
+        Table.
+
     Raises:
-        ValueError: The file is missing, truncated or has another schema; the message names it.
+        ValueError: The file is missing, truncated or has another schema. The message names the file.
     """
     fs, path = resolve_uri(uri)
-    no_partitioning = cast(Any, None)  # pyarrow annotates a string; its documentation allows None
+    # The type annotation of pyarrow allows a string only, but its documentation allows None.
+    no_partitioning = cast(Any, None)
     try:
         table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=no_partitioning)
     except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
         raise ValueError(
-            f"{uri}: cannot be read as Parquet ({error}); delete it and run the job that wrote it again"
+            f"{uri}: cannot be read as Parquet ({error}); delete the file and run the job that wrote it again"
         ) from error
     if schema is not None:
         wanted = schema.names if columns is None else columns
         for name in wanted:
             if name not in table.column_names or table.schema.field(name).type != schema.field(name).type:
                 raise ValueError(
-                    f"{uri}: column {name!r} is missing or not {schema.field(name).type}; it was written by another"
-                    " version"
+                    f"{uri}: column {name!r} is missing or not of type {schema.field(name).type}; another"
+                    " version wrote the file"
                 )
     return table
 
 
 def read_bytes(uri: str) -> bytes:
-    """Read a whole file. Raises ValueError naming it if it cannot be read."""
+    """Read a whole file. Raises ValueError with the name of the file if it cannot be read."""
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path, compression=None) as stream:
@@ -139,15 +144,17 @@ def measure_file_bytes(uri: str) -> int:
 
 
 def write_text(text: str, uri: str) -> None:
+    """Write a text file."""
     write_whole(uri, lambda stream: stream.write(text.encode()))
 
 
 def write_json(value: Any, uri: str) -> None:
+    """Write a value as a JSON file."""
     write_text(json.dumps(value, indent=1, allow_nan=False), uri)
 
 
 def read_json(uri: str) -> Any:
-    """Read a JSON file. Raises ValueError naming the file if it is missing or not JSON."""
+    """Read a JSON file. Raises ValueError with the name of the file if it is missing or is not JSON."""
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path) as stream:
@@ -157,35 +164,36 @@ def read_json(uri: str) -> Any:
 
 
 def clean_temporaries(uri: str) -> int:
-    """Delete the temporary files that killed writers left; return their number."""
+    """Delete the temporary files of killed writers and return their number."""
     fs, path = resolve_uri(uri)
     return _delete_files(fs, pafs.FileSelector(path, recursive=True, allow_not_found=True), TEMPORARY)
 
 
 def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) -> int:
-    """Delete the files whose names begin with `prefix`; return their number."""
+    """Delete the files whose names begin with `prefix` and return their number."""
     stale = [info.path for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
     for name in stale:
-        with suppress(FileNotFoundError):  # its writer is alive and has just renamed it
+        with suppress(FileNotFoundError):  # The writer is alive and has renamed the file.
             fs.delete_file(name)
     return len(stale)
 
 
 def delete_file(uri: str) -> None:
-    """Delete a file if it is there."""
+    """Delete a file if it exists."""
     fs, path = resolve_uri(uri)
     if fs.get_file_info(path).is_file:
         fs.delete_file(path)
 
 
 def delete_directory(uri: str) -> None:
+    """Delete a directory if it exists."""
     fs, path = resolve_uri(uri)
     if fs.get_file_info(path).type == pafs.FileType.Directory:
         fs.delete_dir(path)
 
 
 def move_file(source: str, target: str) -> None:
-    """Move one file into place, creating the directory."""
+    """Move a file; create the target directory if necessary."""
     fs, path = resolve_uri(source)
     _, to = resolve_uri(target)
     fs.create_dir(to.rsplit("/", 1)[0], recursive=True)

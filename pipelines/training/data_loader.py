@@ -1,11 +1,12 @@
-"""Load training batches from tables; Ray tasks read ahead, in an order that depends on the seed alone.
+"""Load training batches from tables. Ray tasks read ahead in an order that depends on the seed alone.
 
-The stream of samples is fixed before anything is read: epoch after epoch, shards in random order, rows shuffled
-within a window of a few shards. Every worker computes from its rank and the step which rows it needs. A resumed run
-therefore continues with the next batch, and two workers see the samples that one worker would see.
+The order of the samples is fixed before the first read. Each epoch visits the shards in random order and shuffles the
+rows within a window of a few shards. Each worker computes the rows that it needs from its rank and the step. A resumed
+run therefore continues with the next batch, and two workers together read the same samples as a single worker.
 
-The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, it polls
-without a pause and holds Python's lock, which makes steps on two cores four times as long (BENCHMARKS.md).
+The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
+polls without a pause and holds Python's global lock. On two cores, training steps then take four times as long
+(docs/experiments/reading_training_data.md).
 """
 
 from __future__ import annotations
@@ -30,28 +31,35 @@ from pipelines.schema.tables import Shard, find_category_indices, list_ground_st
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
-AHEAD = 2  # tasks running or done while the samples of another are consumed
-READER_CPUS = 0.5  # leaves room next to a training worker on two cores; with more, both would wait for each other
+AHEAD = 2  # Number of tasks that read ahead while the training consumes the samples of another task.
+READER_CPUS = 0.5  # With more CPUs, a reader and a training worker would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
-Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # shard, rows, their places in the stream -> stacked samples
+Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, places in the stream) -> stacked samples.
 
 
 @dataclass(frozen=True)
 class Stream:
-    """The endless, seeded order of samples of a training run."""
+    """The endless, seeded order of the samples of a training run.
+
+    Attributes:
+        shards: Shards of the training split.
+        counts: Number of scenes of each shard.
+        batch_size: Global batch size.
+        seed: Seed of the order.
+    """
 
     shards: tuple[Shard, ...]
     counts: tuple[int, ...]
-    batch_size: int  # global
+    batch_size: int
     seed: int
 
     def __post_init__(self) -> None:
         if not self.shards or sum(self.counts) == 0:
-            raise ValueError("there is nothing to train on: the training split has no scenes")
+            raise ValueError("the training split has no scenes")
 
     def positions(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """(shard, row) of samples first .. first + count - 1 of the stream."""
+        """Return the shard and the row of samples first .. first + count - 1 of the stream."""
         epoch_size = sum(self.counts)
         wanted = np.arange(first, first + count)
         shard, row = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -64,7 +72,10 @@ class Stream:
 
 @lru_cache(maxsize=4)
 def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
-    """Every (shard, row) once: shards permuted, rows shuffled within windows of WINDOW_SHARDS shards."""
+    """Return shard and row of each scene once, for one epoch.
+
+    The shards are in random order. Rows are shuffled within windows of WINDOW_SHARDS shards.
+    """
     rng = np.random.default_rng([seed, epoch])
     order = rng.permutation(len(counts))
     shards, rows = [], []
@@ -79,7 +90,7 @@ def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.nd
 
 
 def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
-    """Read the rank's share of `count` consecutive global batches from batch `first`, in order."""
+    """Read the samples of one rank in `count` consecutive global batches from batch `first`, in order."""
     shard, row = stream.positions(first * batch, count * batch)
     mine = (np.arange(count * batch) % batch) // (batch // world) == rank
     shard, row, place = shard[mine], row[mine], first * batch + np.flatnonzero(mine)
@@ -96,7 +107,7 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 def iterate_batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
-    """Yield the local batches of steps start_step .. stop_step - 1 of one worker; Ray tasks read AHEAD of them.
+    """Yield the local batches of steps start_step .. stop_step - 1 of one worker. AHEAD Ray tasks read ahead.
 
     Args:
         stream: Order of the samples.
@@ -110,11 +121,11 @@ def iterate_batches(
         Read-only arrays by name, (batch size / world, ...) each.
 
     Raises:
-        ValueError: The number of workers does not divide the global batch size.
+        ValueError: The global batch size is not a multiple of the number of workers.
     """
     batch = stream.batch_size
     if batch % world:
-        raise ValueError(f"batch size {batch} does not divide by {world} workers")
+        raise ValueError(f"batch size {batch} is not a multiple of {world} workers")
     per_task, local = max(1, SAMPLES_PER_TASK // batch), batch // world
     reader = ray.remote(num_cpus=READER_CPUS)(read_samples)
     shared = ray.put(stream), ray.put(read)
@@ -131,7 +142,12 @@ def iterate_batches(
 
 @dataclass(frozen=True)
 class LayoutReader:
-    """Reads samples for stage 1: encoded layouts (models/tensors.py) under a LayoutSpec, optionally augmented."""
+    """Read samples for stage 1: encoded layouts (models/tensors.py), optionally augmented.
+
+    Attributes:
+        spec: Layout of the model.
+        augment: Augmentation; None reads the stored scenes.
+    """
 
     spec: LayoutSpec
     augment: Augmentation | None = None
@@ -162,23 +178,32 @@ def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLayouts:
-    """The columns of a shard that layouts need; encoding them without Scenes takes half the time."""
+    """Columns of a shard that layouts need. Encoding from columns takes half the time of encoding from Scenes.
 
-    first: np.ndarray  # (scenes,) row of a scene's first primitive
-    count: np.ndarray  # (scenes,)
-    category: np.ndarray  # (n,) int8
-    center_m: np.ndarray  # (n, 3)
-    cholesky: np.ndarray  # (n, 6)
+    Attributes:
+        first: (scenes,) row of the first primitive of each scene.
+        count: (scenes,) number of primitives of each scene.
+        category: (n,) int8 category of each primitive.
+        center_m: (n, 3) centre of each primitive (m, scene frame).
+        cholesky: (n, 6) Cholesky parameters of each primitive.
+        rasters: Rasters table.
+    """
+
+    first: np.ndarray
+    count: np.ndarray
+    category: np.ndarray
+    center_m: np.ndarray
+    cholesky: np.ndarray
     rasters: pa.Table
 
     def layout(self, row: int, spec: LayoutSpec) -> Arrays:
-        """`encode_layout` of one scene."""
+        """Encode one scene like `encode_layout`."""
         here = slice(self.first[row], self.first[row] + self.count[row])
         primitives = encode_primitives(self.category[here], self.center_m[here], self.cholesky[here], spec)
         return self.ground(row, spec) | primitives
 
     def ground(self, row: int, spec: LayoutSpec) -> Arrays:
-        """Encode the ground of one scene; a table of all stored heights is scaled once, for all scenes."""
+        """Encode the ground of one scene. All scenes share one table that maps stored heights to encoded heights."""
         raster = {name: self.rasters[name][row].as_py() for name in self.rasters.column_names}
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
@@ -194,7 +219,7 @@ class StoredLayouts:
 
 @lru_cache(maxsize=4)
 def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
-    """(65536,) uint16: `encode_height` of every 16-bit number of height steps."""
+    """Return (65536,) uint16: `encode_height` of each 16-bit number of height steps."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
     return encode_height(steps * np.float32(step_m), spec)
 
@@ -205,7 +230,9 @@ def _read_stored_layouts(shard: Shard) -> StoredLayouts:
     primitives = shard.read("primitives", ["category", "x_m", "y_m", "z_m", "cholesky"]).combine_chunks()
     rasters = shard.read("rasters")
     if scenes["scene_id"] != rasters["scene_id"]:
-        raise ValueError(f"{shard.path('rasters')} is not aligned with {shard.path('scenes')}; preprocess again")
+        raise ValueError(
+            f"{shard.path('rasters')} is not aligned with {shard.path('scenes')}; run the preprocessing again"
+        )
     return StoredLayouts(
         first=scenes["primitive_offset"].to_numpy(),
         count=scenes["num_primitives"].to_numpy(),
@@ -229,7 +256,7 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
 
 
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
-    """(n,) int64: index into LABELS[label] per row of a scenes table."""
+    """Return the index into LABELS[label] of each row of a scenes table, (n,) int64."""
     densities = zip(scenes["vegetation_density"].to_pylist(), scenes["vehicle_density"].to_pylist(), strict=True)
     names = [compose_label(label, vegetation, vehicle) for vegetation, vehicle in densities]
     return np.array([find_label_index(label, str(name)) for name in names], np.int64)
@@ -237,7 +264,12 @@ def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LatentReader:
-    """Reads samples for stage 2: posterior moments and labels."""
+    """Read samples for stage 2: moments of the latents, and labels.
+
+    Attributes:
+        latents_root: Directory of the latents.
+        label: Kind of label.
+    """
 
     latents_root: str
     label: str

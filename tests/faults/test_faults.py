@@ -316,7 +316,7 @@ def test_preprocess_reports_full_disk_and_resumes(town, tmp_path):
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert done.returncode == 2 and len(lines) == 1, done.stderr[-3000:]
     assert re.fullmatch(
-        rf"error: {full}/\S+: cannot be written \(No space left on device\); make room there.*", lines[0]
+        rf"error: {full}/\S+: cannot be written \(No space left on device\); free disk space.*", lines[0]
     )
     assert not (left / "dataset.json").exists() and find_partial_shards(left / ".staging", set()) == []
     preprocess(replace(TOWN, output=str(left)))
@@ -332,7 +332,7 @@ def test_write_shard_names_failed_file_and_cleans_up(raw, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
     try:
         with pytest.raises(
-            OSError, match=r"staging/.*\.parquet: cannot be written \(File too large\); make room there"
+            OSError, match=r"staging/.*\.parquet: cannot be written \(File too large\); free disk space"
         ):
             write_shard(task, str(staging), CROP)
     finally:

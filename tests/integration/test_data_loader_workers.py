@@ -17,5 +17,5 @@ def test_batches_are_prefetched_in_order(layout_shards, cluster, monkeypatch):
         for name, value in read_samples(stream, reader, step, 1, 4, 1, 2).items():
             assert np.array_equal(batch[name], value), (step, name)
     assert not list(iterate_batches(stream, reader, 5, 5))
-    with pytest.raises(ValueError, match="batch size 4 does not divide by 3 workers"):
+    with pytest.raises(ValueError, match="batch size 4 is not a multiple of 3 workers"):
         next(iterate_batches(stream, reader, 0, 1, 0, 3))
