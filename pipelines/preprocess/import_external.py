@@ -56,27 +56,48 @@ class ImportRequest:
 
     @property
     def files_per_shard(self) -> int:
-        """Number of files per shard, except the last one."""
+        """Return the number of files of each shard except the last."""
         return min(MAX_FILES_PER_SHARD, -(-len(self.files) // WANTED_SHARDS))
 
     def files_of(self, shard: Shard) -> Iterator[tuple[int, str, str]]:
-        """Yield index, scene id and URI of each file of a shard."""
+        """Yield index, scene id and URI of each file of a shard.
+
+        Args:
+            shard: Shard of the import.
+
+        Yields:
+            Index of the file in the import, scene id and URI.
+        """
         start = shard.number * self.files_per_shard
         for index, file in enumerate(self.files[start : start + self.files_per_shard], start):
             yield index, make_scene_id(file), storage.join_uri(self.base, file)
 
     def pictures_path(self, shard: Shard) -> str:
-        """Return the path of the images of a shard of voxel grids."""
+        """Return the path of the images of a shard of voxel grids.
+
+        Args:
+            shard: Shard of the import.
+
+        Returns:
+            Path of an .npz file.
+        """
         return storage.join_uri(self.output, f".pictures-{self.name}", f"part-{shard.number:05d}.npz")
 
     @property
     def target(self) -> str:
-        """Path of the final file with the images of all voxel grids."""
+        """Return the path of the final file with the images of all voxel grids."""
         return storage.join_uri(self.output, f"{self.name}.npz")
 
 
 def make_scene_id(file: str) -> str:
-    """Return the scene id for a file name: "night/007.glb" gives night-007."""
+    """Return the scene id for a file name: "night/007.glb" gives night-007.
+
+    Args:
+        file: File name relative to the directory of the import.
+
+    Returns:
+        Scene id.
+    """
     return file.rsplit(".", 1)[0].replace("/", "-")
 
 
@@ -141,7 +162,15 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
 
 
 def write_tables(row: dict, request: ImportRequest) -> dict:
-    """Import the GLB files of the shard number in `row` as tables, and return the number with the scene ids."""
+    """Import the GLB files of one shard as tables.
+
+    Args:
+        row: Row with the number of the shard.
+        request: Import.
+
+    Returns:
+        Row with the number of the shard and the scene ids.
+    """
     shard = request.shards()[row["shard"]]
 
     def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
@@ -160,7 +189,15 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
 
 
 def write_pictures(row: dict, request: ImportRequest) -> dict:
-    """Import the voxel grids of the shard number in `row` as images, and return the number with the scene ids."""
+    """Import the voxel grids of one shard as images.
+
+    Args:
+        row: Row with the number of the shard.
+        request: Import.
+
+    Returns:
+        Row with the number of the shard and the scene ids.
+    """
     shard = request.shards()[row["shard"]]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
@@ -175,7 +212,14 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
 
 
 def make_pictures_shard(path: str) -> np.ndarray:
-    """Read the images that `write_pictures` wrote: (n, 256, 256, 3) uint8."""
+    """Read the images that `write_pictures` wrote.
+
+    Args:
+        path: Path of an .npz file.
+
+    Returns:
+        (n, 256, 256, 3) uint8 images.
+    """
     return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
 
 
