@@ -1,4 +1,4 @@
-"""Names of models, provenance of commands and checksums of the released weights."""
+"""Tests of model names, of recorded commands and of the checksums of released weights."""
 
 import json
 
