@@ -1,4 +1,4 @@
-"""The rasteriser equals vertical ray casting by trimesh (embree) and polygon filling by shapely."""
+"""Tests of the rasteriser against vertical rays of trimesh (embree) and polygons of shapely."""
 
 import numpy as np
 import shapely
@@ -9,7 +9,7 @@ from pipelines.geometry.rasterize import cast_rays_down, fill_polygon
 
 
 def cast_by_rays(triangles_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """(H, W) heights by embree, -inf where nothing is hit."""
+    """Return heights (H, W) from embree, -inf where a ray hits nothing."""
     mesh = trimesh.Trimesh(triangles_m.reshape(-1, 3), np.arange(3 * len(triangles_m)).reshape(-1, 3), process=False)
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     origins = np.stack([x, y, np.full_like(x, 100.0)], -1).reshape(-1, 3)
@@ -19,7 +19,7 @@ def cast_by_rays(triangles_m: np.ndarray, grid: Grid) -> np.ndarray:
     return height.reshape(x.shape)
 
 
-def random_triangles(rng: np.random.Generator, n: int) -> np.ndarray:
+def draw_triangles(rng: np.random.Generator, n: int) -> np.ndarray:
     center = rng.uniform([-5, -40, -3], [70, 40, 3], (n, 1, 3))
     return center + rng.normal(0, [6, 6, 0.5], (n, 3, 3))
 
@@ -27,7 +27,7 @@ def random_triangles(rng: np.random.Generator, n: int) -> np.ndarray:
 def test_cast_down_equals_ray_casting():
     rng = np.random.default_rng(0)
     grid = Grid()
-    triangles = random_triangles(rng, 200)
+    triangles = draw_triangles(rng, 200)
     height, hit = cast_rays_down(triangles, grid)
     rays = cast_by_rays(triangles, grid)
     same = np.isfinite(height[0]) == np.isfinite(rays)
@@ -40,7 +40,7 @@ def test_cast_down_equals_ray_casting():
 
 def test_cast_down_last_triangle_wins_ties():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
-    level = random_triangles(np.random.default_rng(3), 60)
+    level = draw_triangles(np.random.default_rng(3), 60)
     level[..., 2] = 1.5
     height, hit = cast_rays_down(level, grid)
     alone = np.stack([cast_rays_down(triangle[None], grid)[1][0] == 0 for triangle in level])
@@ -51,7 +51,7 @@ def test_cast_down_last_triangle_wins_ties():
 def test_cast_down_separates_layers():
     rng = np.random.default_rng(1)
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
-    triangles, layer = random_triangles(rng, 60), rng.integers(0, 3, 60)
+    triangles, layer = draw_triangles(rng, 60), rng.integers(0, 3, 60)
     together, hit = cast_rays_down(triangles, grid, layer, 4)
     for k in range(4):
         alone, _ = cast_rays_down(triangles[layer == k], grid)
