@@ -1,4 +1,4 @@
-"""Reconstruction scores of single scenes, with a perfect decoder and with an untrained model."""
+"""Tests of reconstruction scores of single scenes, with a perfect decoder and an untrained model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +31,8 @@ SPEC = replace(
 )
 
 
-def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
-    """The output of a perfect decoder."""
+def encode_perfectly(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
+    """Return the output of a perfect decoder for a scene."""
     layout = encode_layout(scene, spec)
     return DecodedLayout(
         occupancy=layout["occupied"].astype(np.float32),
@@ -43,17 +43,19 @@ def perfect(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
     )
 
 
-def record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> SceneRecord:
+def make_record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> SceneRecord:
     return make_scene_record(scene, layout, LATENT, spec, make_voxel_grid(spec))
 
 
 def test_reconstruction_of_perfect_decoder_scores_one():
     scenes = [random_scene(k, n=60, tilt_rad=0.1) for k in range(2)]
-    got = compute_reconstruction_scores([record(s, perfect(s, SPEC)) for s in scenes], SPEC, make_voxel_grid(SPEC))
+    got = compute_reconstruction_scores(
+        [make_record(s, encode_perfectly(s, SPEC)) for s in scenes], SPEC, make_voxel_grid(SPEC)
+    )
     assert got["ground_iou"] == got["ground_mean_iou"] == 1 and got["height_rmse_m"] < 1e-4
     for variant in got["detection"].values():
         assert variant["ap3d"] > 0.99 and variant["ap3d_50"] > 0.99
-    # Equal extents leave the axes of a scatter matrix open, but random ones differ.
+    # Random extents differ, so a scatter matrix determines the axes of each box.
     assert got["matched"]["found"] == got["matched"]["right"] == 1 and got["matched"]["mean_iou3d"] > 0.99
     assert got["matched"]["category_mean_iou3d"]["vegetation_ellipsoid"] > 0.98
     assert got["voxels"]["iou"] > 0.995 and got["voxels"]["miou"] > 0.99
@@ -63,7 +65,7 @@ def test_reconstruction_of_perfect_decoder_scores_one():
 
 def test_reconstruction_separates_cost_of_coarse_raster():
     coarse, scenes = SPEC.with_resolution(SPEC.grid.rows // 2), [random_scene(k, n=30) for k in range(2)]
-    records = [record(s, perfect(s, coarse), coarse) for s in scenes]
+    records = [make_record(s, encode_perfectly(s, coarse), coarse) for s in scenes]
     got = compute_reconstruction_scores(records, coarse, make_voxel_grid(coarse))
     assert got["raster_px"] == coarse.grid.rows and got["raster_ground_iou"] == 1 > got["ground_iou"] > 0.5
     assert got["raster_height_rmse_m"] < 1e-4
@@ -71,10 +73,10 @@ def test_reconstruction_separates_cost_of_coarse_raster():
 
 def test_reconstruction_ground_errors_are_in_meters():
     scene = random_scene(0, n=30)
-    exact = perfect(scene, SPEC)
+    exact = encode_perfectly(scene, SPEC)
     raised = replace(exact, height=exact.height + 0.3 / 6.0, occupancy=np.zeros_like(exact.occupancy))
-    got = compute_reconstruction_scores([record(scene, raised)], SPEC, make_voxel_grid(SPEC))
-    assert got["ground_iou"] == 0  # no occupied pixel is predicted; height errors count nevertheless
+    got = compute_reconstruction_scores([make_record(scene, raised)], SPEC, make_voxel_grid(SPEC))
+    assert got["ground_iou"] == 0  # no pixel is predicted as occupied, but height errors count
     assert got["height_rmse_m"] == pytest.approx(0.3, abs=1e-4) and got["height_mae_m"] == pytest.approx(0.3, abs=1e-4)
     assert got["height_mse_normalised"] == pytest.approx((0.3 / 6) ** 2, rel=1e-3)
 
@@ -82,7 +84,9 @@ def test_reconstruction_ground_errors_are_in_meters():
 def test_reconstruction_counts_primitives_without_slot_as_missed():
     scene = random_scene(1, n=60, tilt_rad=0.1)
     few = replace(SPEC, slots=(1,) * 11)
-    got = compute_reconstruction_scores([record(scene, perfect(scene, few), few)], few, make_voxel_grid(few))
+    got = compute_reconstruction_scores(
+        [make_record(scene, encode_perfectly(scene, few), few)], few, make_voxel_grid(few)
+    )
     boxes = scene.category != 1
     assert got["matched"]["found"] == pytest.approx(len(set(scene.category[boxes])) / boxes.sum())
     assert got["matched"]["right"] == 1
@@ -90,7 +94,7 @@ def test_reconstruction_counts_primitives_without_slot_as_missed():
 
 def test_reconstruction_record_round_trips():
     scene = random_scene(2, n=20)
-    one = record(scene, perfect(scene, SPEC))
+    one = make_record(scene, encode_perfectly(scene, SPEC))
     again = SceneRecord.from_row(one.to_row())
     for name in ("ground", "matches", "pairs", "outside"):
         first, second = getattr(one, name), getattr(again, name)
@@ -104,26 +108,26 @@ def test_reconstruction_scores_empty_scene(tmp_path):
     scene = random_scene(3, n=0)
     empty = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m))
     full = random_scene(4, n=30)
-    records = [record(s, perfect(s, SPEC)) for s in (empty, full)]
+    records = [make_record(s, encode_perfectly(s, SPEC)) for s in (empty, full)]
     assert compute_reconstruction_scores(records, SPEC, make_voxel_grid(SPEC))["ground_iou"] == 1
 
 
 # --------------------------------------------------------------------------------------------- chunks, sizes and MLflow
 
 
-def selection(root: Path) -> SceneSubset:
+def select_scenes(root: Path) -> SceneSubset:
     return SceneSubset(str(root), "town", "test")
 
 
 def test_reconstruction_chunks_cover_selection_once(reconstruction_dataset):
-    chunks = split_chunks(selection(reconstruction_dataset), 3)
+    chunks = split_chunks(select_scenes(reconstruction_dataset), 3)
     assert [rows for _, rows in chunks] == [[0, 1, 2], [3, 4, 5], [6], [0, 1, 2], [3]]
     assert [shard.number for shard, _ in chunks] == [0, 0, 0, 1, 1]
 
 
 def test_reconstruction_table_bytes_equal_disk_usage(reconstruction_dataset):
     files = [p for p in reconstruction_dataset.rglob("*.parquet")]
-    assert measure_table_bytes(split_chunks(selection(reconstruction_dataset), 3)) == pytest.approx(
+    assert measure_table_bytes(split_chunks(select_scenes(reconstruction_dataset), 3)) == pytest.approx(
         sum(p.stat().st_size for p in files) / 11
     )
 
@@ -135,7 +139,7 @@ def test_publish_scores_uses_one_mlflow_run_per_directory(tmp_path, monkeypatch)
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     output = str(tmp_path / "scores")
-    many = {str(k): 0.5 for k in range(1200)}  # more than one call takes
+    many = {str(k): 0.5 for k in range(1200)}  # more metrics than one call accepts
     for value, lvae in ((0.25, "one"), (0.75, "two")):
         scores = {"reconstruction": {"ap3d": Estimate(value, 0.1, 0.9), "many": many, "absent": None}}
         assert publish_scores(output, scores, {"lvae": lvae}) == storage.read_json(f"{output}/metrics.json")
