@@ -1,4 +1,4 @@
-"""Rendered pictures show what rays cast by trimesh hit."""
+"""Tests of rendered pictures, in part against rays of trimesh."""
 
 from dataclasses import replace
 
@@ -14,10 +14,10 @@ from pipelines.rendering.render import arrange_contact_sheet, render_3d, render_
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
 
-def literal(scene: Scene, view: Grid) -> np.ndarray:
-    """(H, W) class ids: every primitive against the vertical line through every pixel centre.
+def render_literally(scene: Scene, view: Grid) -> np.ndarray:
+    """Return class ids (H, W) from vertical lines through all pixel centres and all primitives.
 
-    Of equal heights the ground counts, then the last box; an ellipsoid must be higher than everything.
+    At equal heights, the ground has priority, then the last box, then ellipsoids.
     """
     x, y = np.meshgrid(view.x_m(), view.y_m(), indexing="ij")
     height, winner = scene.surface()
@@ -26,7 +26,7 @@ def literal(scene: Scene, view: Grid) -> np.ndarray:
     top = np.where(class_id == EMPTY, -np.inf, height[below])
     for k in sorted(range(len(scene)), key=lambda k: (scene.category[k] == ELLIPSOID, -k)):
         center, rotation, size = (part[k].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m))
-        # In half axes the line is foot + (z - center z) along.
+        # In units of the half extents, the line is foot + (z - center[2]) * along.
         foot = 2 * ((x - center[0])[..., None] * rotation[0] + (y - center[1])[..., None] * rotation[1]) / size
         along = 2 * rotation[2] / size
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -52,9 +52,9 @@ def test_bev_equals_brute_force(tilt_rad, rows, cols, size_px):
         scene = random_scene(seed, 60, grid, tilt_rad, center_m=center_m)
         step_m = max(rows, cols) * 0.5 / size_px
         view = Grid(40, 10, step_m, round(rows * 0.5 / step_m), round(cols * 0.5 / step_m))
-        np.testing.assert_array_equal(render_bev(scene, size_px), CLASS_COLORS[literal(scene, view)])
+        np.testing.assert_array_equal(render_bev(scene, size_px), CLASS_COLORS[render_literally(scene, view)])
         fine = Grid(40, 10, step_m / 2, 2 * view.rows, 2 * view.cols)
-        blocks = CLASS_COLORS[literal(scene, fine)].reshape(view.rows, 2, view.cols, 2, 3)
+        blocks = CLASS_COLORS[render_literally(scene, fine)].reshape(view.rows, 2, view.cols, 2, 3)
         np.testing.assert_array_equal(render_bev(scene, size_px, supersample=2), np.round(blocks.mean(axis=(1, 3))))
 
 
@@ -71,18 +71,22 @@ def test_bev_breaks_ties_by_ground_then_last_box():
         size_m=np.array([[2, 2, 2], [2, 2, 2], [3, 3, 2], [2, 2, 1], [0.3, 0.3, 0.1]], np.float32),
     )
     picture = render_bev(scene, 16)
-    np.testing.assert_array_equal(picture, CLASS_COLORS[literal(scene, grid)])
+    np.testing.assert_array_equal(picture, CLASS_COLORS[render_literally(scene, grid)])
 
-    def shown(x_m: float, y_m: float) -> list[int]:
+    def get_color(x_m: float, y_m: float) -> list[int]:
         row, col = grid.pixel(x_m, y_m)
         return picture[row, col].tolist()
 
     ground = CLASS_COLORS[list_ground_ids(scene)[-2]].tolist()
-    assert shown(-2, -2) == ground and shown(-3.9, 3.9) == ground  # a car as high as the ground; the ground is shown
-    assert shown(0.25, 0.25) == shown(1.25, 0.25) == CLASS_COLORS[CATEGORY_IDS[bus]].tolist()
-    assert shown(-0.75, 0.25) == CLASS_COLORS[CATEGORY_IDS[car]].tolist()  # the ellipsoid's top is no higher
-    assert shown(3.25, 3.25) == CLASS_COLORS[CATEGORY_IDS[pole]].tolist()
-    assert shown(0.25, 1.5) == CLASS_COLORS[CATEGORY_IDS[ELLIPSOID]].tolist()
+    assert (
+        get_color(-2, -2) == ground and get_color(-3.9, 3.9) == ground
+    )  # the ground is visible because the car has the same height
+    assert get_color(0.25, 0.25) == get_color(1.25, 0.25) == CLASS_COLORS[CATEGORY_IDS[bus]].tolist()
+    assert (
+        get_color(-0.75, 0.25) == CLASS_COLORS[CATEGORY_IDS[car]].tolist()
+    )  # the car is visible because the ellipsoid is not higher
+    assert get_color(3.25, 3.25) == CLASS_COLORS[CATEGORY_IDS[pole]].tolist()
+    assert get_color(0.25, 1.5) == CLASS_COLORS[CATEGORY_IDS[ELLIPSOID]].tolist()
 
 
 @pytest.mark.parametrize("elevation_deg", [90, 38])
@@ -107,7 +111,7 @@ def test_bev_equals_vertical_rays():
     expected = np.append(class_id, 0)[hit].reshape(x.shape)
     picture = render_bev(scene)[1::3, 1::3]
     same = (picture == CLASS_COLORS[expected]).all(axis=-1)
-    # The ground mesh ends at pixel centres and blends no classes within a triangle: rims may differ.
+    # Borders of the ground may differ: its mesh ends at pixel centres, and each triangle has one class.
     assert same.mean() > 0.98
     objects = expected >= 6
     objects &= expected < 17
@@ -154,10 +158,10 @@ def test_cast_ellipsoids_is_exact():
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
     own = radius[index[row, col], np.arange(len(points))]
-    assert np.allclose(own, 0.5, atol=1e-6)  # on the surface of the one hit
+    assert np.allclose(own, 0.5, atol=1e-6)  # the point is on the surface of the ellipsoid that the ray hits
     homogeneous[:, 2] += 1e-3
     radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
-    assert (radius > 0.5 - 1e-6).all()  # and above all others
+    assert (radius > 0.5 - 1e-6).all()  # no ellipsoid contains a point just above
 
 
 def test_cast_ellipsoids_accepts_none():
