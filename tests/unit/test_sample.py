@@ -1,4 +1,4 @@
-"""The sampler without Ray."""
+"""Tests of the sampler without Ray."""
 
 from dataclasses import replace
 
