@@ -1,4 +1,4 @@
-"""Scene geometry: canonical boxes, the grid, crops and merges."""
+"""Tests of scene geometry: canonical boxes, the grid, crops and merges."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from models.geometry.cholesky import compute_cholesky_parameters, compute_scatte
 from models.scene import Grid, canonicalize_boxes, compute_yaw, merge_scenes
 
 
-def same_corners(a, b):
-    """Each corner of a has a corner of b within 1e-6."""
+def have_same_corners(a, b):
+    """Return True if each corner of a is within 1e-6 m of a corner of b."""
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
     first = np.einsum("nij,nkj->nki", a[0], signs[None] * a[1][:, None])
     second = np.einsum("nij,nkj->nki", b[0], signs[None] * b[1][:, None])
@@ -20,9 +20,9 @@ def same_corners(a, b):
 def test_canonical_boxes_keep_corners():
     rng = np.random.default_rng(0)
     rotation, size = random_rotations(rng, 500), rng.uniform(0.1, 9, (500, 3))
-    rotation[::3, :, 0] *= -1  # mirrored boxes
+    rotation[::3, :, 0] *= -1  # axes of mirrored boxes
     canonical, lwh = canonicalize_boxes(rotation, size)
-    assert same_corners((rotation, size), (canonical, lwh))
+    assert have_same_corners((rotation, size), (canonical, lwh))
     assert np.allclose(np.linalg.det(canonical), 1)
     assert (lwh[:, 0] >= lwh[:, 1]).all()
     assert (np.abs(canonical[:, 2, 2]) >= np.abs(canonical[:, 2, :2]).max(axis=1) - 1e-12).all()
@@ -50,7 +50,7 @@ def test_scatter_matrix_round_trips():
         compute_scatter_matrix(back_rotation, back_size), compute_scatter_matrix(rotation, size), atol=1e-9
     )
     assert np.allclose(np.linalg.det(back_rotation), 1)
-    # Unlike quaternions, equal for R and its mirrored and rotated equivalents.
+    # Unlike quaternions, scatter matrices are equal for all axes of the same box.
     assert np.allclose(compute_cholesky_parameters(rotation * [-1, -1, 1], size), parameters)
 
 
