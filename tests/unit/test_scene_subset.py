@@ -1,4 +1,4 @@
-"""Subsets of scenes: compared with brute force, in corner cases and over several worlds."""
+"""Tests of subsets of scenes: against brute force, in special cases and for several worlds."""
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +27,13 @@ def test_farthest_poses_equal_brute_force():
         expected.append(int(nearest.argmax()))
     assert select_farthest(xy, world, 80).tolist() == expected
     assert select_farthest(xy, world, 7).tolist() == expected[:7]
-    assert sorted(select_farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [0, 1, 2, 3, 4]  # all at the same position
+    assert sorted(select_farthest(np.zeros((5, 2)), np.zeros(5, int), 5)) == [
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]  # all poses have the same position
 
 
 @pytest.mark.parametrize("apart_m", [0.5, 3.0, 40.0, 1e6])
