@@ -1,4 +1,4 @@
-"""Generated ground is blended into known ground: edges and heights are continuous across the seam."""
+"""Tests of ground blending: edges and heights are continuous across the seam."""
 
 from dataclasses import replace
 
@@ -12,12 +12,15 @@ from models.scene import KITTI_GROUND_CLASSES, Grid
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)
 ROAD, SIDEWALK = (KITTI_GROUND_CLASSES.index(name) for name in ("road", "sidewalk"))
 NEW = np.zeros((64, 64), bool)
-NEW[:32] = True  # what lies more than 16 m ahead
+NEW[:32] = True  # the generated region, more than 16 m ahead
 REACH = round(BLEND_M / GRID.resolution_m)
 
 
-def street(left_px: int, height_m: float):
-    """A road of 12 pixels from column `left_px`, with sidewalk on its left, 0.1 m higher, and void on its right."""
+def make_street(left_px: int, height_m: float):
+    """Return a scene with a road of 12 pixels that starts at column `left_px`.
+
+    The sidewalk on its left is 0.1 m higher, and there is no ground on its right.
+    """
     height, occupied = np.zeros((len(KITTI_GROUND_CLASSES), 64, 64), np.float32), np.zeros((5, 64, 64), bool)
     for c, columns, up_m in ((ROAD, slice(left_px, left_px + 12), 0.0), (SIDEWALK, slice(0, left_px), 0.1)):
         occupied[c, :, columns], height[c, :, columns] = True, height_m + up_m
@@ -26,12 +29,14 @@ def street(left_px: int, height_m: float):
 
 
 def test_blend_ground_aligns_shifted_street():
-    known, made = street(20, 0.0), street(23, 0.2)
+    known, made = make_street(20, 0.0), make_street(23, 0.2)
     bent = blend_ground(made, known, NEW)
     for c in (ROAD, SIDEWALK):
-        assert np.array_equal(bent.occupied[c, 31], known.occupied[c, 32])  # across the border: the same columns
+        assert np.array_equal(
+            bent.occupied[c, 31], known.occupied[c, 32]
+        )  # both sides of the seam have the same columns
         assert np.abs(bent.height_m[c, 31] - known.height_m[c, 32]).max() < 0.003
-    # Further ahead it approaches the generated ground, by a pixel and one or two centimetres per row.
+    # Further ahead, the edge moves by at most one pixel per row and the height by at most 3 cm per row.
     left = bent.occupied[ROAD].argmax(axis=1)[:32]
     assert left[0] == 23 and left[31] == 20 and set(np.diff(left)) <= {0, -1}
     along = np.abs(np.diff(bent.height_m[ROAD, :32, 26]))
@@ -42,7 +47,7 @@ def test_blend_ground_aligns_shifted_street():
 
 
 def test_blend_ground_removes_step_at_seam():
-    known, made = street(20, 0.0), street(20, 0.0)
+    known, made = make_street(20, 0.0), make_street(20, 0.0)
     made.height_m[:, :32] += 0.3 * made.occupied[:, :32]
     bent = blend_ground(made, known, NEW)
     for c, column in ((ROAD, 26), (SIDEWALK, 5)):
@@ -51,7 +56,10 @@ def test_blend_ground_removes_step_at_seam():
 
 
 def test_blend_ground_starts_new_class_at_known_height():
-    known, made = street(64, 0.3), street(64, 0.0)  # sidewalk everywhere: known at 0.4 m, generated at 0.1 m
+    known, made = (
+        make_street(64, 0.3),
+        make_street(64, 0.0),
+    )  # both scenes have only sidewalk: known at 0.4 m, generated at 0.1 m
     made.occupied[SIDEWALK, :32], made.occupied[ROAD, :32] = False, True
     made.height_m[SIDEWALK, :32], made.height_m[ROAD, :32] = 0, 0.1
     bent = blend_ground(made, known, NEW)
@@ -61,37 +69,37 @@ def test_blend_ground_starts_new_class_at_known_height():
 
 
 def test_blend_ground_keeps_known_and_matching_pixels():
-    known, made = street(20, 0.0), street(23, 0.2)
+    known, made = make_street(20, 0.0), make_street(23, 0.2)
     bent = blend_ground(made, known, NEW)
     for name in ("occupied", "height_m"):
         assert np.array_equal(getattr(bent, name)[:, ~NEW], getattr(made, name)[:, ~NEW])
     same = blend_ground(known, known, NEW)
     assert np.array_equal(same.occupied, known.occupied) and np.allclose(same.height_m, known.height_m, atol=1e-6)
     assert np.array_equal(same.center_m, known.center_m)
-    known.height_m[:] += 0.2 * GRID.resolution_m * np.arange(64)[:, None] * known.occupied  # a hill of 20 %
+    known.height_m[:] += 0.2 * GRID.resolution_m * np.arange(64)[:, None] * known.occupied  # a slope of 20 %
     assert np.allclose(blend_ground(known, known, NEW).height_m, known.height_m, atol=1e-5)
 
 
 @pytest.mark.parametrize("mask", [np.zeros((64, 64), bool), np.ones((64, 64), bool)])
 def test_blend_ground_without_seam_changes_nothing(mask):
-    made = street(23, 0.2)
-    assert blend_ground(made, street(20, 0.0), mask) is made
+    made = make_street(23, 0.2)
+    assert blend_ground(made, make_street(20, 0.0), mask) is made
 
 
 def test_blend_ground_fades_out_road_into_void():
-    known, made = street(20, 0.0), street(20, 0.0)
+    known, made = make_street(20, 0.0), make_street(20, 0.0)
     made = replace(made, occupied=made.occupied & False, height_m=made.height_m * 0)
     bent = blend_ground(made, known, NEW)
     ahead = bent.occupied[ROAD, :32].any(axis=1)
     assert ahead[31] and not ahead[: 32 - REACH].any()
-    other = blend_ground(known, made, NEW)  # the reverse: known void, generated street
+    other = blend_ground(known, made, NEW)  # the known region is empty, the generated region has a street
     assert not other.occupied[:, 31].any() and np.array_equal(other.occupied[:, 0], known.occupied[:, 0])
     for scene in (bent, other):
         assert not scene.height_m[~scene.occupied].any()
 
 
 def test_blend_ground_keeps_object_height_above_ground():
-    known, made = street(20, 0.0), street(20, 0.5)
+    known, made = make_street(20, 0.0), make_street(20, 0.5)
     center = np.tile(np.float32([18.0, 3.0, 1.0]), (12, 1))
     center[6:, 0] = 31.0
     made = replace(made, center_m=center)
@@ -102,7 +110,7 @@ def test_blend_ground_keeps_object_height_above_ground():
 
 
 def test_blend_ground_ignores_unknown_pixels():
-    known = street(20, 0.0)
+    known = make_street(20, 0.0)
     half = replace(known, occupied=known.occupied & ~NEW, height_m=np.where(NEW, 0, known.height_m).astype(np.float32))
     for scene in (extrapolate_ground(half, NEW), extrapolate_ground(known, np.zeros_like(NEW))):
         assert np.array_equal(scene.occupied, known.occupied) and np.array_equal(scene.height_m, known.height_m)
