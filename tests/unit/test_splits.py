@@ -1,4 +1,4 @@
-"""The split of the paper (supplement A) equals a literal second implementation and brute-force distances."""
+"""Tests of the split of the paper (supplement A) against a literal implementation and all pairs of distances."""
 
 import logging
 
@@ -8,16 +8,16 @@ import pytest
 from pipelines.schema.splits import count_segments, make_no_split, split_poses
 
 
-def winding_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray) -> np.ndarray:
-    """(p, 3) positions every .3 to 1.1 m along a smooth random course."""
+def draw_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray) -> np.ndarray:
+    """Return positions (p, 3) every 0.3 to 1.1 m along a smooth random path."""
     step_m = rng.uniform(0.3, 1.1, int(length_m / 0.7))
     yaw = np.cumsum(rng.normal(0, 0.03, len(step_m)))
     steps = np.stack([np.cos(yaw), np.sin(yaw), 0.01 * np.sin(yaw)], axis=1) * step_m[:, None]
     return start_m + np.cumsum(steps, axis=0)
 
 
-def by_the_book(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """The split of the supplement, computed pose by pose."""
+def split_literally(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[str]]:
+    """Compute the split of the supplement pose by pose."""
     driven, label = 0.0, {}
     for sequence, positions in positions_by_sequence.items():
         for k in range(len(positions)):
@@ -43,12 +43,12 @@ def by_the_book(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[
 def test_split_equals_literal_supplement():
     rng = np.random.default_rng(0)
     drives = {
-        "0000": winding_drive(rng, 900, np.array([0.0, 0, 100])),
-        "0002": winding_drive(rng, 400, np.array([50.0, 20, 100])),  # crosses the first
-        "0003": winding_drive(rng, 700, np.array([3000.0, 0, 90])),
+        "0000": draw_drive(rng, 900, np.array([0.0, 0, 100])),
+        "0002": draw_drive(rng, 400, np.array([50.0, 20, 100])),  # this drive crosses the first
+        "0003": draw_drive(rng, 700, np.array([3000.0, 0, 90])),
     }
     split = split_poses(drives)
-    assert {s: label.tolist() for s, label in split.items()} == by_the_book(drives)
+    assert {s: label.tolist() for s, label in split.items()} == split_literally(drives)
 
 
 def test_split_keeps_train_poses_5_m_from_test_poses():
@@ -67,7 +67,8 @@ def test_split_of_straight_drive_has_100_test_regions_of_15_m():
     starts = np.flatnonzero((split[1:] == "test") & (split[:-1] != "test"))
     assert len(starts) == 100
     assert abs((split == "test").sum() - 1500) <= 100
-    # 200 m segments: 5 m at their end and 5 m before the test region belong to no split; removal adds 5 m
+    # Each segment of 200 m has 10 m without a split: 5 m at its end and 5 m before the test region.
+    # The removal of poses within 5 m of the other split adds few poses.
     assert abs((split == "unused").sum() - 1000) <= 200
 
 
