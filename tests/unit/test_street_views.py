@@ -1,4 +1,4 @@
-"""Street views equal ray casting, centrelines equal known lines, and OpenDRIVE files follow the schema."""
+"""Tests of street views against ray casting, of centrelines, and of OpenDRIVE files against their schema."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -27,8 +27,8 @@ def town_scenes() -> list[Scene]:
     return [generate_town(seed).scene(k, "test") for seed, k in ((3, 20), (4, 20), (8, 10))]
 
 
-def rays(camera: StreetCamera) -> np.ndarray:
-    """(h, w, 3) scene-frame directions whose camera z is 1."""
+def compute_rays(camera: StreetCamera) -> np.ndarray:
+    """Return ray directions (h, w, 3) in the scene frame, with a camera z of 1."""
     lens = camera.lens
     u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     local = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(u.shape)], axis=-1)
@@ -40,11 +40,11 @@ def rays(camera: StreetCamera) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_street_view_equals_ray_casting(seed):
-    """Compares with embree on the whole mesh, and with the exact quadric where embree sees facets of ellipsoids."""
+    """The references are embree for the mesh of boxes and ground, and the exact quadric for ellipsoids."""
     scene = random_scene(seed, 60, tilt_rad=0.4)
-    # Rays hit outer faces only, as in the renderer: a camera inside a box sees out of it.
+    # As in the renderer, rays hit only outer faces, so a camera inside a box sees through its faces.
     camera = StreetCamera.at([1.0, 2.0, 3.0], 0.2, -0.1, SMALL)
-    view, way = StreetRenderer(scene).view(camera), rays(camera)
+    view, way = StreetRenderer(scene).view(camera), compute_rays(camera)
     soup = triangulate_scene(scene)
     flat = scene.category[soup.primitive.clip(0)] != ELLIPSOID
     flat |= soup.primitive == GROUND
@@ -65,7 +65,9 @@ def test_street_view_equals_ray_casting(seed):
         unit = (scene.rotation[index] * (2 / scene.size_m[index])).T.astype(float)
         d, p = directions @ unit.T, unit @ (scene.center_m[index] - camera.position_m)
         a, b, c = (d * d).sum(1), d @ p, p @ p - 1
-        if camera.local(scene.center_m[index])[2] < 3.5 or c < 0:  # objects next to or around the camera are excluded
+        if (
+            camera.local(scene.center_m[index])[2] < 3.5 or c < 0
+        ):  # exclude ellipsoids that are near the camera or contain it
             continue
         inside = b * b - a * c
         near = np.where((inside > 0) & (b > 0), (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
@@ -85,21 +87,21 @@ def test_street_view_normals_face_camera_and_are_deterministic(town_scenes):
     view, again = renderer.view(camera), renderer.view(camera)
     seen = np.isfinite(view.depth_m)
     assert np.allclose(np.linalg.norm(view.normal[seen], axis=1), 1, atol=1e-4)
-    assert ((view.normal * rays(camera)).sum(axis=-1)[seen] < 1e-4).all()
+    assert ((view.normal * compute_rays(camera)).sum(axis=-1)[seen] < 1e-4).all()
     for one, other in zip(view, again, strict=True):
         assert np.array_equal(one, other)
     assert shade_view(view).shape == (47, 176, 3) and len(np.unique(shade_view(view).reshape(-1, 3), axis=0)) > 50
 
 
 def test_street_view_clips_at_near_plane():
-    """A long box next to the camera, from behind it to far ahead: its side fills the left half of the picture."""
+    """The side of a long box, from behind the camera to far ahead, fills the left half of the picture."""
     scene = random_scene(0, 1, tilt_rad=0)
     box = {"category": np.array([6], np.int8), "center_m": np.array([[0, 3, 0]], np.float32), "label": UNSET}
     box |= {"size_m": np.array([[100, 2, 8]], np.float32), "rotation": np.eye(3, dtype=np.float32)[None]}
     scene = replace(scene, occupied=np.zeros_like(scene.occupied), height_m=np.zeros_like(scene.height_m), **box)
     lens = Lens(100, 50, 50.0, 50.0, 49.5, 24.5)
     view = StreetRenderer(scene).view(StreetCamera.at([0, 0, 0], 0.0, lens=lens))
-    u = np.arange(50)  # left half: the plane y = 2 m
+    u = np.arange(50)  # the left half of the picture shows the plane y = 2 m
     expected = 2 / ((49.5 - u) / 50.0)
     assert np.allclose(view.depth_m[25, :48], expected[:48], rtol=1e-4) and (view.primitive[:, 50:] == GROUND).all()
 
@@ -107,7 +109,7 @@ def test_street_view_clips_at_near_plane():
 def test_street_view_at_half_resolution_shows_same_view():
     full, half = Lens(), Lens().resize(704, 188)
     assert half.fx == pytest.approx(full.fx / 2)
-    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # the borders of the picture have the same directions
+    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # borders of the picture have equal directions at both resolutions
         there = ((corner[0] + 0.5) / 2 - 0.5 - half.cx) / half.fx, ((corner[1] + 0.5) / 2 - 0.5 - half.cy) / half.fy
         assert np.allclose(there, [(corner[0] - full.cx) / full.fx, (corner[1] - full.cy) / full.fy])
 
@@ -115,8 +117,8 @@ def test_street_view_at_half_resolution_shows_same_view():
 # --------------------------------------------------------------------------------------------------------- roads
 
 
-def scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = None) -> Scene:
-    """A scene whose road covers all points within half a width of some lines (k, 2), on a slope of 2 %."""
+def make_scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = None) -> Scene:
+    """Return a scene on a slope of 2 % whose road covers all points within width_m / 2 of the lines (k, 2)."""
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     road = np.zeros(x.shape, bool)
@@ -131,8 +133,8 @@ def scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = N
     return replace(scene, occupied=occupied, height_m=np.where(occupied, 0.02 * x, 0).astype(np.float32))
 
 
-def off_m(points: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
-    """(k,) distance of points (k, 2) from the nearest of the lines."""
+def compute_distance_m(points: np.ndarray, ways: list[np.ndarray]) -> np.ndarray:
+    """Return the distance (k,) of points (k, 2) from the nearest line in m."""
     found = []
     for way in ways:
         for a, b in zip(way[:-1], way[1:], strict=True):
@@ -150,10 +152,10 @@ SIDE = np.array([[30.0, 3.0], [30.0, 60.0]])
 
 @pytest.mark.parametrize("way, width_m", [(STRAIGHT, 6.5), (OBLIQUE, 7.0), (ARC, 6.0)])
 def test_centerlines_of_single_road_equal_its_axis(way, width_m):
-    network = extract_road_network(scene_of_roads([way], width_m))
+    network = extract_road_network(make_scene_of_roads([way], width_m))
     (road,) = network.roads
     assert (road.start, road.end, len(network.nodes_m)) == (-1, -1, 0)
-    assert off_m(road.xyz_m[:, :2], [way]).max() < 0.6
+    assert compute_distance_m(road.xyz_m[:, :2], [way]).max() < 0.6
     assert np.median(np.abs(road.width_m - width_m)) < 0.6
     inner = road.xyz_m[(road.xyz_m[:, 0] > 8) & (road.xyz_m[:, 0] < 56)]
     assert np.abs(inner[:, 2] - 0.02 * inner[:, 0]).max() < 0.05
@@ -162,23 +164,23 @@ def test_centerlines_of_single_road_equal_its_axis(way, width_m):
 
 
 def test_centerlines_split_at_side_street():
-    network = extract_road_network(scene_of_roads([STRAIGHT, SIDE], 6.5))
+    network = extract_road_network(make_scene_of_roads([STRAIGHT, SIDE], 6.5))
     assert len(network.roads) == 3 and len(network.nodes_m) == 1
     assert np.linalg.norm(network.nodes_m[0, :2] - [30, 3]) < 1.5
     assert len(network.list_leaving(0)) == 3 and sorted(r.start + r.end for r in network.roads) == [-1, -1, -1]
     for road in network.list_leaving(0):
-        assert road.end == -1 and off_m(road.xyz_m[:, :2], [STRAIGHT, SIDE]).max() < 1.2
+        assert road.end == -1 and compute_distance_m(road.xyz_m[:, :2], [STRAIGHT, SIDE]).max() < 1.2
 
 
 def test_centerlines_have_one_node_per_crossing_without_spurs():
     across = np.array([[34.0, -60.0], [34.0, 60.0]])
-    scene = scene_of_roads([STRAIGHT, across], 7.0)
+    scene = make_scene_of_roads([STRAIGHT, across], 7.0)
     network = extract_road_network(scene)
     assert len(network.roads) == 4 and len(network.nodes_m) == 1 and len(network.list_leaving(0)) == 4
     rough = scene.occupied.copy()
     rng = np.random.default_rng(0)
-    rough[0] &= rng.random(rough[0].shape) > 0.02  # pinholes
-    rough[0, 5:9, 5:9] = True  # an island
+    rough[0] &= rng.random(rough[0].shape) > 0.02  # small holes in the road
+    rough[0, 5:9, 5:9] = True  # a separate piece of road
     spotted = extract_road_network(replace(scene, occupied=rough, height_m=np.where(rough, scene.height_m, 0)))
     assert len(spotted.roads) == 4
     nothing = np.zeros_like(scene.occupied)
@@ -186,17 +188,19 @@ def test_centerlines_have_one_node_per_crossing_without_spurs():
 
 
 def test_route_goes_straight_and_keeps_right():
-    network = extract_road_network(scene_of_roads([STRAIGHT, SIDE], 6.0))
+    network = extract_road_network(make_scene_of_roads([STRAIGHT, SIDE], 6.0))
     way = plan_drive(network)
     assert len(plan_drive(replace(network, roads=()))) == 0
-    assert way[0, 0] < 2 and way[-1, 0] > 60  # past the side street
+    assert way[0, 0] < 2 and way[-1, 0] > 60  # the drive passes the side street
     inner = way[(way[:, 0] > 5) & ((way[:, 0] < 20) | (way[:, 0] > 42))]
-    assert np.abs(inner[:, 1] - 1.5).max() < 0.5  # a quarter of 6 m right of y = 3
+    assert np.abs(inner[:, 1] - 1.5).max() < 0.5  # the lane centre is 6 m / 4 to the right of y = 3 m
     assert (np.diff(way[:, 0]) > 0).all()
     left = plan_drive(network, right=-0.25)
     assert left[10:20, 1].mean() > 4
     back = plan_drive(network, start_m=(64.0, 3.0))
-    assert back[0, 0] > 60 and back[-1, 0] < 4 and back[10:15, 1].mean() > 3.5  # right is the other side
+    assert (
+        back[0, 0] > 60 and back[-1, 0] < 4 and back[10:15, 1].mean() > 3.5
+    )  # in this direction, the right lane is on the other side
 
 
 # ----------------------------------------------------------------------------------------------------- OpenDRIVE
@@ -208,8 +212,8 @@ def schema() -> etree.XMLSchema:
     return etree.XMLSchema(etree.parse(str(path)))
 
 
-def sampled(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-    """(k, 3) points and (k,) headings of the reference line of a road, computed as the standard defines them."""
+def sample_reference_line(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (k, 3) and headings (k,) of the reference line of a road, as the standard defines them."""
     points, headings = [], []
     elevation = [{k: float(v) for k, v in e.attrib.items()} for e in road.iter("elevation")]
     for geometry in road.iter("geometry"):
@@ -228,13 +232,13 @@ def sampled(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
         points.append(np.stack([x, y, z], axis=1))
         headings.append(np.arctan2(np.gradient(y, t), np.gradient(x, t)))
     for before, after in zip(points[:-1], points[1:], strict=True):
-        assert np.abs(before[-1] - after[0]).max() < 1e-4  # joined
+        assert np.abs(before[-1] - after[0]).max() < 1e-4  # geometries are continuous
     return np.concatenate(points), np.concatenate(headings)
 
 
 def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
     counted = 0
-    for scene in [*town_scenes, scene_of_roads([STRAIGHT, SIDE], 12.5)]:
+    for scene in [*town_scenes, make_scene_of_roads([STRAIGHT, SIDE], 12.5)]:
         content = export_opendrive(scene)
         schema.assertValid(etree.fromstring(content))
         network, root = extract_road_network(scene), ET.fromstring(content)
@@ -242,12 +246,12 @@ def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
         roads = root.findall("road")
         assert root.find("header/offset").get("hdg") is not None and len(roads) >= len(lines)
         for element, road, line in zip(roads, network.roads, lines, strict=False):
-            points, headings = sampled(element)
+            points, headings = sample_reference_line(element)
             way = road.xyz_m
-            assert off_m(points[:, :2], [way[:, :2]]).max() < 0.5
+            assert compute_distance_m(points[:, :2], [way[:, :2]]).max() < 0.5
             nearest = np.linalg.norm(points[:, None, :2] - way[None, :, :2], axis=2).argmin(axis=1)
             assert np.abs(points[:, 2] - way[nearest, 2]).max() < 0.1
-            assert np.abs(np.angle(np.exp(1j * np.diff(headings)))).max() < 0.05  # smooth
+            assert np.abs(np.angle(np.exp(1j * np.diff(headings)))).max() < 0.05  # headings change smoothly
             assert float(element.get("length")) == pytest.approx(line.length_m)
             width_m = [
                 sum(float(lane.find("width").get("a")) for lane in element.findall(f"lanes/laneSection/{side}/lane"))
@@ -260,7 +264,7 @@ def test_opendrive_follows_schema_and_centerlines(town_scenes, schema):
 
 
 def test_opendrive_junction_connects_lanes_of_its_roads(schema):
-    root = ET.fromstring(export_opendrive(scene_of_roads([STRAIGHT, SIDE], 6.5)))
+    root = ET.fromstring(export_opendrive(make_scene_of_roads([STRAIGHT, SIDE], 6.5)))
     roads = {road.get("id"): road for road in root.findall("road")}
     (junction,) = root.findall("junction")
     connections = junction.findall("connection")
@@ -268,14 +272,14 @@ def test_opendrive_junction_connects_lanes_of_its_roads(schema):
     for connection in connections:
         way = roads[connection.get("connectingRoad")]
         assert way.get("junction") == junction.get("id")
-        points, headings = sampled(way)
+        points, headings = sample_reference_line(way)
         for which, name in ((0, "predecessor"), (-1, "successor")):
             link = way.find(f"link/{name}")
-            other_points, other_headings = sampled(roads[link.get("elementId")])
+            other_points, other_headings = sample_reference_line(roads[link.get("elementId")])
             end = 0 if link.get("contactPoint") == "start" else -1
             assert np.abs(points[which] - other_points[end]).max() < 1e-3
             turn = headings[which] - other_headings[end]
-            assert abs(np.sin(turn)) < 0.05  # parallel to it, in either direction
+            assert abs(np.sin(turn)) < 0.05  # the roads are parallel, in either direction
             leads_on = (which == 0) == (end == -1)
             assert (np.cos(turn) > 0) == leads_on
         link = connection.find("laneLink")
