@@ -1,4 +1,4 @@
-"""Extending and inpainting of scenes larger than a block, and the studio without Ray."""
+"""Tests of extending and inpainting scenes larger than a block, and of the studio without Ray."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ SPEC = small_spec()
 
 
 @pytest.mark.parametrize("side", ["ahead", "behind", "left", "right"])
-def test_extend_scene_grows_to_side_and_keeps_given_part(side):
+def test_extend_scene_grows_to_side_and_keeps_given_scene(side):
     pipeline, scene, quick = tiny_pipeline(SPEC), studio_scene(1), RePaintConfig(4, 2, 1)
     once = extend_scene(pipeline, scene, side, "low", repaint=quick)
     assert once.grid == expand_grid(scene.grid, side, SPEC.grid.rows // 2)
@@ -62,7 +62,7 @@ def test_inpaint_regenerates_only_region_of_large_scene(contents):
         row, col = scene.grid.pixel(*scene.center_m[:, :2].T)
         kept = scene.center_m[~inside[row, col] | (contents == "ground")]
         assert np.array_equal(new.center_m[: len(kept)], kept)
-    # On a scene of the size of a block it equals the inpainting of the pipeline.
+    # For a scene of the size of a block, the result equals inpainting by the pipeline.
     scene = studio_scene(2)
     region = select_polygon(scene.grid, [(20, -10), (40, -10), (40, 10), (20, 10)])
     *_, last = inpaint_blocks(pipeline, scene, region, "low", contents, repaint=quick)
@@ -73,7 +73,7 @@ def test_inpaint_regenerates_only_region_of_large_scene(contents):
 
 
 def test_studio_requires_its_token(studio_files):
-    """The same interface without Ray, on any host name."""
+    """The test uses the interface of the studio without Ray and accepts any host name."""
     from starlette.testclient import TestClient
 
     from pipelines.studio.api import build_studio_app
@@ -87,4 +87,4 @@ def test_studio_requires_its_token(studio_files):
         "low",
         "medium",
         "high",
-    ]  # the cookie holds the token from now on
+    ]  # the session cookie contains the token
