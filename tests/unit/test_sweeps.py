@@ -1,4 +1,4 @@
-"""Sweeps over sizes of the reference set and over samplers and numbers of steps."""
+"""Tests of sweeps over reference sets, samplers and numbers of steps."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,9 @@ def test_reference_sizes_fit_both_sides():
     xy, world = rng.uniform(0, 100, (200, 2)), np.zeros(200, int)
     got = list(list_references(xy, world, (10, 50, 150, 400), (30.0, 1.0, 1e-6), least=4, most=120))
     assert [(one.strategy, one.setting) for one in got][:2] == [("farthest", 10), ("farthest", 50)]
-    assert [one.setting for one in got if one.strategy == "apart"] == [30.0]  # more than 120 of 1 m
+    assert [one.setting for one in got if one.strategy == "apart"] == [
+        30.0
+    ]  # a distance of 1 m selects more than 120 scenes
     assert np.array_equal(got[0].rows, select_farthest(xy, world, 10)) and np.array_equal(got[1].rows[:10], got[0].rows)
     assert np.array_equal(got[-1].rows, select_apart(xy, world, 30.0))
 
@@ -34,7 +36,7 @@ def test_reference_sweep_rejects_unfit_references():
 # -------------------------------------------------------------------------------------------------------- samplers
 
 
-def row_of(sampler: str, steps: int, frechet: Estimate, cars: float = 10.0, scaling: float = 1.0) -> dict:
+def make_row(sampler: str, steps: int, frechet: Estimate, cars: float = 10.0, scaling: float = 1.0) -> dict:
     validity = {name: {"generated": Estimate(0.5, 0.4, 0.6)} for name in ("road_connectivity", "overlapping")}
     counts = {"car": (20.0, cars), "tree": (50.0, 45.0), "human": (0.2, 0.0)}
     scores = {
@@ -54,27 +56,27 @@ def row_of(sampler: str, steps: int, frechet: Estimate, cars: float = 10.0, scal
 
 
 def test_sampler_sweep_compares_with_ddpm_of_most_steps():
-    paper = row_of("ddpm", 250, Estimate(2.0, 1.5, 2.5))
-    near, far = row_of("dpm++", 20, Estimate(2.8, 2.4, 3.2)), row_of("ddpm", 10, Estimate(9.0, 8.0, 10.0))
+    paper = make_row("ddpm", 250, Estimate(2.0, 1.5, 2.5))
+    near, far = make_row("dpm++", 20, Estimate(2.8, 2.4, 3.2)), make_row("ddpm", 10, Estimate(9.0, 8.0, 10.0))
     rows = [far, paper, near]
     assert near["seconds_per_scene"] == 2 and near["layout_frechet_high"] == 3.2 and near["sunken"] is None
     assert (
         find_reference_row(rows) is paper
-        and find_reference_row([near, row_of("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
+        and find_reference_row([near, make_row("ddim", 50, Estimate(1, 1, 1))])["steps"] == 50
     )
     assert is_as_good_as(near, paper) and not is_as_good_as(far, paper)
-    assert is_as_good_as(row_of("dpm++", 20, Estimate(0.5, 0.4, 0.6)), paper)  # a better score also counts as equal
+    assert is_as_good_as(make_row("dpm++", 20, Estimate(0.5, 0.4, 0.6)), paper)  # a better score also counts as good
     assert (near["count_category"], near["count_ratio"], near["count_ratio_low"]) == (
         "car",
         0.5,
         0.45,
-    )  # humans are few
-    more = [row_of("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
+    )  # humans are too few for a ratio
+    more = [make_row("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
     assert [is_as_good_as(row, paper) for row in more] == [True, True, False]
     assert [row[-1] for row in build_sampler_table(rows).rows] == ["no", "–", "yes"]
     (layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
     assert page.count("<svg") == 4 and "as good as ddpm of 250" in page
-    scaled = row_of("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
-    assert find_reference_row([*rows, scaled]) is paper  # the paper does not scale the noise
+    scaled = make_row("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
+    assert find_reference_row([*rows, scaled]) is paper  # the reference row is without noise scaling, as in the paper
     assert build_sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
