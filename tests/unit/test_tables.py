@@ -1,4 +1,4 @@
-"""Tables round-trip scenes, and other tools can read them."""
+"""Tests of tables: scenes round-trip, and DuckDB can query the files."""
 
 import duckdb
 import numpy as np
@@ -91,12 +91,12 @@ def test_shard_names_truncated_and_missing_files(tmp_path, scenes):
 def test_shard_write_is_atomic(tmp_path):
     target = str(tmp_path / "a" / "b.json")
 
-    def fails(stream):
+    def fail_during_write(stream):
         stream.write(b"{")
         raise RuntimeError("disk full")
 
     with pytest.raises(RuntimeError):
-        storage.write_whole(target, fails)
+        storage.write_whole(target, fail_during_write)
     assert list((tmp_path / "a").iterdir()) == []
     storage.write_json({"a": 1}, target)
     assert storage.read_json(target) == {"a": 1}
