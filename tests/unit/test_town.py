@@ -1,4 +1,4 @@
-"""The town has the statistics of KITTI-360, valid geometry, and round-trips the KITTI-360 format."""
+"""Tests of the town generator: statistics of KITTI-360, valid geometry and the KITTI-360 format."""
 
 import subprocess
 import sys
@@ -32,8 +32,8 @@ def drives():
 
 
 @pytest.fixture(scope="module")
-def thousand():
-    """(counts of 1,000 test scenes, relief of every tenth in metres)."""
+def large_sample():
+    """Counts of 1,000 test scenes, and the relief of every tenth scene in m."""
     relief = []
 
     def scenes():
@@ -48,15 +48,15 @@ def thousand():
     return make_sample(scenes()), np.array(relief)
 
 
-def test_town_scenes_have_target_statistics(thousand):
-    sample, _ = thousand
+def test_town_scenes_have_target_statistics(large_sample):
+    sample, _ = large_sample
     assert len(sample.counts) == 1_000
     missed = [f"{r.what} ({r.label}): {r.measured:.2f}, target {r.target:g}" for r in measure_town(sample) if not r.ok]
     assert not missed, "\n".join(missed)
 
 
-def test_town_counts_are_overdispersed_with_every_category(thousand):
-    counts = thousand[0].counts
+def test_town_counts_are_overdispersed_with_every_category(large_sample):
+    counts = large_sample[0].counts
     dispersion = dict(zip(CATEGORIES, counts.var(axis=0) / counts.mean(axis=0), strict=True))
     assert (counts.sum(axis=0) > 0).all()
     for name in ("vegetation_cuboid", "vegetation_ellipsoid", "construction_small", "object"):
@@ -66,9 +66,9 @@ def test_town_counts_are_overdispersed_with_every_category(thousand):
     assert dispersion["construction_big"] > 1, dispersion
 
 
-def test_town_vegetation_and_relief_are_in_stated_ranges(thousand):
-    """Medians lie within the stated ranges (p05 to p95) of count and volume per label; tails lie close to them."""
-    sample, relief = thousand
+def test_town_vegetation_and_relief_are_in_stated_ranges(large_sample):
+    """Medians are within the stated ranges (p05 to p95) of count and volume per label; tails are close to them."""
+    sample, relief = large_sample
     label = sample.labels()
     for which, count_range, volume_range in (
         ("low", (13, 36), (700, 8_000)),
@@ -113,8 +113,8 @@ def test_town_imu_is_above_road_with_z_down_and_small_tilt(drives):
         for index in range(0, len(drive), 40):
             scene = drive.scene(index, grid=Grid(front_m=32.0))
             road = scene.ground_classes.index("road")
-            assert scene.occupied[road, 126:130, 126:130].all()  # the car is on a road
-            # Slab tops lie 0.3 m above the true surface, the IMU 0.93 m.
+            assert scene.occupied[road, 126:130, 126:130].all()  # the ego vehicle is on a road
+            # Slab tops are 0.3 m above the true surface, and the IMU is 0.93 m above it.
             assert abs(scene.height_m[road, 128, 128] + 0.63) < 0.06
 
 
@@ -135,7 +135,7 @@ def test_town_cars_stand_on_surface_near_roads(drives):
                 near += lanes[max(0, r - 12) : r + 13, max(0, c - 12) : c + 13].any()
     gaps = np.concatenate(gaps)
     assert np.percentile(np.abs(gaps), 98) < 0.12
-    assert near / total > 0.7  # the other cars are on driveways and car parks
+    assert near / total > 0.7  # all other cars are on driveways and car parks
 
 
 def test_town_moving_objects_avoid_parked_ones(drives):
@@ -149,7 +149,7 @@ def test_town_moving_objects_avoid_parked_ones(drives):
 
 
 def test_town_streets_are_connected(drives):
-    """Road slabs that touch form one piece."""
+    """All road slabs belong to one connected component."""
     for drive in drives:
         ground = drive.ground
         roads = np.flatnonzero(ground.slab_class == drive.ground_classes.index("road"))
@@ -179,7 +179,7 @@ def test_town_slabs_are_closed_simple_and_disjoint(drives):
         faces = ground.triangles[ground.vertex_slab[ground.triangles[:, 0]] == slab]
         assert 4 <= n <= 40 and len(faces) == 4 * n - 4
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-        assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
+        assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # the slab is closed
         assert np.allclose(vertices[:n, 2] - vertices[n:, 2], 0.6)
         outline = shapely.Polygon(vertices[:n, :2])
         assert outline.is_valid
@@ -192,7 +192,7 @@ def test_town_slabs_are_closed_simple_and_disjoint(drives):
         corners.append(n)
     union = shapely.union_all([polygon.buffer(-0.02) for polygon in polygons])
     total = sum(polygon.area for polygon in polygons)
-    assert union.area > 0.97 * total  # slabs abut, up to bends and rounding
+    assert union.area > 0.97 * total  # slabs do not overlap, except at bends and for rounding
     assert 120 < np.median(areas["road"]) < 320
     assert 10 < np.median(areas["sidewalk"]) < 35
     assert 0.15 < np.mean(np.array(corners) == 4) < 0.6
