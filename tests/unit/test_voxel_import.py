@@ -1,4 +1,4 @@
-"""Voxel files are read in any axis convention, drawn from above and scored on the full grid."""
+"""Tests of the voxel import: axis conventions, pictures from above and invalid files."""
 
 import io
 from dataclasses import replace
@@ -54,7 +54,7 @@ def test_read_voxels_repeats_coarse_voxels(tmp_path, shape):
 
 
 def test_read_voxels_undoes_every_axis_convention(tmp_path):
-    """A voxel at x (forward), y (left), z (up) is the same in any axis order and direction of a file."""
+    """A voxel at x (forward), y (left), z (up) is read correctly for each axis order and direction of a file."""
     ours = random_voxels((64, 64, 8))
     for letters in permutations("xyz"):
         for signs in product("+-", repeat=3):
@@ -76,14 +76,14 @@ def test_voxel_picture_shows_topmost_filled_voxel():
 
 
 def test_voxel_picture_agrees_with_picture_of_primitives(town_scenes):
-    """They differ where a primitive covers no voxel centre."""
+    """The pictures differ where a primitive covers no voxel centre."""
     tall = VoxelGrid(bottom_m=-10.0, top_m=22.0, levels=64)
     for scene in town_scenes[:3]:
         same = (draw_voxels(voxelize(scene, tall)) == render_bev(scene)).all(axis=2)
         assert same.mean() > 0.99
 
 
-def compressed(**arrays) -> bytes:
+def compress_arrays(**arrays) -> bytes:
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
     return content.getvalue()
@@ -91,16 +91,16 @@ def compressed(**arrays) -> bytes:
 
 FAULTS = {
     "text": (lambda: b"hello", r"not a zip file"),
-    "truncated": (lambda: compressed(voxels=random_voxels())[:-200], r"not a zip file"),
-    "shape": (lambda: compressed(voxels=np.zeros((256, 256, 16), np.uint8)), r"holds 256 x 256 x 16 of uint8"),
-    "flat": (lambda: compressed(voxels=np.zeros((256, 256), np.uint8)), r"array of shape \(256, 256\)"),
-    "batch": (lambda: compressed(voxels=np.zeros((9, *FULL), np.uint8)), r"more than one scene"),
-    "floats": (lambda: compressed(voxels=np.zeros(FULL, np.float32)), r"of float32"),
-    "class": (lambda: compressed(voxels=np.full((64, 64, 8), 18)), r"class ids \[18\]"),
-    "negative": (lambda: compressed(voxels=np.full((64, 64, 8), -1)), r"class ids \[-1\]"),
-    "two": (lambda: compressed(a=np.zeros(2), b=np.zeros(2)), r"holds a, b"),
-    "none": (lambda: compressed(), r"holds nothing"),
-    "pickle": (lambda: compressed(voxels=np.array([{}], object)), r"allow_pickle=False"),
+    "truncated": (lambda: compress_arrays(voxels=random_voxels())[:-200], r"not a zip file"),
+    "shape": (lambda: compress_arrays(voxels=np.zeros((256, 256, 16), np.uint8)), r"holds 256 x 256 x 16 of uint8"),
+    "flat": (lambda: compress_arrays(voxels=np.zeros((256, 256), np.uint8)), r"array of shape \(256, 256\)"),
+    "batch": (lambda: compress_arrays(voxels=np.zeros((9, *FULL), np.uint8)), r"more than one scene"),
+    "floats": (lambda: compress_arrays(voxels=np.zeros(FULL, np.float32)), r"of float32"),
+    "class": (lambda: compress_arrays(voxels=np.full((64, 64, 8), 18)), r"class ids \[18\]"),
+    "negative": (lambda: compress_arrays(voxels=np.full((64, 64, 8), -1)), r"class ids \[-1\]"),
+    "two": (lambda: compress_arrays(a=np.zeros(2), b=np.zeros(2)), r"holds a, b"),
+    "none": (lambda: compress_arrays(), r"holds nothing"),
+    "pickle": (lambda: compress_arrays(voxels=np.array([{}], object)), r"allow_pickle=False"),
 }
 
 
