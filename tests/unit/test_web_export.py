@@ -1,4 +1,4 @@
-"""The scene that the web viewer receives equals the scene of the tables."""
+"""Tests of the web export: the web viewer receives the scene of the tables."""
 
 import base64
 import io
