@@ -1,4 +1,4 @@
-"""The catalogue, contact sheets and the dataset page show the contents of the tables."""
+"""Tests of the catalogue, of contact sheets and of the dataset page."""
 
 import re
 from collections import Counter
@@ -26,13 +26,13 @@ from pipelines.schema.tables import Shard
 
 
 @pytest.fixture(scope="module")
-def facts(town_dataset):
+def dataset_facts(town_dataset):
     return read_facts(town_dataset)
 
 
 @pytest.fixture(scope="module")
 def generated(tmp_path_factory):
-    """Four generated scenes: no dataset.json, no pose, no vehicle label."""
+    """Folder with four generated scenes, without dataset.json, poses and vehicle labels."""
     root = str(tmp_path_factory.mktemp("inspect") / "generated")
     grid = Grid(rows=32, cols=32, resolution_m=2)
     fields = {"source": "generated-x", "split": "generated", "sequence": "0", "vegetation_density": "low", "grid": grid}
@@ -129,7 +129,9 @@ def test_plate_draws_heights_on_color_scale():
         picture[known & (surface >= high)] == RAMP[-1]
     ).all()
     order = surface[known].argsort()
-    assert (np.diff(picture[known].astype(int)[order][:, 1]) >= 0).all()  # the ramp's green only rises
+    assert (
+        np.diff(picture[known].astype(int)[order][:, 1]) >= 0
+    ).all()  # the green channel of the colour scale increases
 
 
 def test_plate_footprints_equal_mesh_projections():
@@ -169,8 +171,8 @@ def test_histograms_count_every_scene_once(counts):
     assert sum(histogram_titles(draw_count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
 
 
-def test_dataset_page_is_well_formed_and_self_contained(facts):
-    html = render_dataset_html(facts)
+def test_dataset_page_is_well_formed_and_self_contained(dataset_facts):
+    html = render_dataset_html(dataset_facts)
     page = SvgPage(html)
     assert not re.search(r"https?:|//[a-z]|@import", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html))
     assert not page.all("script") and not page.all("link")
@@ -187,8 +189,8 @@ def test_dataset_page_is_well_formed_and_self_contained(facts):
         assert text in page.text
 
 
-def test_dataset_page_states_table_contents(facts, town_dataset):
-    html = render_dataset_html(facts)
+def test_dataset_page_states_table_contents(dataset_facts, town_dataset):
+    html = render_dataset_html(dataset_facts)
     scenes = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes()]
     for k, name in enumerate(CATEGORIES):
         counts = np.array([s.counts()[k] for s in scenes])
@@ -197,18 +199,18 @@ def test_dataset_page_states_table_contents(facts, town_dataset):
         assert all(sum(histogram_titles(svg)) == len(scenes) for svg in drawn)
         if counts.any():
             sizes = np.concatenate([s.size_m[s.category == k] for s in scenes])
-            assert np.array_equal(np.sort(facts.sizes_m[name], axis=0), np.sort(sizes, axis=0))
+            assert np.array_equal(np.sort(dataset_facts.sizes_m[name], axis=0), np.sort(sizes, axis=0))
     for name, slots in TOWN_SLOTS.items():
         counts = [s.counts()[CATEGORIES.index(name)] for s in scenes if s.split == "train"]
         p95 = max(1, int(np.ceil(np.percentile(counts, 95))))
         svg = re.search(rf'aria-label="scenes by number of {name.replace("_", " ")}".*?</svg>', html).group()
         assert f">slots {slots}<" in svg and f">p95 {p95}<" in svg
-    total = sum(facts.labels.values())
-    assert total == sum(map(len, scenes)) == sum(map(len, facts.sizes_m.values()))
+    total = sum(dataset_facts.labels.values())
+    assert total == sum(map(len, scenes)) == sum(map(len, dataset_facts.sizes_m.values()))
 
 
-def test_dataset_page_ground_shares_and_labels_add_up(facts, town_dataset):
-    html = render_dataset_html(facts)
+def test_dataset_page_ground_shares_and_labels_add_up(dataset_facts, town_dataset):
+    html = render_dataset_html(dataset_facts)
     low = [s for shard in Catalogue.read(town_dataset).shards for s in shard.scenes() if s.vegetation_density == "low"]
     share = np.mean([s.occupied[0].mean() for s in low])
     svg = re.search(r'aria-label="by vegetation density".*?</svg>', html).group()
@@ -218,9 +220,9 @@ def test_dataset_page_ground_shares_and_labels_add_up(facts, town_dataset):
     assert sum(int(n) for vegetation, _, n in cells if vegetation == "low") == len(low) == 3
 
 
-def test_dataset_map_has_one_dot_per_scene(facts):
-    catalogue = facts.catalogue
-    paths = re.findall(r'data-split="(\w+)" d="([^"]*)"', render_dataset_html(facts))
+def test_dataset_map_has_one_dot_per_scene(dataset_facts):
+    catalogue = dataset_facts.catalogue
+    paths = re.findall(r'data-split="(\w+)" d="([^"]*)"', render_dataset_html(dataset_facts))
     dots = {split: np.array(re.findall(r"M([-\d.]+) ([-\d.]+)h0", d), float) for split, d in paths}
     assert {split: len(d) for split, d in dots.items()} == Counter(catalogue.column("split"))
     rows = (catalogue.column("split") == "test").nonzero()[0]
@@ -228,7 +230,7 @@ def test_dataset_map_has_one_dot_per_scene(facts):
     world -= world.mean(axis=0)
     drawn = (dots["test"] - dots["test"].mean(axis=0)) * [1, -1]
     scale = np.abs(drawn).max() / np.abs(world).max()
-    assert np.allclose(drawn, scale * world, atol=0.15)  # to scale, x right, y up, one decimal
+    assert np.allclose(drawn, scale * world, atol=0.15)  # the map is to scale, with x right, y up and one decimal
 
 
 @pytest.mark.parametrize("sequences", [1, 9, MAX_NAMED + 1, 1000])
