@@ -1,4 +1,4 @@
-"""A report is one well-formed, self-contained page."""
+"""Tests of reports, each a well-formed page without external links."""
 
 import base64
 import io
@@ -70,7 +70,7 @@ def test_report_keeps_pictures(sections):
     decoded = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))).convert("RGB")) for source in sources
     ]
-    assert np.array_equal(decoded[0], flat)  # exact class colours
+    assert np.array_equal(decoded[0], flat)  # the PNG keeps exact class colours
     assert decoded[1].shape == shaded.shape and np.abs(decoded[1].astype(int) - shaded).mean() < 4
 
 
@@ -87,7 +87,7 @@ def test_report_rejects_table_of_wrong_shape():
         render_report_html("Demo", [Table("T", ["a"], [["x"]], ["one", "two"])])
 
 
-def polylines(svg):
+def parse_polylines(svg):
     return [
         np.array([[float(v) for v in p.split(",")] for p in points.split()])
         for points in re.findall(r'points="([^"]*)"', svg)
@@ -95,16 +95,16 @@ def polylines(svg):
 
 
 def test_chart_draws_lines_at_values():
-    (line,) = polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [0, 5, 10])})))
+    (line,) = parse_polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [0, 5, 10])})))
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
     assert (np.diff(line[:, 1]) < 0).all()
-    (line,) = polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [1, 10, 100])}, log_y=True)))
+    (line,) = parse_polylines(draw_chart_svg(Chart("c", {"a": ([0, 1, 2], [1, 10, 100])}, log_y=True)))
     assert np.allclose(np.diff(line, axis=0), np.diff(line, axis=0)[0], atol=0.11)
 
 
 def test_chart_omits_undrawable_values():
     chart = Chart("c", {"a": ([0, 1, 2, 3, 4], [1, np.nan, 0, -1, 10])}, log_y=True)
-    (line,) = polylines(draw_chart_svg(chart))
+    (line,) = parse_polylines(draw_chart_svg(chart))
     assert len(line) == 2
     for series in ({}, {"a": ([], [])}, {"a": ([1.0], [np.inf])}):
         assert "no data" in draw_chart_svg(Chart("c", series))
@@ -115,9 +115,9 @@ def test_chart_omits_undrawable_values():
 
 def test_chart_thins_and_smooths_long_series():
     y = np.sin(np.arange(10_000) / 2000)
-    faint, mean = polylines(draw_chart_svg(Chart("c", {"a": (np.arange(10_000), y)})))
+    faint, mean = parse_polylines(draw_chart_svg(Chart("c", {"a": (np.arange(10_000), y)})))
     assert len(faint) <= 600 and len(mean) <= 600
-    assert np.abs(faint - mean).max() < 6  # a smooth series is its own running mean
+    assert np.abs(faint - mean).max() < 6  # the running mean of a smooth series is close to the series
 
 
 @pytest.mark.parametrize("low, high", [(0, 1), (-3, 17), (5, 5), (0, 0), (1e-7, 3e-7), (0.99, 123456)])
