@@ -33,7 +33,7 @@ lint: .venv/ready
 	$(BIN)/pyright
 
 docs: .venv/ready
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	PATH="$(CURDIR)/$(BIN):$$PATH" NO_MKDOCS_2_WARNING=1 mkdocs build --quiet
 	@echo "documentation: build/site/index.html"
 
 $(TESTS): export RAY_DATA_USE_DATASOURCE_V2 = 0

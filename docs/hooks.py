@@ -70,8 +70,8 @@ def write_api_page(page: str, packages: tuple[str, ...]) -> str:
 
 def read_help(job: Path, *words: str) -> str:
     """Return the `--help` of a job or of one of its subcommands."""
-    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
-    command = [sys.executable, str(job), *words, "--help"]
+    environment = os.environ | {"COLUMNS": "86", "NO_COLOR": "1"}
+    command = [sys.executable, str(job.relative_to(ROOT)), *words, "--help"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
     return done.stdout.rstrip()
 

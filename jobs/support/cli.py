@@ -6,6 +6,10 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from inspect import get_annotations
+from types import ModuleType
+from typing import Annotated, get_type_hints
 
 import tyro
 
@@ -87,6 +91,23 @@ def find_root_cause(error: BaseException) -> BaseException:
     return error
 
 
+def hide_empty_defaults(options: ModuleType) -> None:
+    """Change the option classes of a module such that their help does not show an empty default.
+
+    tyro appends "(default: None)" or "(default: '')" to the help of an option. The help of these options states in
+    words what the job uses instead.
+
+    Args:
+        options: Module jobs.<job>.
+    """
+    classes = [value for value in vars(options).values() if isinstance(value, type) and is_dataclass(value)]
+    for cls in {base for value in classes for base in value.__mro__ if is_dataclass(base)}:
+        hints = get_type_hints(cls, include_extras=True)
+        for field in fields(cls):
+            if field.default in ("", None, ()) and field.name in get_annotations(cls):
+                cls.__annotations__[field.name] = Annotated[hints[field.name], tyro.conf.arg(help_behavior_hint="")]
+
+
 def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) -> None:
     """Parse the command line of a job, check its options, then import and run its implementation.
 
@@ -102,6 +123,8 @@ def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) ->
     words = sys.argv[1:] if args is None else list(args)
     if renamed := find_renamed(job, words):
         exit_with_error(renamed)
+    if not {"-h", "--help"}.isdisjoint(words):
+        hide_empty_defaults(options)
     default = {"default": options.DEFAULT} if hasattr(options, "DEFAULT") else {}
     config = tyro.cli(options.Config, args=words, prog=prog, description=options.__doc__, **default)
     set_ray_environment()
