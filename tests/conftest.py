@@ -12,7 +12,7 @@ os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-UNCHECKED = "pipelines.preprocess.sources.town.land"  # checks would slow millions of calls of a short function
+UNCHECKED = "pipelines.preprocess.sources.town.land"  # type checks would slow millions of calls of a short function
 
 
 def list_checked_modules() -> list[str]:
@@ -308,7 +308,7 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
     controlnet = ControlNetModel(in_channels=4, conditioning_embedding_out_channels=(16, 32), **common)
     embedding = controlnet.controlnet_cond_embedding.conv_out
     for block in (*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block, embedding):
-        torch.nn.init.normal_(block.weight, std=0.5)  # these weights are initially zero, which would disable the image
+        torch.nn.init.normal_(block.weight, std=0.5)  # the initial weights are zero, so the image would have no effect
     vae = AutoencoderKL(
         block_out_channels=(32, 64),
         down_block_types=("DownEncoderBlock2D",) * 2,
