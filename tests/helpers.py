@@ -56,7 +56,7 @@ def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad:
     rotation, size = canonicalize_boxes(random_rotations(rng, n, tilt_rad), size)
     classes = KITTI_GROUND_CLASSES
     angle, offset = rng.uniform(-np.pi, np.pi, (2, len(classes), 1, 1)) * [[[[1]]], [[[5]]]]
-    occupied = np.cos(angle) * (grid.x_m()[:, None] - 32) + np.sin(angle) * grid.y_m() > offset  # half planes
+    occupied = np.cos(angle) * (grid.x_m()[:, None] - 32) + np.sin(angle) * grid.y_m() > offset  # half planes of ground
     slope = 0.01 * grid.x_m()[:, None] - 0.02 * grid.y_m()[None, :]
     height = np.where(occupied, slope[None] - 0.6 + 0.1 * np.arange(len(classes))[:, None, None], 0)
     defaults = {
