@@ -50,7 +50,7 @@ def test_publish_writes_model_with_card_and_finds_it(smoke, evaluation_directory
         assert path.is_dir() or b"/tmp/" not in path.read_bytes()
     for picture in ("samples.png", "failures.png"):
         assert (entry / picture).read_bytes()[:4] == b"\x89PNG"
-    pipeline = load_pipeline(output)  # has the settings of the evaluated scenes
+    pipeline = load_pipeline(output)  # the pipeline has the settings of the evaluated scenes
     assert pipeline.config.noise_scaling == 1.01 and pipeline.config.existence_threshold == 0.25
     trained = {name: value.tolist() for name, value in pipeline.dit.state_dict().items()}
     for name in ("tiny", reference, run_id):
@@ -163,7 +163,7 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     sampling = load_pipeline(complete(str(more))).config
     assert (
         sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25
-    )  # the settings of the initial pipeline
+    )  # both settings equal those of the initial pipeline
     with pytest.raises(ValueError, match=r"its label is vegetation, but that of this run is vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):
