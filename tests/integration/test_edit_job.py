@@ -45,7 +45,7 @@ def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster)
 
     part = next((tmp_path / "out" / "scenes" / "source=edited-bare" / "split=test").glob("*.parquet"))
     written = part.stat().st_mtime_ns
-    assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # a second run does no work
+    assert edit_scenes(trees) == made and part.stat().st_mtime_ns == written  # a second run writes no file
     with pytest.raises(ValueError, match="holds a run 'bare' with other edits; choose another --run"):
         edit_scenes(Remove(category=("pole",), **options))
 
@@ -56,7 +56,7 @@ def test_edit_job_edits_table_and_replays(table, town_scenes, tmp_path, cluster)
         assert_same_primitives(scene, edited[scene.scene_id])
 
 
-def test_edit_job_rejects_bad_scene_and_edits_the_rest(table, town_scenes, tmp_path, cluster):
+def test_edit_job_rejects_bad_scene_and_edits_other_scenes(table, town_scenes, tmp_path, cluster):
     from jobs.edit_scenes import Remove
     from jobs.implementation.edit_scenes import edit_scenes
 
