@@ -72,7 +72,7 @@ def test_wheel_generates_scene_outside_repository(wheel, tmp_path):
 
 @pytest.mark.slow
 def test_wheel_with_dependencies_runs_console_script(wheel, tmp_path):
-    """The test uses an empty environment, so each dependency must stand in pyproject.toml."""
+    """The test uses an empty environment, so pyproject.toml must list each dependency."""
     bin_ = tmp_path / "venv/bin"
     run_program(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     words = ("install", "--quiet", "--disable-pip-version-check", "--no-compile", wheel)
