@@ -296,7 +296,7 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
         inpaint(config)
 
 
-def test_claim_run_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
+def test_run_guard_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
     from models.sampling.repaint import RePaintConfig
     from pipelines.generation.outpaint import OutpaintRequest
     from pipelines.generation.sample import guard_generation_run, load_pipeline
@@ -333,7 +333,7 @@ def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
     assert all(found["between"].value == 0 for found in scores["distance"].values())
 
 
-def test_describe_resumes_interrupted_run(smoke, tmp_path, monkeypatch):
+def test_scene_features_resume_interrupted_run(smoke, tmp_path, monkeypatch):
     """The second call keeps existing parts and computes missing parts. With other options, all parts are recomputed."""
     from pipelines.evaluation import features as module
     from pipelines.schema.dataset import Dataset
