@@ -106,8 +106,8 @@ def test_encoding_is_bi_lipschitz_only_if_octahedral():
         for name, e in ENCODINGS.items()
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
-    assert ratio["cholesky"].min() < 1e-6  # rotating a cube does not change its code
-    assert ratio["quaternion"].max() > 1000  # length and width swap, or yaw jumps between -pi/2 and pi/2
+    assert ratio["cholesky"].min() < 1e-6  # The rotation of a cube does not change its code.
+    assert ratio["quaternion"].max() > 1000  # Length and width swap, or yaw jumps between -pi/2 and pi/2.
 
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
@@ -242,7 +242,9 @@ def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
     assert all(scene.occupied.any() == ground for scene in rebuilt)
     if not objects:
         assert not any(len(scene) for scene in rebuilt)
-    if ground and objects:  # both decoders read both halves of the latent; the linear ground start reads only its half
+    if (
+        ground and objects
+    ):  # both decoders read both halves of the latent; the linear ground start reads only the ground half
         own, other = lvae.ground_decoder.shortcut.weight.split(16)
         assert (own != 0).any() and not other.any()
         assert (lvae.ground_decoder.shortcut.weight.grad[16:] != 0).any()
