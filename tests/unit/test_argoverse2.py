@@ -171,7 +171,7 @@ def test_argoverse2_groups_every_category_of_taxonomy(root):
 
 
 @pytest.fixture(scope="module", params=["train", "val"])
-def real(real_data, request):
+def real_drive(real_data, request):
     (log,) = [log for split, log in list_logs(real_data / "av2") if split == request.param]
     return read_drive(real_data / "av2", request.param, log)
 
@@ -185,42 +185,42 @@ def sample_surface(drive, points_m: np.ndarray) -> np.ndarray:
     return np.where(inside, ground.raster_m[row.clip(0, rows - 1), col.clip(0, cols - 1)], np.nan)
 
 
-def test_argoverse2_real_ego_origin_is_wheel_radius_above_ground(real):
-    position = real.world_from_imu[:, :, 3]
-    assert abs(np.nanmedian(position[:, 2] - sample_surface(real, position)) - 0.31) < 0.05
+def test_argoverse2_real_ego_origin_is_wheel_radius_above_ground(real_drive):
+    position = real_drive.world_from_imu[:, :, 3]
+    assert abs(np.nanmedian(position[:, 2] - sample_surface(real_drive, position)) - 0.31) < 0.05
 
 
-def test_argoverse2_real_cars_stand_on_ground(real):
-    cars = real.category == CATEGORIES.index("vehicle_small")
-    bottom = real.center_m[cars, 2] - real.size_m[cars, 2] / 2
-    above = bottom - sample_surface(real, real.center_m[cars])
+def test_argoverse2_real_cars_stand_on_ground(real_drive):
+    cars = real_drive.category == CATEGORIES.index("vehicle_small")
+    bottom = real_drive.center_m[cars, 2] - real_drive.size_m[cars, 2] / 2
+    above = bottom - sample_surface(real_drive, real_drive.center_m[cars])
     assert np.isfinite(above).sum() > 1000
     assert abs(np.nanmedian(above)) < 0.05 and np.nanpercentile(np.abs(above), 90) < 0.2
 
 
-def test_argoverse2_real_bollards_do_not_move(real):
+def test_argoverse2_real_bollards_do_not_move(real_drive):
     """Bollards are static only if the reader applies the pose of every sweep of the moving car."""
-    bollards = real.label == "BOLLARD"
-    for track in np.unique(real.instance_id[bollards]):
-        places = real.center_m[real.instance_id == track]
+    bollards = real_drive.label == "BOLLARD"
+    for track in np.unique(real_drive.instance_id[bollards]):
+        places = real_drive.center_m[real_drive.instance_id == track]
         assert np.linalg.norm(places - places.mean(axis=0), axis=1).max() < 0.25
 
 
-def test_argoverse2_real_cars_move_along_their_heading(real):
+def test_argoverse2_real_cars_move_along_their_heading(real_drive):
     agreement = []
-    for track in np.unique(real.instance_id[real.label == "REGULAR_VEHICLE"]):
-        rows = np.flatnonzero(real.instance_id == track)
-        way = real.center_m[rows[-1], :2] - real.center_m[rows[0], :2]
+    for track in np.unique(real_drive.instance_id[real_drive.label == "REGULAR_VEHICLE"]):
+        rows = np.flatnonzero(real_drive.instance_id == track)
+        way = real_drive.center_m[rows[-1], :2] - real_drive.center_m[rows[0], :2]
         if np.linalg.norm(way) > 10:
-            middle = real.heading_rad[rows[len(rows) // 2]]
+            middle = real_drive.heading_rad[rows[len(rows) // 2]]
             agreement.append(way @ [np.cos(middle), np.sin(middle)] / np.linalg.norm(way))
     assert len(agreement) >= 3 and np.median(agreement) > 0.9
 
 
-def test_argoverse2_real_scene_has_road_below_ego_and_no_ego_box(real):
-    assert "EGO_VEHICLE" not in set(real.label)
-    for k in range(0, len(real), 39):
-        scene = real.scene(k)
+def test_argoverse2_real_scene_has_road_below_ego_and_no_ego_box(real_drive):
+    assert "EGO_VEHICLE" not in set(real_drive.label)
+    for k in range(0, len(real_drive), 39):
+        scene = real_drive.scene(k)
         assert scene.occupied[0][-8:, 120:136].mean() > 0.9
         assert abs(np.median(scene.height_m[0][-8:, 120:136]) + 0.31) < 0.1
 
