@@ -333,7 +333,7 @@ def test_custom_source_keeps_height_of_points_on_edge(tmp_path):
 
 
 def test_custom_source_polygon_larger_than_crop_fills_it(tmp_path):
-    """One polygon has no point in the crop, and a second polygon has only a few."""
+    """One polygon has no point in the crop, and a second polygon has only a few points in the crop."""
     huge = [[*(ORIGIN[:2] + 2000 * np.array(d)), 113.0] for d in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     polygons = [{"class": "terrain", "outline": huge}, make_street()["polygons"][0]]
     drive = write_and_read_drive(make_street() | {"polygons": polygons}, tmp_path)
