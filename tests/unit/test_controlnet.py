@@ -10,7 +10,7 @@ from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, make_cont
 from pipelines.schema.palette import CLASS_COLORS, CLASS_ID
 
 
-def request(controlnet_weights: tuple[str, str], **changes) -> PhotoRequest:
+def make_request(controlnet_weights: tuple[str, str], **changes) -> PhotoRequest:
     return PhotoRequest(
         *controlnet_weights,
         **(
@@ -34,13 +34,15 @@ def test_control_image_uses_palette_and_sky():
 
 
 def test_painter_depends_on_image_prompt_and_seed(controlnet_weights):
-    painter = Painter(request(controlnet_weights))
+    painter = Painter(make_request(controlnet_weights))
     first = painter.paint(street_class_ids())
     assert first.shape == (44, 60, 3) and first.dtype == np.uint8 and first.std() > 1  # 44 is not a multiple of 8
     assert np.array_equal(first, painter.paint(street_class_ids()))
     assert not np.array_equal(first, painter.paint(street_class_ids()[::-1].copy()))
     for other in ({"seed": 1}, {"prompt": "xyz"}, {"control_scale": 0.0}):
-        assert not np.array_equal(first, Painter(request(controlnet_weights, **other)).paint(street_class_ids())), other
+        assert not np.array_equal(
+            first, Painter(make_request(controlnet_weights, **other)).paint(street_class_ids())
+        ), other
 
 
 def test_painter_names_missing_weights(controlnet_weights, tmp_path):
@@ -54,6 +56,6 @@ def test_painter_names_missing_weights(controlnet_weights, tmp_path):
     for path in Path(controlnet_weights[1]).glob("*.json"):
         (tmp_path / path.name).write_text(path.read_text())
     with pytest.raises(ValueError, match="no Stable Diffusion and ControlNet weights"):
-        Painter(request((controlnet_weights[0], str(tmp_path))))
+        Painter(make_request((controlnet_weights[0], str(tmp_path))))
     with pytest.raises(ValueError, match="holds no street views; run jobs/render_streets"):
         paint(Config(streets=str(tmp_path), diffusion=controlnet_weights[0], controlnet=controlnet_weights[1]))
