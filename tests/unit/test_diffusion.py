@@ -70,7 +70,7 @@ def test_add_noise_in_two_steps_has_variance_of_one():
 
 
 def test_velocity_converts_to_epsilon():
-    """The velocity is computed by diffusers; its factors are those of a DiT that predicts velocities."""
+    """A DiT with v-prediction converts a velocity of diffusers to the noise."""
     clean, noise, t = torch.randn(4, *LATENT_SHAPE), torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999])
     latent, velocity = (
         SchedulerConfig.ddpm().build().add_noise(clean, noise, t),
