@@ -107,7 +107,7 @@ def test_suppress_duplicates_ignores_suppressed_objects():
     ]
 
 
-def test_suppress_duplicates_lets_plants_and_categories_overlap():
+def test_suppress_duplicates_keeps_plants_and_other_categories():
     assert not find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9], "vegetation_cuboid")).any()
     pair = make_row_of_boxes([0, 1], [0.6, 0.9])
     mixed = replace(pair, category=np.array([pair.category[0], CATEGORY_INDEX["pole"]], np.int8))
