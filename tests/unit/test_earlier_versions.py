@@ -1,4 +1,4 @@
-"""Tests of pipelines and tables from version 0.1, which stand in tests/golden/version_0_1."""
+"""Tests of the pipelines and tables of version 0.1 in tests/golden/version_0_1."""
 
 import json
 
