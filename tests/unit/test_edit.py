@@ -120,8 +120,8 @@ def test_translate_moves_along_scene_or_own_axes(scene):
     length = scene.rotation[:, :, 0]
     heading = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1)
     known = ~np.isnan(scene.heading_rad)
-    assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # along the length
-    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # along the known headings
+    assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # Moves are along the length.
+    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # Moves are in the direction of known headings.
     assert np.abs(way_m - length)[~known].max() < 1e-4
 
 
@@ -143,7 +143,7 @@ def test_rotate_turns_every_corner(scene, about_m, by_deg):
     off = turned.heading_rad[known] - scene.heading_rad[known] - angle
     assert np.abs(np.sin(off / 2)).max() < 1e-5 and np.abs(turned.heading_rad[known]).max() <= np.pi
     assert np.isnan(turned.heading_rad[~known]).all()
-    if by_deg == 30:  # the vertical axis; at least one axis of a tilted box turns by less
+    if by_deg == 30:  # at least one axis of a tilted box turns by less than 30 degrees
         assert (done.turned_rad <= np.deg2rad(30.01)).all() and (done.turned_rad > np.deg2rad(25)).all()
 
 
