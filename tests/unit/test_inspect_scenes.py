@@ -31,7 +31,7 @@ def dataset_facts(town_dataset):
 
 
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory):
+def generated_dataset(tmp_path_factory):
     """Folder with four generated scenes, without dataset.json, poses and vehicle labels."""
     root = str(tmp_path_factory.mktemp("inspect") / "generated")
     grid = Grid(rows=32, cols=32, resolution_m=2)
@@ -158,7 +158,7 @@ def test_sheet_has_aspect_ratio_of_five_to_four(count, aspect):
 # ------------------------------------------------------------------------------------------------------ the page
 
 
-def histogram_titles(svg):
+def find_histogram_titles(svg):
     return [int(n) for n in re.findall(r"<title>[^<]*: (\d+) scenes</title>", svg)]
 
 
@@ -168,7 +168,7 @@ def test_histograms_count_every_scene_once(counts):
     width, scenes = count_bins(counts)
     assert scenes.sum() == len(counts)
     assert np.array_equal(scenes, np.histogram(counts, np.arange(len(scenes) + 1) * width)[0])
-    assert sum(histogram_titles(draw_count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
+    assert sum(find_histogram_titles(draw_count_histogram("pole", counts, {"p95": 3, "slots": 5}))) == len(counts)
 
 
 def test_dataset_page_is_well_formed_and_self_contained(dataset_facts):
@@ -196,7 +196,7 @@ def test_dataset_page_states_table_contents(dataset_facts, town_dataset):
         counts = np.array([s.counts()[k] for s in scenes])
         drawn = re.findall(rf'<svg[^>]*aria-label="scenes by number of {name.replace("_", " ")}".*?</svg>', html)
         assert len(drawn) == (counts.any() or name in TOWN_SLOTS)
-        assert all(sum(histogram_titles(svg)) == len(scenes) for svg in drawn)
+        assert all(sum(find_histogram_titles(svg)) == len(scenes) for svg in drawn)
         if counts.any():
             sizes = np.concatenate([s.size_m[s.category == k] for s in scenes])
             assert np.array_equal(np.sort(dataset_facts.sizes_m[name], axis=0), np.sort(sizes, axis=0))
@@ -254,8 +254,8 @@ def test_dataset_maps_of_many_sequences_fit_page(sequences):
     assert (apart | apart.T | np.eye(sequences, dtype=bool)).all()
 
 
-def test_dataset_page_works_without_dataset_json(generated, tmp_path):
-    path = write_dataset_report(Report(dataset=generated, num_examples=0, output=str(tmp_path / "page.html")))
+def test_dataset_page_works_without_dataset_json(generated_dataset, tmp_path):
+    path = write_dataset_report(Report(dataset=generated_dataset, num_examples=0, output=str(tmp_path / "page.html")))
     page = SvgPage(Path(path).read_text("utf-8"))
     assert "4 generated" in page.text and "somewhere" in page.text
     for absent in ("p95", "slots", "Split map", "Thresholds of density labels", "Rejected"):
@@ -267,17 +267,17 @@ def test_dataset_page_works_without_dataset_json(generated, tmp_path):
 # -------------------------------------------------------------------------------------------------------- the job
 
 
-def test_draw_scenes_runs_without_ray(generated, tmp_path, monkeypatch):
+def test_draw_scenes_runs_without_ray(generated_dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("jobs.implementation.inspect_scenes.start_ray", None)
-    written = draw_scenes(OneScene(dataset=generated, max_scenes=2, seed=1, glb=True, output=str(tmp_path)))
+    written = draw_scenes(OneScene(dataset=generated_dataset, max_scenes=2, seed=1, glb=True, output=str(tmp_path)))
     assert sorted(path.rsplit(".", 1)[1] for path in written) == ["glb", "glb", "png", "png"]
     names = [path.rsplit("/", 1)[1].removesuffix(".png") for path in written if path.endswith(".png")]
     assert set(names) <= {f"generated-x-0-{k}" for k in range(4)} and len(set(names)) == 2
     nodes = trimesh.load(f"{tmp_path}/{names[0]}.glb").graph.nodes
     assert sum(re.fullmatch(r"[a-z_]+_\d{4}", node) is not None for node in nodes) == 9
-    (again,) = draw_scenes(OneScene(ids=(names[0],), dataset=generated, output=str(tmp_path / "again")))
+    (again,) = draw_scenes(OneScene(ids=(names[0],), dataset=generated_dataset, output=str(tmp_path / "again")))
     assert Path(again).read_bytes() == (tmp_path / f"{names[0]}.png").read_bytes()
     with pytest.raises(ValueError, match="--max-scenes is 0, expected at least 1"):
-        draw_scenes(OneScene(dataset=generated, max_scenes=0))
+        draw_scenes(OneScene(dataset=generated_dataset, max_scenes=0))
     with pytest.raises(ValueError, match="holds no split=test; it holds source="):
-        draw_scenes(OneScene(dataset=generated, split="test"))
+        draw_scenes(OneScene(dataset=generated_dataset, split="test"))
