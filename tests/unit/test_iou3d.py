@@ -178,7 +178,7 @@ def test_iou3d_rejects_invalid_boxes(part, value, message):
 
 
 def test_ellipsoid_iou3d_keeps_stated_error():
-    """The reference IoU is the closed form for two spheres, which a linear map of both spheres keeps."""
+    """The reference is the closed form for two spheres; a linear map of both spheres keeps the IoU."""
     rng = np.random.default_rng(4)
     n = 200
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
