@@ -23,7 +23,7 @@ L_SLAB = np.concatenate([np.column_stack([L_OUTLINE, np.full(6, z)]) for z in (0
 L_FACES = "0 1 2 0 2 3 0 3 4 0 4 5 8 7 6 9 8 6 10 9 6 11 10 6 " + " ".join(
     f"{i} {i + 6} {j} {j} {i + 6} {j + 6}" for i, j in zip(range(6), [1, 2, 3, 4, 5, 0], strict=True)
 )
-IDENTITY_POSE = "1 0 0 100 0 -1 0 200 0 0 -1 117"  # x east, y right, z down
+IDENTITY_POSE = "1 0 0 100 0 -1 0 200 0 0 -1 117"  # the pose faces east, with y to the right and z down
 
 
 def make_sphere() -> np.ndarray:
@@ -104,7 +104,7 @@ def compute_set_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def real(real_data):
+def real_drive(real_data):
     root = real_data / "kitti360"
     (sequence,) = list_sequences(root)
     drive, report = read_drive(root, sequence)
@@ -112,19 +112,19 @@ def real(real_data):
     return drive, report, ElementTree.parse(path).getroot()
 
 
-def numbers(element: ElementTree.Element, cols: int) -> np.ndarray:
+def parse_numbers(element: ElementTree.Element, cols: int) -> np.ndarray:
     return np.array(element.findtext("data").split(), float).reshape(-1, cols)
 
 
-def test_kitti360_real_boxes_have_corners_of_file(real):
-    drive, _, xml = real
+def test_kitti360_real_boxes_have_corners_of_file(real_drive):
+    drive, _, xml = real_drive
     row_of = {index: row for row, index in enumerate(drive.instance_id)}
     cuboids = ellipsoids = 0
     for element in xml:
         row = row_of.get(int(element.findtext("index")))
         if row is None or element.findtext("category") == "stuff":
             continue
-        transform, vertices = numbers(element.find("transform"), 4), numbers(element.find("vertices"), 3)
+        transform, vertices = parse_numbers(element.find("transform"), 4), parse_numbers(element.find("vertices"), 3)
         world = vertices @ transform[:3, :3].T + transform[:3, 3]
         center, rotation, size = drive.center_m[row], drive.rotation[row], drive.size_m[row]
         assert np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0
@@ -142,8 +142,8 @@ def test_kitti360_real_boxes_have_corners_of_file(real):
     assert (cuboids, ellipsoids) == (np.sum(drive.category != 1), np.sum(drive.category == 1))
 
 
-def test_kitti360_real_duplicates_are_nearly_identical(real):
-    drive, report, xml = real
+def test_kitti360_real_duplicates_are_nearly_identical(real_drive):
+    drive, report, xml = real_drive
     written = [tuple(e.findtext(t) for t in ("label", "transform/data", "vertices/data")) for e in xml]
     assert report.objects == len(written) == 977
     boxes = [(label, t) for label, t, vertices in set(written) if len(vertices.split()) in (3 * 8, 3 * 63)]
@@ -160,8 +160,8 @@ def test_kitti360_real_duplicates_are_nearly_identical(real):
     assert (len(drive.category), len(drive.ground.slab_class)) == (report.boxes, report.slabs)
 
 
-def test_kitti360_real_cars_stand_half_a_slab_below_raster(real):
-    drive, _, _ = real
+def test_kitti360_real_cars_stand_half_a_slab_below_raster(real_drive):
+    drive, _, _ = real_drive
     depth, road_below = [], []
     for k in range(0, len(drive), 25):
         scene = drive.scene(k)
@@ -177,15 +177,15 @@ def test_kitti360_real_cars_stand_half_a_slab_below_raster(real):
     assert abs(np.median(road_below) + 0.63) < 0.1
 
 
-def test_kitti360_real_road_lies_ahead(real):
-    drive, _, _ = real
+def test_kitti360_real_road_lies_ahead(real_drive):
+    drive, _, _ = real_drive
     ahead = np.mean([drive.scene(k).occupied[0][:, 118:138].mean() for k in range(50, 450, 50)])
     aside = np.mean([drive.scene(k).occupied[0][:, :20].mean() for k in range(50, 450, 50)])
     assert ahead > 2 * aside
 
 
-def test_kitti360_real_parked_cars_point_along_road(real):
-    drive, _, _ = real
+def test_kitti360_real_parked_cars_point_along_road(real_drive):
+    drive, _, _ = real_drive
     headed = np.flatnonzero(np.isfinite(drive.heading_rad))
     assert set(drive.label[headed]) == {"car", "truck"}
     path = drive.world_from_imu[:, :2, 3]
@@ -316,13 +316,13 @@ def test_kitti360_removes_duplicate_objects(tmp_path):
         format_object("truck", index=6),  # another object at the same place
         format_object(
             index=7, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.3, 205.1, 117))
-        ),  # copy from another annotation window
-        format_object(index=8, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # a different car
-        format_object(index=9, transform=make_affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # a different size
+        ),  # Copy from another annotation window.
+        format_object(index=8, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # A different car.
+        format_object(index=9, transform=make_affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # A different size.
         format_object("smallPole", index=10, transform=make_affine(np.diag([0.3, 0.3, 4]), (140, 205, 117))),
         format_object(
             "smallPole", index=11, transform=make_affine(np.diag([0.3, 0.3, 4]), (140.2, 205, 117))
-        ),  # a neighbouring pole
+        ),  # A neighbouring pole.
     )
     assert drive.instance_id.tolist() == [1, 6, 8, 9, 10, 11]
     assert (report.duplicates, report.slabs) == (4, 1)
