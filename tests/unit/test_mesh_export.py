@@ -32,7 +32,7 @@ from pipelines.io.mesh_export import (
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, GROUND_CLASS_ID, parse_rgb
 
 
-def load(glb: bytes) -> trimesh.Scene:
+def load_glb(glb: bytes) -> trimesh.Scene:
     return trimesh.load_scene(io.BytesIO(glb), file_type="glb")
 
 
@@ -46,7 +46,7 @@ def place_mesh(loaded: trimesh.Scene, node: str) -> trimesh.Trimesh:
 
 def test_scene_glb_has_named_node_per_primitive_and_ground():
     scene = example_scene()
-    loaded = load(export_glb(scene))
+    loaded = load_glb(export_glb(scene))
     expected = {f"{CATEGORIES[c]}_{i:04d}" for i, c in enumerate(scene.category)} | {"ground"}
     assert set(loaded.graph.nodes_geometry) == expected
     assert len(loaded.geometry) == len(CATEGORIES) + 1  # nodes of one category share a mesh
@@ -66,7 +66,7 @@ def test_scene_glb_is_y_up_with_forward_z_and_left_x():
 
 def test_scene_glb_keeps_corners_and_volumes():
     scene = example_scene()
-    loaded = load(export_glb(scene))
+    loaded = load_glb(export_glb(scene))
     signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     for i, category in enumerate(scene.category):
         mesh = place_mesh(loaded, f"{CATEGORIES[category]}_{i:04d}")
@@ -99,7 +99,7 @@ def test_ground_mesh_is_fused_surface_at_pixel_centers():
     at_row, at_col = scene.grid.pixel(first[:, 0], first[:, 1])
     assert ((at_row % 5 == 0) & (at_col % 5 == 0)).sum() == quads
 
-    loaded = place_mesh(load(export_glb(scene)), "ground")
+    loaded = place_mesh(load_glb(export_glb(scene)), "ground")
     assert np.allclose(loaded.vertices, vertices, atol=1e-4) and np.array_equal(loaded.faces, triangles)
 
 
@@ -119,7 +119,7 @@ def test_ground_mesh_diagonal_and_winding_of_one_block():
     assert {frozenset(t) for t in triangles.tolist()} == {frozenset({0, 1, 2}), frozenset({1, 2, 3})}
 
 
-def linear_light(color_hex: str) -> np.ndarray:
+def convert_to_linear_light(color_hex: str) -> np.ndarray:
     srgb = np.array(parse_rgb(color_hex)) / 255
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
@@ -131,9 +131,9 @@ def test_scene_glb_colors_are_palette_in_linear_light():
     assert np.allclose(factors.pop("ground"), 1)
     assert set(factors) == set(CATEGORIES)
     for name, factor in factors.items():
-        assert np.allclose(factor, linear_light(COLOR_HEX[name]), atol=0.5 / 255 + 1e-6)
-    painted = load(glb).geometry["ground"].visual.vertex_attributes["color"][:, :3] / 255
-    expected = np.array([linear_light(COLOR_HEX[name]) for name in KITTI_GROUND_CLASSES])
+        assert np.allclose(factor, convert_to_linear_light(COLOR_HEX[name]), atol=0.5 / 255 + 1e-6)
+    painted = load_glb(glb).geometry["ground"].visual.vertex_attributes["color"][:, :3] / 255
+    expected = np.array([convert_to_linear_light(COLOR_HEX[name]) for name in KITTI_GROUND_CLASSES])
     distance = np.abs(painted[::97, None] - expected[None]).max(axis=-1)
     assert distance.min(axis=1).max() <= 0.5 / 255 + 1e-6
     assert (distance.min(axis=0) < 0.01).all()  # the scene contains each class
@@ -162,7 +162,7 @@ def test_scene_from_unit_places_unit_box():
 def test_scene_glb_accepts_empty_scene():
     scene = empty_scene()
     assert triangulate_scene(scene).corners_m.shape == (0, 3, 3)
-    loaded = load(export_glb(scene))
+    loaded = load_glb(export_glb(scene))
     assert len(loaded.graph.nodes_geometry) == 0 and "scene" in loaded.graph.nodes
 
 
