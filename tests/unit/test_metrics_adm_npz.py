@@ -114,7 +114,7 @@ def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
     assert_refused(path, r"arr_0 of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
 
 
-def test_npz_writer_rejects_bad_images_and_leaves_nothing(tmp_path):
+def test_npz_writer_rejects_bad_images_and_leaves_no_file(tmp_path):
     path = str(tmp_path / "x.npz")
     for batches, count, match in (
         ([make_pictures()], 8, "got 7 pictures, expected 8"),
@@ -145,7 +145,7 @@ def test_npz_reference_moments_equal_those_of_features(tmp_path):
     np.testing.assert_allclose(found.pool3.covariance, compute_moments(pool3).covariance, atol=1e-12)
     np.testing.assert_array_equal(np.concatenate(list(iterate_pictures(path, 4))), make_pictures())
 
-    np.savez(path, **arrays)  # names of TTUR and pytorch-fid
+    np.savez(path, **arrays)  # TTUR and pytorch-fid use these names
     assert read_reference_moments(path).spatial is None
     np.savez(path, make_pictures())
     assert read_reference_moments(path) is None
