@@ -171,7 +171,7 @@ def test_neighborhood_scores_equal_brute_force(seed, monkeypatch):
 
 
 def test_neighborhood_scores_count_ties_as_within():
-    """Integer points far from the origin have many ties, which differences resolve and matrix products do not."""
+    """Integer points far from the origin have many equal distances, which a matrix product does not compute exactly."""
     rng = np.random.default_rng(5)
     real, generated = rng.integers(0, 4, (2, 60, 3)).astype(float) + 1e6
     for k, got in zip((1, 2, 3), compute_scores(real, generated, (1, 2, 3)), strict=True):
@@ -179,7 +179,7 @@ def test_neighborhood_scores_count_ties_as_within():
 
 
 def test_neighborhood_scores_include_border_of_ball():
-    """generated[0] equals real[1], so it is on the border of each ball with the nearest neighbour real[1]."""
+    """generated[0] equals real[1], so it is on the border of each ball whose radius is the distance to real[1]."""
     rng = np.random.default_rng(6)
     base = rng.normal(size=(40, 512))
     generated = rng.normal(50, 1, size=(40, 512))
@@ -253,7 +253,7 @@ def test_kernel_distance_of_equal_sources_contains_zero():
 
 
 def test_intervals_have_stated_coverage():
-    """In 200 experiments with 150 scenes each, 95 % of the intervals contain the true mean and the true share."""
+    """In 200 experiments with 150 scenes each, about 95 % of the intervals contain the true mean or share."""
     rng = np.random.default_rng(12)
     held = np.zeros(2)
     for _ in range(200):
