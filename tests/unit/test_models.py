@@ -175,7 +175,7 @@ def test_object_shortcut_is_equivariant_to_cell_shift():
     features = torch.full((2, sum(small_spec().slots), 9), 0.3)
     features[1, 0, :2] += torch.tensor(
         [2 / 8, -1 / 8]
-    )  # two cells ahead (a lower row) and one cell to the right (a higher column)
+    )  # the object moves two cells ahead (to a lower row) and one cell to the right (to a higher column)
     real = torch.zeros(features.shape[:2], dtype=torch.bool)
     real[:, 0] = True
     with torch.no_grad():
@@ -264,7 +264,7 @@ def test_linear_init_lowers_learning_rate():
     assert not make_small_lvae().learning_rate_factors()
 
 
-def test_shortcuts_show_ground_before_first_step():
+def test_shortcuts_predict_ground_before_first_step():
     batch = make_layout_batch([random_scene(i) for i in range(12)], small_spec())
     iou = []
     for shortcut in (False, True):
