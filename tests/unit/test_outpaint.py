@@ -144,7 +144,7 @@ def test_block_composer_of_true_blocks_equals_truth_in_one_datum(truth, overlap,
     for index in [index for front in block_grid.group_by_rank(wanted) for index in front]:
         needed = {other for other, _ in block_grid.known_cells(index)}
         if not needed <= blocks.keys():
-            continue  # a known block of this block is outside the truth
+            continue  # the block needs a neighbour outside the truth
         condition = composer.condition_block(index, blocks, EMPTY, "reencode")
         datum = condition.datum_m
         assert (datum != 0) == (
