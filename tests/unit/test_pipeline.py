@@ -102,22 +102,22 @@ def test_pipeline_round_trip_keeps_sampler(pipeline, tmp_path):
 
 def test_pipeline_noise_scaling_skips_ddpm_of_paper(pipeline, tmp_path):
 
-    def drawn(sampler, of=pipeline, **options):
-        of.use_sampler(sampler)
-        return of.sample_latents(["low", "high"], 3, range(2), 10, **options)
+    def sample_with(sampler, pipe=pipeline, **options):
+        pipe.use_sampler(sampler)
+        return pipe.sample_latents(["low", "high"], 3, range(2), 10, **options)
 
-    plain = {name: drawn(name) for name in ("ddpm", "dpm++")}
-    assert torch.equal(drawn("dpm++", noise_scaling=1.0), plain["dpm++"])
-    more = drawn("dpm++", noise_scaling=1.01)
+    plain = {name: sample_with(name) for name in ("ddpm", "dpm++")}
+    assert torch.equal(sample_with("dpm++", noise_scaling=1.0), plain["dpm++"])
+    more = sample_with("dpm++", noise_scaling=1.01)
     assert not torch.allclose(more, plain["dpm++"], rtol=1e-4)
     pipeline.register_to_config(noise_scaling=1.01)
     pipeline.save_pretrained(tmp_path)
     pipeline.register_to_config(noise_scaling=1.0)
     again = PrITTIPipeline.from_pretrained(tmp_path)
     again.set_progress_bar_config(disable=True)
-    assert torch.equal(drawn("dpm++", again), more) and torch.equal(drawn("ddpm", again), plain["ddpm"])
+    assert torch.equal(sample_with("dpm++", again), more) and torch.equal(sample_with("ddpm", again), plain["ddpm"])
     with pytest.raises(ValueError, match=r"noise_scaling is 2.0, expected 0.9 to 1.1"):
-        drawn("dpm++", noise_scaling=2.0)
+        sample_with("dpm++", noise_scaling=2.0)
     pipeline.use_sampler("ddpm")
 
 
@@ -125,7 +125,8 @@ def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
     latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.new_identity("run", 0, 0, "low")]
     (everything,) = pipeline.decode(latents, identities, 1e-6)
     existence = np.sort(everything.existence)
-    gap = np.argmax(np.diff(existence))  # a gap, because existence may round differently after loading
+    # The threshold is in a gap, because existence probabilities may round differently after loading.
+    gap = np.argmax(np.diff(existence))
     middle = float(existence[gap : gap + 2].mean())
     (probable,) = pipeline.decode(latents, identities, middle)
     assert 0 < len(probable) < len(everything) and probable.existence.min() > middle
@@ -327,7 +328,7 @@ def test_inpaint_rejects_objects_only_for_mixed_latent():
         mixed.inpaint([random_scene(0, grid=SPEC.grid)], [np.ones((32, 32), bool)], ["low"], "objects")
 
 
-def test_composite_of_nothing_changes_nothing():
+def test_composite_of_empty_region_keeps_scene():
     scene, other = random_scene(0, n=20, grid=SPEC.grid), random_scene(1, n=20, grid=SPEC.grid)
     nothing, everything = np.zeros((32, 32), bool), np.ones((32, 32), bool)
     assert scenes_equal(composite_scenes(scene, other, nothing, "both"), scene)
