@@ -38,7 +38,7 @@ def test_cast_down_equals_ray_casting():
     assert ((hit[0] >= 0) == np.isfinite(height[0])).all()
 
 
-def test_cast_down_last_triangle_wins_ties():
+def test_cast_down_prefers_last_triangle_at_equal_height():
     grid = Grid(rows=64, cols=64, resolution_m=1.0)
     level = draw_triangles(np.random.default_rng(3), 60)
     level[..., 2] = 1.5
@@ -82,7 +82,7 @@ def test_polygon_fill_equals_shapely():
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     for n in (3, 4, 9, 40):
         angle = np.sort(rng.uniform(0, 2 * np.pi, n))
-        radius = rng.uniform(5, 45, n)  # star-shaped, non-convex, partly outside
+        radius = rng.uniform(5, 45, n)  # the polygon is star-shaped, non-convex and partly outside the grid
         outline = np.stack([32 + radius * np.cos(angle), radius * np.sin(angle)], -1)
         filled = fill_polygon(outline, grid)
         assert filled.any()
