@@ -9,7 +9,7 @@ from models.scene import Grid, canonicalize_boxes, compute_yaw, merge_scenes
 
 
 def have_same_corners(a, b):
-    """Return True if each corner of a is within 1e-6 m of a corner of b."""
+    """Return True if each corner of `a` is within 1e-6 m of a corner of `b`."""
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
     first = np.einsum("nij,nkj->nki", a[0], signs[None] * a[1][:, None])
     second = np.einsum("nij,nkj->nki", b[0], signs[None] * b[1][:, None])
