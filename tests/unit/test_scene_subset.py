@@ -75,15 +75,15 @@ def test_selection_reads_two_shards(tmp_path):
     Shard(str(tmp_path), "town", "train", 0).write(scenes[:4])
     Shard(str(tmp_path), "town", "train", 1).write(scenes[4:])
 
-    def rows(**options) -> list[list[int]]:
+    def select_rows(**options) -> list[list[int]]:
         return [r for _, r in SceneSubset(str(tmp_path), "town", "train", **options).shards()]
 
-    assert rows() == [[0, 1, 2, 3], [0, 1, 2, 3, 4]]
-    assert rows(limit=3, pick="first") == [[0, 1, 2]]
-    assert sum(map(len, rows(limit=3))) == 3
-    assert sum(map(len, rows(limit=5, pick="farthest"))) == 5
-    assert sum(map(len, rows(limit=5, pick="balanced"))) == 5
-    assert sum(map(len, rows(pick="apart", apart_m=1e9))) <= 9
+    assert select_rows() == [[0, 1, 2, 3], [0, 1, 2, 3, 4]]
+    assert select_rows(limit=3, pick="first") == [[0, 1, 2]]
+    assert sum(map(len, select_rows(limit=3))) == 3
+    assert sum(map(len, select_rows(limit=5, pick="farthest"))) == 5
+    assert sum(map(len, select_rows(limit=5, pick="balanced"))) == 5
+    assert sum(map(len, select_rows(pick="apart", apart_m=1e9))) <= 9
 
 
 @pytest.mark.parametrize(
