@@ -36,7 +36,7 @@ def test_blend_ground_aligns_shifted_street():
             bent.occupied[c, 31], known.occupied[c, 32]
         )  # both sides of the seam have the same columns
         assert np.abs(bent.height_m[c, 31] - known.height_m[c, 32]).max() < 0.003
-    # Further ahead, the edge moves by at most one pixel per row and the height by at most 3 cm per row.
+    # Further ahead, the edge of the road moves by at most one pixel per row and the height by at most 3 cm per row.
     left = bent.occupied[ROAD].argmax(axis=1)[:32]
     assert left[0] == 23 and left[31] == 20 and set(np.diff(left)) <= {0, -1}
     along = np.abs(np.diff(bent.height_m[ROAD, :32, 26]))
@@ -86,7 +86,7 @@ def test_blend_ground_without_seam_changes_nothing(mask):
     assert blend_ground(made, make_street(20, 0.0), mask) is made
 
 
-def test_blend_ground_fades_out_road_into_void():
+def test_blend_ground_ends_road_gradually_at_empty_ground():
     known, made = make_street(20, 0.0), make_street(20, 0.0)
     made = replace(made, occupied=made.occupied & False, height_m=made.height_m * 0)
     bent = blend_ground(made, known, NEW)
