@@ -44,7 +44,7 @@ def test_split_equals_literal_supplement():
     rng = np.random.default_rng(0)
     drives = {
         "0000": draw_drive(rng, 900, np.array([0.0, 0, 100])),
-        "0002": draw_drive(rng, 400, np.array([50.0, 20, 100])),  # this drive crosses the first
+        "0002": draw_drive(rng, 400, np.array([50.0, 20, 100])),  # this drive crosses drive 0000
         "0003": draw_drive(rng, 700, np.array([3000.0, 0, 90])),
     }
     split = split_poses(drives)
@@ -93,7 +93,7 @@ def test_split_of_short_drive_has_fewer_segments_and_warns(total_m, count, caplo
     assert ("no training pose remains" in caplog.text) == (total_m < 25)
 
 
-def test_split_none_trains_on_everything():
+def test_no_split_uses_all_poses_for_training():
     split = make_no_split({"a": np.zeros((3, 3)), "b": np.zeros((0, 3))})
     assert split["a"].tolist() == ["train"] * 3
     assert split["b"].tolist() == []
