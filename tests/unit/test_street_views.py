@@ -179,8 +179,8 @@ def test_centerlines_have_one_node_per_crossing_without_spurs():
     assert len(network.roads) == 4 and len(network.nodes_m) == 1 and len(network.list_leaving(0)) == 4
     rough = scene.occupied.copy()
     rng = np.random.default_rng(0)
-    rough[0] &= rng.random(rough[0].shape) > 0.02  # small holes in the road
-    rough[0, 5:9, 5:9] = True  # a separate piece of road
+    rough[0] &= rng.random(rough[0].shape) > 0.02  # Small holes in the road.
+    rough[0, 5:9, 5:9] = True  # A separate piece of road.
     spotted = extract_road_network(replace(scene, occupied=rough, height_m=np.where(rough, scene.height_m, 0)))
     assert len(spotted.roads) == 4
     nothing = np.zeros_like(scene.occupied)
