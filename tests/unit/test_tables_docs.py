@@ -156,7 +156,7 @@ def town() -> list[Scene]:
 
 
 @pytest.fixture(scope="module")
-def generated(town) -> list[Scene]:
+def generated_scenes(town) -> list[Scene]:
     return [make_generated_scene(scene, k) for k, scene in enumerate(town[::4])]
 
 
@@ -167,14 +167,14 @@ def rejects() -> list[dict]:
 
 
 @pytest.fixture(scope="module")
-def root(town, generated, rejects, tmp_path_factory) -> Path:
+def root(town, generated_scenes, rejects, tmp_path_factory) -> Path:
     """Folder with `real` and `generated`, which replace `DIR` and `GENERATED` of the page."""
     path = tmp_path_factory.mktemp("tables")
     for split in ("train", "test"):
         for number, sequence in enumerate(sorted({s.sequence for s in town if s.split == split})):
             members = [s for s in town if (s.split, s.sequence) == (split, sequence)]
             Shard(f"{path}/real", "town", split, number).write(members)
-    Shard(f"{path}/generated", "generated-docs", "generated", 0).write(generated)
+    Shard(f"{path}/generated", "generated-docs", "generated", 0).write(generated_scenes)
     shard = Shard(f"{path}/real", "town", "train", 0)
     storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
     _, changes = edit_shard(town[0], EditRequest((Remove(Select(where="length_m > 3")),), "", "docs"))
@@ -249,14 +249,14 @@ def test_tables_page_trees_per_kilometer(answers, town):
     assert len(answer) == 2
 
 
-def test_tables_page_ground_shares(answers, town, generated):
+def test_tables_page_ground_shares(answers, town, generated_scenes):
     answer = select_answer(answers, "Which ground classes", "source", "vehicle_density")
     for label in {s.vehicle_density for s in town}:
         share = np.mean([s.ground_area_m2() for s in town if s.vehicle_density == label], axis=0) / 64**2
         for name, expected in zip(town[0].ground_classes, share, strict=True):
             if name != "ground":
                 assert abs(answer[f"{name}_percent"]["town", label] - 100 * expected) <= 0.051
-    assert answer.scenes.sum() == len(town) + len(generated)
+    assert answer.scenes.sum() == len(town) + len(generated_scenes)
 
 
 def test_tables_page_cluttered_sidewalks(answers, town):
@@ -309,7 +309,7 @@ def test_tables_page_parked_cars(answers, town):
         assert np.allclose(answer.loc[side, ["p05_m", "p50_m", "p95_m"]].astype(float), expected, atol=0.051)
 
 
-def test_tables_page_objects_seen_again(answers, town):
+def test_tables_page_objects_visible_in_next_scene(answers, town):
     seen_again, moved, mistaken = Counter(), Counter(), Counter()
     for drive in group_by_drive(town).values():
         for a, b in zip(drive, drive[1:], strict=False):
@@ -327,19 +327,19 @@ def test_tables_page_objects_seen_again(answers, town):
     assert answer.seen_again.sum() == seen_again.total() > 1000 and answer.moved.sum() > 0
 
 
-def test_tables_page_scene_contents(answers, town, generated):
+def test_tables_page_scene_contents(answers, town, generated_scenes):
     answer = select_answer(answers, "What is in a scene", "source", "category")
     assert np.isclose(answer.per_scene["town"].sum(), np.mean([len(s) for s in town]), atol=0.06)
-    for source, scenes in (("town", town), ("generated-docs", generated)):
+    for source, scenes in (("town", town), ("generated-docs", generated_scenes)):
         sizes = np.concatenate([s.size_m[select_categories(s, "vehicle_small")] for s in scenes])
         row = answer.loc[source, "vehicle_small"].astype(float)
         assert np.allclose(row, [len(sizes) / len(scenes), *np.median(sizes, axis=0)], atol=0.006)
 
 
-def test_tables_page_generated_next_to_real(answers, town, generated):
+def test_tables_page_compares_generated_with_real(answers, town, generated_scenes):
     answer = select_answer(answers, "Do generated scenes", "category")
     for name in answer.index:
-        for side, scenes in (("real", town), ("generated", generated)):
+        for side, scenes in (("real", town), ("generated", generated_scenes)):
             heights = np.concatenate([s.size_m[select_categories(s, name), 2] for s in scenes])
             assert np.isclose(answer[f"{side}_per_scene"][name], len(heights) / len(scenes), atol=0.006)
             if len(heights):
@@ -455,7 +455,7 @@ def test_duckdb_lists_table_columns(answers):
 
 
 def test_shard_reads_files_without_descriptions(tmp_path):
-    """Files without descriptions have the same column names and types and mix with files with descriptions."""
+    """Files without descriptions are readable, alone and together with files with descriptions."""
     old, new = (Shard(str(tmp_path), "town", "train", k) for k in (0, 1))
     old.write([random_scene(0)])
     new.write([random_scene(1)])
