@@ -113,7 +113,7 @@ def test_town_imu_is_above_road_with_z_down_and_small_tilt(drives):
         for index in range(0, len(drive), 40):
             scene = drive.scene(index, grid=Grid(front_m=32.0))
             road = scene.ground_classes.index("road")
-            assert scene.occupied[road, 126:130, 126:130].all()  # the ego vehicle is on a road
+            assert scene.occupied[road, 126:130, 126:130].all()  # The ego vehicle is on a road.
             # Slab tops are 0.3 m above the true surface, and the IMU is 0.93 m above it.
             assert abs(scene.height_m[road, 128, 128] + 0.63) < 0.06
 
@@ -251,7 +251,7 @@ def test_plan_town_covers_request_with_different_towns():
         plan_town_parts(num_train=-3)
 
 
-def test_take_spreads_over_drive():
+def test_select_poses_spreads_over_drive():
     assert select_poses(250, 250).tolist() == list(range(250))
     some = select_poses(251, 7)
     assert len(set(some)) == 7 and some[0] < 30 and some[-1] > 220
