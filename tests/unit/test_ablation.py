@@ -194,7 +194,7 @@ def test_trial_training_sets_are_nested_and_differ_by_seed():
     low, high = THINGS["vehicle"].length_m
     assert low <= large.size_m[:, 0].min() and large.size_m[:, 0].max() <= high
     assert (large.size_m[:, 1] < large.size_m[:, 0]).all()
-    with pytest.raises(ValueError, match="expected sizes of 2 or more"):
+    with pytest.raises(ValueError, match="expected sizes of at least 2"):
         list_trials("vehicle", (), 5)
 
 

@@ -61,7 +61,7 @@ def test_catalogue_suggests_ids_for_unknown_id(town_dataset):
         catalogue.find(["town-9"])
     named = str(error.value).split("scenes include ")[1].split(", ")
     assert len(named) == 3 and set(named) <= set(catalogue.column("scene_id"))
-    with pytest.raises(ValueError, match="there are: ") as error:
+    with pytest.raises(ValueError, match="existing scenes include ") as error:
         catalogue.find(["town-1000000"])
     assert all("town-1000000" in name for name in str(error.value).split("scenes include ")[1].split(", "))
 

@@ -29,7 +29,7 @@ def test_reference_sizes_fit_both_sides():
 
 
 def test_reference_sweep_rejects_unfit_references():
-    with pytest.raises(ValueError, match="no reference fits 5 real and 4 generated"):
+    with pytest.raises(ValueError, match="no reference set fits 5 real and 4 generated"):
         sweep_references(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(4), [], (3,))
 
 
@@ -76,7 +76,7 @@ def test_sampler_sweep_compares_with_ddpm_of_most_steps():
     assert [row[-1] for row in build_sampler_table(rows).rows] == ["no", "–", "yes"]
     (layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
-    assert page.count("<svg") == 4 and "as good as ddpm of 250" in page
+    assert page.count("<svg") == 4 and "as good as ddpm with 250 steps" in page
     scaled = make_row("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
     assert find_reference_row([*rows, scaled]) is paper  # the reference row is without noise scaling, as in the paper
     assert build_sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
