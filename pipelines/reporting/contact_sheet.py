@@ -295,7 +295,7 @@ def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
         draw.rectangle((box.left - 1, box.top - 1, box.left + cols, box.top + rows), outline=LINE)
         plate.paste(Image.fromarray(picture), (box.left, box.top))
         boxes[name] = box
-    _format_metres(draw, scene, boxes["bev"])
+    _draw_ticks(draw, scene, boxes["bev"])
     if scene.occupied.any():
         _draw_scale(plate, draw, boxes["heights"], span_m)
     _draw_legend(draw, scene, LEGEND_X, BOTTOM_ROW)
@@ -321,7 +321,7 @@ def _draw_header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
     write_text(draw, MARGIN, 128, "  ·  ".join([*parts, f"{len(scene)} primitives"]), 20)
 
 
-def _format_metres(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> None:
+def _draw_ticks(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> None:
     """Draw ticks of x at the left of a view from above, and ticks of y below it."""
     grid = scene.grid
     for x in choose_ticks(grid.back_m, grid.front_m, 4):

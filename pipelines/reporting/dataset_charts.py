@@ -99,7 +99,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
         if value <= beyond - 0.5 and value == int(value):
             parts.append(_draw_text(left + (value + 0.5) * step_px, height - 6, format_number(value), "middle"))
     parts.append(_draw_line(left, height - bottom, width - right, height - bottom, "axis"))
-    for value, names in _is_same(marks).items():
+    for value, names in _join_mark_names(marks).items():
         x = left + (value + 0.5) * step_px
         parts.append(
             _draw_line(x, top - 6, x, height - bottom, "series-3", 'stroke-width="1.5" stroke-dasharray="4 3"')
@@ -111,7 +111,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
     return _make_svg(f"scenes by number of {spell_name(category)}", width, height, parts)
 
 
-def _is_same(marks: Mapping[str, float]) -> dict[float, str]:
+def _join_mark_names(marks: Mapping[str, float]) -> dict[float, str]:
     """Return the joined names of the marks by value."""
     names: dict[float, list[str]] = {}
     for name, value in marks.items():
