@@ -69,20 +69,20 @@ class BoxDistribution:
     height_m: tuple[float, float]
 
 
-THINGS = {
+BOX_DISTRIBUTIONS = {
     "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # The paper's study.
     # For square footprints, the scatter matrix does not determine the yaw.
     "any": BoxDistribution((1.0, 6.0), (0.4, 1.0), (0.5, 4.0)),
 }
 
 
-def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
+def draw_boxes(distribution: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
     """Draw upright boxes with yaw in [-pi, pi).
 
     With the same key, the first n boxes of a larger draw equal the draw of n boxes.
 
     Args:
-        things: Distribution of the box sizes.
+        distribution: Distribution of the box sizes.
         count: Number of boxes.
         *key: Integers that key the random numbers.
 
@@ -90,7 +90,7 @@ def draw_boxes(things: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
         The boxes.
     """
     unit = torch.rand(count, 4, generator=make_keyed_generator(*key), dtype=torch.float64).numpy()
-    low, high = np.array([things.length_m, things.width_share, things.height_m, (-np.pi, np.pi)]).T
+    low, high = np.array([distribution.length_m, distribution.width_share, distribution.height_m, (-np.pi, np.pi)]).T
     length, share, height, yaw = (low + unit * (high - low)).T
     return CenteredBoxes(make_yaw_rotation(yaw), np.stack([length, share * length, height], axis=1))
 

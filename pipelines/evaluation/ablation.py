@@ -20,7 +20,13 @@ import torch
 
 from models.geometry.encodings import ENCODINGS
 from models.geometry.iou3d import compute_iou3d_pairs, make_boxes
-from models.studies.orientation_study import THINGS, CenteredBoxes, StudyConfig, draw_boxes, train_autoencoder
+from models.studies.orientation_study import (
+    BOX_DISTRIBUTIONS,
+    CenteredBoxes,
+    StudyConfig,
+    draw_boxes,
+    train_autoencoder,
+)
 from pipelines.reporting.chart import Chart, draw_chart_svg
 from pipelines.reporting.drawings_page import CaptionedSvg, DrawingsSection, render_page_html
 from pipelines.reporting.report import Table, Text
@@ -46,14 +52,14 @@ class Trial:
     """One autoencoder to train.
 
     Attributes:
-        things: Kind of boxes.
+        kind: Kind of boxes.
         encoding: Encoding of a box.
         count: Number of training boxes.
         seed: Seed of boxes and weights.
         numbers: Numbers that the autoencoder regresses: all, or only those that vary (moving).
     """
 
-    things: str
+    kind: str
     encoding: str
     count: int
     seed: int
@@ -62,10 +68,10 @@ class Trial:
     @property
     def name(self) -> str:
         """Return the name of the trial, which names its file of scores."""
-        return f"{self.things}-{self.encoding}-{self.numbers}-{self.count:05d}-seed{self.seed}"
+        return f"{self.kind}-{self.encoding}-{self.numbers}-{self.count:05d}-seed{self.seed}"
 
 
-def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
+def list_trials(kind: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
     """List the trials of each encoding at each training size, ordered by seed and then by decreasing training size.
 
     Raises:
@@ -76,12 +82,12 @@ def list_trials(things: str, counts: Sequence[int], seeds: int, numbers: str = "
             f"training sizes {list(counts)} and {seeds} seeds; expected sizes of at least 2 and at least 1 seed"
         )
     sizes = sorted(set(counts), reverse=True)
-    return [Trial(things, e, count, seed, numbers) for seed in range(seeds) for count in sizes for e in ENCODINGS]
+    return [Trial(kind, e, count, seed, numbers) for seed in range(seeds) for count in sizes for e in ENCODINGS]
 
 
 def draw_training_boxes(trial: Trial) -> CenteredBoxes:
     """Draw the training boxes of a trial. With the same seed, a larger set begins with the boxes of a smaller set."""
-    return draw_boxes(THINGS[trial.things], trial.count, TRAIN_KEY, trial.seed)
+    return draw_boxes(BOX_DISTRIBUTIONS[trial.kind], trial.count, TRAIN_KEY, trial.seed)
 
 
 def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int) -> dict:
@@ -94,7 +100,7 @@ def run_trial(row: dict, directory: str, settings: StudyConfig, test_count: int)
     moving_only = trial.numbers == "moving"
     fitted = train_autoencoder(ENCODINGS[trial.encoding], draw_training_boxes(trial), settings, trial.seed, moving_only)
     seconds = time.perf_counter() - started
-    truth = draw_boxes(THINGS[trial.things], test_count, TEST_KEY)
+    truth = draw_boxes(BOX_DISTRIBUTIONS[trial.kind], test_count, TEST_KEY)
     rebuilt, error = fitted.rebuild(truth)
     iou = compute_mean_iou3d(truth, rebuilt)
     bins = np.digitize(truth.size_m[:, 1] / truth.size_m[:, 0], SHARE_EDGES[1:-1])
@@ -154,16 +160,21 @@ def average_by_size(scores: Iterable[dict]) -> list[dict]:
     """Return mean IoU3D and its variation over seeds, per kind of boxes, numbers, encoding and training size."""
 
     def key(row: dict) -> tuple:
-        return list(THINGS).index(row["things"]), row["numbers"], list(ENCODINGS).index(row["encoding"]), row["count"]
+        return (
+            list(BOX_DISTRIBUTIONS).index(row["kind"]),
+            row["numbers"],
+            list(ENCODINGS).index(row["encoding"]),
+            row["count"],
+        )
 
     rows = []
-    for (things, numbers, encoding, count), found in groupby(sorted(scores, key=key), key):
+    for (kind, numbers, encoding, count), found in groupby(sorted(scores, key=key), key):
         found = list(found)
         iou = np.array([row["iou"] for row in found])
         per_share = np.array([row["iou_per_share"] for row in found], float).mean(axis=0)
         rows.append(
             {
-                "boxes": list(THINGS)[things],
+                "boxes": list(BOX_DISTRIBUTIONS)[kind],
                 "numbers": numbers,
                 "encoding": list(ENCODINGS)[encoding],
                 "training_size": count,
@@ -199,7 +210,7 @@ def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
 @cache
 def find_ranges(encoding: str) -> np.ndarray:
     """Return the range (entries,) of each number of an encoding over "any" boxes."""
-    return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(THINGS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
+    return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(BOX_DISTRIBUTIONS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
 def compute_yaw_loss(row: dict, count: int) -> dict:
@@ -212,7 +223,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
-    truth = draw_boxes(THINGS["any"], count, NOISE_KEY)
+    truth = draw_boxes(BOX_DISTRIBUTIONS["any"], count, NOISE_KEY)
     truth.size_m[:, 1] = row["width_share"] * truth.size_m[:, 0]
     rng = np.random.default_rng(0)
     noisy = encoding.encode(*truth) + row["noise"] * scale * rng.standard_normal((count, encoding.entries))
@@ -412,16 +423,16 @@ def _round_values(value: float | str | None) -> float | str | None:
     return round(value, 4) if isinstance(value, float) else value
 
 
-def draw_size_chart(rows: Sequence[dict], things: str, numbers: str = "all") -> Chart:
+def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Chart:
     """Chart mean IoU3D against training size (paper's figure), with a line per encoding and whiskers over seeds."""
-    rows = [row for row in rows if (row["boxes"], row["numbers"]) == (things, numbers)]
+    rows = [row for row in rows if (row["boxes"], row["numbers"]) == (kind, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
         chosen = [row for row in rows if row["encoding"] == encoding]
         aside = 1 + 0.012 * (k - 1)  # A small shift per encoding prevents overlapping whiskers.
         points = [p for row in chosen for p in _draw_whisker(row["training_size"] * aside, row)]
         series[encoding] = tuple(zip(*points, strict=True)) if points else ((), ())
-    title = f"IoU3D of reconstructed boxes ({things}, {numbers} numbers): mean, minimum and maximum over seeds"
+    title = f"IoU3D of reconstructed boxes ({kind}, {numbers} numbers): mean, minimum and maximum over seeds"
     return Chart(title, series, "training samples", "mean IoU3D")
 
 
@@ -430,12 +441,12 @@ def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
-def draw_share_chart(rows: Sequence[dict], things: str, count: int) -> Chart:
+def draw_share_chart(rows: Sequence[dict], kind: str, count: int) -> Chart:
     middle = ((SHARE_EDGES[1:] + SHARE_EDGES[:-1]) / 2).tolist()
-    chosen = [row for row in rows if row["boxes"] == things and row["training_size"] == count]
+    chosen = [row for row in rows if row["boxes"] == kind and row["training_size"] == count]
     series = {row["encoding"]: (middle, [np.nan if v is None else v for v in row["iou3d_per_share"]]) for row in chosen}
     return Chart(
-        f"Mean IoU3D of reconstructed boxes ({things}, {count:,} samples) by footprint",
+        f"Mean IoU3D of reconstructed boxes ({kind}, {count:,} samples) by footprint",
         series,
         "width / length",
         "mean IoU3D",

@@ -14,7 +14,13 @@ from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
 from models.presets import LVAE_PRESETS
 from models.scene import canonicalize_boxes, make_yaw_rotation
-from models.studies.orientation_study import THINGS, OneObjectAutoencoder, StudyConfig, draw_boxes, train_autoencoder
+from models.studies.orientation_study import (
+    BOX_DISTRIBUTIONS,
+    OneObjectAutoencoder,
+    StudyConfig,
+    draw_boxes,
+    train_autoencoder,
+)
 from models.tensors import decode_layout, make_layout_batch
 from models.vae.config import override_options
 from models.vae.losses import compute_lvae_loss
@@ -191,7 +197,7 @@ def test_trial_training_sets_are_nested_and_differ_by_seed():
     assert all((a[:1200] == b).all() for a, b in zip(large, small, strict=True))
     other = draw_training_boxes(Trial("vehicle", "cholesky", 1200, 4))
     assert not np.isin(other.size_m, large.size_m).any()
-    low, high = THINGS["vehicle"].length_m
+    low, high = BOX_DISTRIBUTIONS["vehicle"].length_m
     assert low <= large.size_m[:, 0].min() and large.size_m[:, 0].max() <= high
     assert (large.size_m[:, 1] < large.size_m[:, 0]).all()
     with pytest.raises(ValueError, match="expected sizes of at least 2"):
@@ -201,7 +207,7 @@ def test_trial_training_sets_are_nested_and_differ_by_seed():
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_trial_learns_with_tiny_settings(name):
     torch.set_num_threads(1)
-    boxes, truth = draw_boxes(THINGS["vehicle"], 128, 0), draw_boxes(THINGS["vehicle"], 200, 1)
+    boxes, truth = draw_boxes(BOX_DISTRIBUTIONS["vehicle"], 128, 0), draw_boxes(BOX_DISTRIBUTIONS["vehicle"], 200, 1)
     iou = []
     for epochs in (0, 15):
         fitted = train_autoencoder(ENCODINGS[name], boxes, StudyConfig(epochs, batch_size=8), 0, moving_only=True)

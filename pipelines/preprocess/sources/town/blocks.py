@@ -215,7 +215,7 @@ def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
     gaps += ((width - 0.5, 0.5, width - 0.5, middle - 2), (width - 0.5, middle + 2, width - 0.5, depth - 0.5))
     for line in gaps:
         plant_border(site, frame, *line, kind, 0.8)
-    n = 2 + site.rng.poisson(3 * site.mood.things)
+    n = 2 + site.rng.poisson(3 * site.mood.objects)
     site.sheet.boxes(
         frame,
         "box",

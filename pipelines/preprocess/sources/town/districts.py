@@ -39,7 +39,7 @@ class District:
     lamps_per_100m: float
     signs_per_100m: float
     lights: float  # Share of street corners with a traffic light.
-    things_per_plot: float  # Number of bins and boxes per plot.
+    objects_per_plot: float  # Number of bins and boxes per plot.
     bicycles_per_plot: float
     people_per_100m: float
     trucks_per_100m: float
@@ -74,7 +74,7 @@ DISTRICTS = {
         lamps_per_100m=2.143,
         signs_per_100m=0.359,
         lights=0.05,
-        things_per_plot=0.321,
+        objects_per_plot=0.321,
         bicycles_per_plot=0.05,
         people_per_100m=0.01,
         trucks_per_100m=0.1,
@@ -105,7 +105,7 @@ DISTRICTS = {
         lamps_per_100m=2.64,
         signs_per_100m=2.05,
         lights=0.1,
-        things_per_plot=0.629,
+        objects_per_plot=0.629,
         bicycles_per_plot=0.02,
         people_per_100m=0.0,
         trucks_per_100m=0.1,
@@ -136,7 +136,7 @@ DISTRICTS = {
         lamps_per_100m=3.136,
         signs_per_100m=3.027,
         lights=0.05,
-        things_per_plot=2.376,
+        objects_per_plot=2.376,
         bicycles_per_plot=0.54,
         people_per_100m=0.706,
         trucks_per_100m=0.08,
@@ -157,7 +157,7 @@ class Mood:
     walls: float
     cars: float
     furniture: float
-    things: float
+    objects: float
     bicycles: float
     people: float
 
@@ -187,7 +187,7 @@ def draw_mood(rng: np.random.Generator) -> Mood:
         walls=gamma(8),
         cars=gamma(3),
         furniture=gamma(6),
-        things=gamma(4),
+        objects=gamma(4),
         # Green blocks have more pedestrians and bicycles.
         bicycles=gamma(1.5) * green**2,
         people=gamma(1.5) * green,

@@ -166,7 +166,7 @@ def _plant_borders(
 def _place_belongings(site: Site, frame: LocalFrame, walls: Rect, gate: tuple[float, float]) -> None:
     """Place bins, boxes and bicycles in front of the house and next to its driveway."""
     s0, s1, t0, _ = walls
-    n = site.rng.poisson(site.district.things_per_plot * site.mood.things)
+    n = site.rng.poisson(site.district.objects_per_plot * site.mood.objects)
     if n:
         row = (gate[1] if site.rng.random() < 0.5 and gate[1] else site.rng.uniform(s0, s1)) + 1.2 * np.arange(n)
         label = "trashbin" if site.rng.random() < 0.5 else "box"
