@@ -17,13 +17,13 @@ from pipelines.rendering.pinhole import Lens, StreetRenderer, shade_view
 from pipelines.rendering.render import encode_png, render_3d
 from pipelines.rendering.street_views import StreetRequest, place_cameras
 
-GAP, WIDTH, HEIGHT, FRAME = 12, 480, 360, 154  # pixels: between pictures, of a scene, height of a street view
+GAP, WIDTH, HEIGHT, FRAME = 12, 480, 360, 154  # Gap between pictures, size of a scene, height of a street view (px).
 SEED = 0
 FRAMES = 3
 
 
 def draw_street_views(scene: Scene) -> list[np.ndarray]:
-    """Views along the road through a scene, evenly spread."""
+    """Draw street views at equal distances along the road of a scene."""
     lens = Lens().resize(WIDTH, FRAME)
     request = StreetRequest("", "", 1.0, 1.55, 0.0, lens, 0.25, None)
     cameras = place_cameras(plan_drive(extract_road_network(scene)), request)
