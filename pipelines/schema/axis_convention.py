@@ -1,4 +1,4 @@
-"""Name the axis directions of imported files: "x+" is forward, "x-" backward, "y+" left and "z+" up."""
+"""Names of the axis directions of imported files: "x+" is forward, "x-" backward, "y+" left and "z+" up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def compute_scene_from_axes(axes: Axes) -> np.ndarray:
         (3, 3) matrix; column k is the direction of file axis k in the scene frame.
 
     Raises:
-        ValueError: The axes do not name each of x, y and z once with a sign.
+        ValueError: `axes` does not contain each of x, y and z exactly once, with a sign.
     """
     if sorted(word[:1] for word in axes) != ["x", "y", "z"] or any(word[1:] not in ("+", "-") for word in axes):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A dataset directory: statistics of its training split, density labels and dataset.json.
+"""Dataset directory: statistics of the training split, density labels and the metadata file dataset.json.
 
 The writer creates dataset.json last. A directory that holds dataset.json is therefore complete.
 """
@@ -18,15 +18,15 @@ from pipelines.schema.density_labels import DensityThresholds, classify_density,
 from pipelines.schema.tables import SCENES, Shard
 
 DESCRIPTION = "dataset.json"
-Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; each is a list with one value per component.
-# Surface that the ground heights of each source describe. "surface" is the surface that objects stand on.
-# "top" is the top of the ground slabs, which lies 0.3 m above that surface.
+Extremes = dict[str, list[list[float]]]  # Name -> [lowest, highest]; both are lists with one value per component.
+# Per source, the surface to which the ground heights refer. "surface" is the surface on which objects stand.
+# "top" is the top of the ground slabs, 0.3 m above that surface.
 SURFACE = {"town": "top", "kitti360": "top", "av2": "surface", "own": "surface"}
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of the training split: thresholds of both density labels and the LayoutSpec.
+    """Statistics of the training split: the thresholds of both density labels, and the LayoutSpec.
 
     Attributes:
         vegetation: Thresholds of the vegetation density label.
@@ -61,10 +61,10 @@ def compute_training_statistics(
         manifests: Manifests of all shards.
         staging: Directory with the tables of the shards.
         grid: Grid of the rasters.
-        slots: Number of slots per category (the paper's sum to N = 514). None takes the 95th percentiles of the counts.
+        slots: Number of slots per category; in the paper, they sum to N = 514. None: the 95th percentile of each count.
 
     Returns:
-        Statistics of all scenes whose split is train.
+        Statistics of all training scenes.
 
     Raises:
         ValueError: The training split is empty.
@@ -115,10 +115,10 @@ def label_scenes(scenes: pa.Table, statistics: Statistics) -> pa.Table:
 
     Args:
         scenes: Rows of the scenes table.
-        statistics: Statistics of the training split, which hold the label thresholds.
+        statistics: Statistics of the training split; they contain the label thresholds.
 
     Returns:
-        The scenes table with the columns vegetation_density and vehicle_density filled.
+        The scenes table with values in the columns vegetation_density and vehicle_density.
     """
     groups = (("vegetation", VEGETATION, statistics.vegetation), ("vehicle", VEHICLES, statistics.vehicle))
     for name, group, thresholds in groups:
@@ -181,13 +181,13 @@ class Dataset:
 
 
 def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
-    """Merge the lowest and highest values of several parts.
+    """Merge the value ranges of several parts.
 
     Args:
-        parts: Lowest and highest values by name; a name may be absent from a part.
+        parts: Lowest and highest value of each name, one mapping per part. A part need not contain every name.
 
     Returns:
-        The lowest and highest value over all parts, by name.
+        Lowest and highest value of each name over all parts.
     """
     parts = list(parts)
     return {

@@ -13,7 +13,7 @@ from models.scene import DENSITIES
 
 @dataclass(frozen=True)
 class DensityThresholds:
-    """25th and 75th percentiles of a group's count and total volume per scene of the training split."""
+    """25th and 75th percentiles, over the training scenes, of a group's count and of its total volume."""
 
     count_p25: float
     count_p75: float
@@ -25,7 +25,7 @@ def compute_density_thresholds(count: np.ndarray, volume_m3: np.ndarray) -> Dens
     """Compute the thresholds of a density label from a training split.
 
     Args:
-        count: (n,) number of the group's primitives per scene, before any truncation to slots.
+        count: (n,) number of the group's primitives per scene, before truncation to the slots.
         volume_m3: (n,) total volume of the group's primitives per scene (m3).
 
     Returns:
@@ -50,12 +50,12 @@ def classify_density(
     percentile. It is medium otherwise (paper, supplement A, Scene Labeling).
 
     Args:
-        count: Number of the group's primitives, per scene or for one scene.
+        count: Number of the group's primitives: an array with one value per scene, or a single value.
         volume_m3: Total volume of the group's primitives (m3), same shape as `count`.
         thresholds: Percentiles of the training split.
 
     Returns:
-        Array of str with the shape of `count`; a numpy str for one scene.
+        Array of str with the shape of `count`; a numpy str if `count` is a single value.
     """
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)

@@ -1,7 +1,7 @@
 """Colours and class ids of the authors' renderings, keyed by category and ground class.
 
-A class id names either a ground class or a primitive category. One small integer thus describes a pixel, a triangle or
-a voxel. The authors' data contain no crossings; this project adds id 17 and its colour.
+A class id names either a ground class or a primitive category. One small integer therefore describes the class of a
+pixel, triangle or voxel. The authors' data contain no crossings. This project adds id 17 and a colour for them.
 """
 
 from __future__ import annotations
@@ -71,6 +71,6 @@ def list_ground_ids(scene: Scene) -> np.ndarray:
         scene: Scene with G ground classes.
 
     Returns:
-        (G + 1,) class ids. The last entry is EMPTY, so index -1 (no ground) gives EMPTY.
+        (G + 1,) class ids. The last entry is EMPTY; index -1 (no ground) therefore selects EMPTY.
     """
     return np.array([GROUND_CLASS_ID[name] for name in scene.ground_classes] + [EMPTY], np.uint8)

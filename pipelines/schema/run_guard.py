@@ -1,4 +1,4 @@
-"""Bind a directory, or a run name in it, to one set of options that a JSON file records."""
+"""Bind a directory or a run name to one set of options. A JSON file records the options."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def guard_options(
 ) -> None:
     """Record the options of a run, or raise an error if results with other options exist.
 
-    If the file records other options and their results are not in use, the function deletes these results and records
-    the new options.
+    If the file records other options but the results are not in use, the function deletes these results. It then
+    records the new options.
 
     Args:
         record: Path of the JSON file with the options.
         options: Options of this run; values must be valid in JSON.
-        is_in_use: Returns whether a run with the recorded options has written results, which must be kept.
-        discard: Deletes the incomplete results of a run with other options.
-        describe: Returns the error message for the first option that differs, such as "seed=1, asked for 2".
+        is_in_use: Function that returns whether the run with the recorded options has results that must be kept.
+        discard: Function that deletes the incomplete results of the run with other options.
+        describe: Function that returns the error message for a difference such as "seed=1, asked for 2".
 
     Raises:
-        ValueError: The file records other options, and results with these options are in use.
+        ValueError: The file records other options, and the results of that run are in use.
     """
     if difference := find_changed_option(record, options):
         if is_in_use():
@@ -39,15 +39,15 @@ def guard_options(
 
 
 def guard_run(output: str, source: str, run: str, options: Mapping[str, object], parts: Sequence[str] = ()) -> None:
-    """Bind a run name to one set of options, recorded in `<source>.json` of the dataset directory.
+    """Bind a run name to one set of options. The file `<source>.json` of the dataset directory records the options.
 
     Args:
         output: Dataset directory.
         source: Value of the source column, such as generated-<run>.
         run: Run name.
         options: Options of this run; values must be valid in JSON.
-        parts: Further directories of the run. A run with other options is replaced only if it wrote no scene and no
-            file in these directories.
+        parts: More directories to which the run writes. An earlier run with other options is replaced only if it wrote
+            neither a scene nor a file in these directories.
 
     Raises:
         ValueError: The directory holds a run of the same name with other options.
@@ -68,14 +68,14 @@ def guard_run(output: str, source: str, run: str, options: Mapping[str, object],
 
 
 def find_changed_option(record: str, options: Mapping[str, object]) -> str:
-    """Describe the first option that differs from those recorded in a JSON file.
+    """Describe the first option that differs from the options in a JSON file.
 
     Args:
         record: Path of the JSON file; the file may be absent.
         options: Options of this run.
 
     Returns:
-        Description such as "seed=1, asked for 2". The string is empty if no option differs or the file is absent.
+        Description such as "seed=1, asked for 2". The string is empty if all options agree or the file is absent.
     """
     return compare_options(storage.read_json(record), options) if storage.exists(record) else ""
 
@@ -88,8 +88,8 @@ def compare_options(recorded: Mapping[str, object], options: Mapping[str, object
         options: Options of this run.
 
     Returns:
-        Description such as "seed=1, asked for 2", with options in alphabetical order. The string is empty if no option
-        differs.
+        Description such as "seed=1, asked for 2" of the alphabetically first difference. The string is empty if all
+        options agree.
     """
     recorded, asked = dict(recorded), json.loads(json.dumps(options))
     if recorded == asked:

@@ -14,20 +14,20 @@ from pipelines.schema.tables import Shard, find_shards
 
 Pick = Literal["spread", "first", "farthest", "apart", "balanced"]
 COLUMNS = ["sequence", "x_m", "y_m", "vegetation_density", "vehicle_density"]
-ONE_WORLD = ("kitti360",)  # Sources whose drives share one world frame.
+ONE_WORLD = ("kitti360",)  # Sources in which all drives share one world frame.
 
 
 @dataclass(frozen=True)
 class SceneSubset:
-    """A selection of at most `limit` scenes of a source and a split.
+    """A selection of at most `limit` scenes of a dataset directory.
 
     The selection rules (`pick`) are:
 
     * spread: evenly spaced over all scenes.
     * first: the first scenes.
     * farthest: farthest point sampling of the poses (paper, supplement, Precision and Recall Metrics).
-    * apart: poses that are at least apart_m apart, evenly thinned to `limit` (same section of the paper).
-    * balanced: equal numbers of scenes per pair of density labels where available, evenly spaced within each pair.
+    * apart: poses at distances of at least apart_m, then evenly subsampled to `limit` (same section of the paper).
+    * balanced: the same number of scenes for each pair of density labels if available, evenly spaced within a pair.
 
     Attributes:
         root: Dataset directory.
@@ -35,7 +35,7 @@ class SceneSubset:
         split: Value of the split column (default: all splits).
         limit: Maximum number of scenes (default: all).
         pick: Selection rule.
-        apart_m: Minimum distance between poses for the rule apart (m).
+        apart_m: Minimum distance between poses for the rule "apart" (m).
     """
 
     root: str
@@ -51,7 +51,7 @@ class SceneSubset:
         if self.pick not in get_args(Pick):
             raise ValueError(f"pick is {self.pick!r}, expected one of {', '.join(get_args(Pick))}")
         if self.pick == "apart" and not self.apart_m > 0:
-            raise ValueError(f"apart_m is {self.apart_m}, expected a distance above 0")
+            raise ValueError(f"apart_m is {self.apart_m}, expected a distance greater than 0")
 
     def shards(self) -> list[tuple[Shard, list[int]]]:
         """Return each shard that has selected rows, together with the numbers of these rows.
@@ -111,13 +111,13 @@ class SceneSubset:
 
 
 def read_described_columns(parts: list[tuple[Shard, list[int]]]) -> tuple[pa.Table, np.ndarray]:
-    """Read COLUMNS of the scenes in some rows of some shards.
+    """Read COLUMNS of the selected rows of several shards.
 
     Args:
         parts: Shards with their row numbers.
 
     Returns:
-        The table in the given order, and the source of each scene (n,).
+        Table with one row per scene, in the order of `parts`; and the source of each scene (n,).
     """
     table = pa.concat_tables([shard.read("scenes", COLUMNS).take(rows) for shard, rows in parts])
     return table, np.repeat([shard.source for shard, _ in parts], [len(rows) for _, rows in parts])
@@ -136,11 +136,11 @@ def list_label_pairs(scenes: pa.Table) -> np.ndarray:
 
 
 def select_evenly(total: int, count: int) -> np.ndarray:
-    """Select evenly spaced numbers from 0 .. total - 1.
+    """Select evenly spaced integers from 0 to total - 1.
 
     Args:
         total: Number of candidates.
-        count: Number of selected candidates, at most `total`.
+        count: Number of candidates to select, at most `total`.
 
     Returns:
         (count,) selected numbers in ascending order.
@@ -149,7 +149,7 @@ def select_evenly(total: int, count: int) -> np.ndarray:
 
 
 def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Read the positions of scenes and number the world frame of each scene.
+    """Read the position of each scene and the number of its world frame.
 
     Callers treat poses of different world frames as infinitely far apart.
 
@@ -168,12 +168,12 @@ def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.nda
 def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
     """Select poses by farthest point sampling, starting with pose 0.
 
-    Every prefix of the result is a farthest point sample as well.
+    For every k, the first k indices are also a farthest point sample.
 
     Args:
         xy_m: (n, 2) position of each pose (m).
         world: (n,) number of the world frame of each pose.
-        count: Number of selected poses, at most n.
+        count: Number of poses to select, at most n.
 
     Returns:
         (count,) indices in order of selection.
@@ -184,14 +184,15 @@ def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarr
         last = chosen[place - 1]
         there = world == world[last]
         nearest_m[there] = np.minimum(nearest_m[there], np.hypot(*(xy_m[there] - xy_m[last]).T))
-        nearest_m[last] = -1  # A second pose at the same position is still selectable: its distance of 0 m exceeds -1.
+        # The value -1 excludes this pose. Another pose at the same position (0 m) remains selectable.
+        nearest_m[last] = -1
         if place < count:
             chosen[place] = nearest_m.argmax()
     return chosen
 
 
 def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndarray:
-    """Select poses that lie at least apart_m from every pose selected before.
+    """Select each pose that lies at least apart_m from all poses selected so far.
 
     The search uses a grid of cells of width apart_m. Each pose is compared with the poses in its cell and the eight
     neighbouring cells.
@@ -218,11 +219,12 @@ def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndar
 def select_balanced(labels: np.ndarray, count: int) -> np.ndarray:
     """Select the same number of scenes for each label where possible.
 
-    If a label has too few scenes, the other labels share the remaining number. Scenes are evenly spaced within a label.
+    If a label has too few scenes, more scenes of the other labels are selected. Scenes are evenly spaced within a
+    label.
 
     Args:
         labels: (n,) label of each scene.
-        count: Number of selected scenes, at most n.
+        count: Number of scenes to select, at most n.
 
     Returns:
         (count,) indices, grouped by label.

@@ -14,8 +14,8 @@ MAX_SEGMENTS = 100
 TEST_M = 15.0
 MARGIN_M = 5.0
 REMOVAL_M = 5.0
-# The paper defines the split only for its 73.7 km of drives. Shorter drives get fewer segments of at least 50 m:
-# 25 m for test poses with margins, and 25 m for training poses.
+# The paper defines the split only for its 73.7 km of drives. Shorter drives are cut into fewer segments of at least
+# 50 m: 25 m for test poses with margins, and 25 m for training poses.
 MIN_SEGMENT_M = 50.0
 
 # Argoverse 2 is split by log; its test logs have no annotations.
@@ -27,14 +27,14 @@ logger = logging.getLogger(__name__)
 def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Assign the split train, test or unused to every pose of every sequence.
 
-    The distance driven is cut into equal segments, one sequence after the other. The gap between two sequences counts
-    as 0 m. A segment has the parts
+    The sequences are concatenated, and the total driven distance is cut into segments of equal length. The gap between
+    two sequences counts as 0 m. A segment has the parts
 
         train ... | 5 m unused | 15 m test | 5 m unused
 
-    Then every train pose within 5 m (BEV) of a test pose becomes unused, and every test pose within 5 m of a train
-    pose. The paper does not define the order of these two removals. Here both removals use the labels before any
-    removal. Both poses of a close pair therefore become unused.
+    Then every train pose within 5 m (BEV) of a test pose becomes unused. Every test pose within 5 m of a train pose
+    also becomes unused. The paper does not define the order of these two removals. In this code, both removals use the
+    splits from before the first removal. Both poses of a close pair therefore become unused.
 
     Args:
         positions_by_sequence: (p, 3) positions of each sequence in driving order (m), in one shared world frame. Pass
@@ -77,10 +77,10 @@ def make_no_split(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.
 def count_segments(total_m: float) -> int:
     """Return the number of split segments: min(100, floor(total_m / 50 m)), at least 1.
 
-    The function logs a warning if the number is below the paper's 100.
+    The function logs a warning if the number is less than the paper's 100.
 
     Args:
-        total_m: Distance driven over all sequences (m).
+        total_m: Driven distance, summed over all sequences (m).
 
     Returns:
         Number of segments.
@@ -88,7 +88,7 @@ def count_segments(total_m: float) -> int:
     count = max(1, min(MAX_SEGMENTS, int(total_m // MIN_SEGMENT_M)))
     if count < MAX_SEGMENTS:
         logger.warning(
-            "the drives are %.0f m long: %d split segments of %.1f m instead of the paper's %d%s",
+            "the drives are %.0f m long; they are cut into %d segments of %.1f m instead of the paper's %d segments%s",
             total_m,
             count,
             total_m / count,
@@ -99,7 +99,7 @@ def count_segments(total_m: float) -> int:
 
 
 def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the distance driven at each pose of all sequences, (sum of p,), and the total distance (m)."""
+    """Return the driven distance at each pose of all sequences, shape (sum of p,), and the total distance (m)."""
     steps = [
         np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])
         for p in positions_m
@@ -110,7 +110,7 @@ def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray,
 
 
 def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> np.ndarray:
-    """(p,) str: the split of each pose, from its position within its segment."""
+    """Return the split (p,) of each pose. The position within the segment determines the split."""
     ends_m = total_m * np.arange(1, segments + 1) / segments
     segment = np.searchsorted(ends_m, driven_m, side="right").clip(max=segments - 1)
     to_end_m = ends_m[segment] - driven_m
@@ -121,7 +121,7 @@ def _label_by_distance(driven_m: np.ndarray, total_m: float, segments: int) -> n
 
 
 def _remove_close(labels: np.ndarray, bev_m: np.ndarray) -> np.ndarray:
-    """Return the splits (p,) after train and test poses within 5 m (BEV) of each other become unused."""
+    """Return the splits (p,), in which train and test poses within 5 m (BEV) of each other are unused."""
     train, test = np.flatnonzero(labels == TRAIN), np.flatnonzero(labels == TEST)
     if len(train) == 0 or len(test) == 0:
         return labels

@@ -1,9 +1,9 @@
 """Convert scenes to and from Parquet tables; real and generated scenes share this schema.
 
-A dataset directory holds the tables `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`. Hive directories
-`source=.../split=.../part-<shard>.parquet` partition each table. Part k of every table holds the same scenes in the
-same order, so a reader needs no join. Column names contain units, and the metadata of every file describes its columns.
-docs/reference/tables.md documents the tables for users.
+A dataset directory holds the tables `scenes/`, `primitives/`, `rasters/`, `latents/` and `rejects/`. Each table is
+partitioned in Hive style: `source=.../split=.../part-<shard>.parquet`. Part k of every table holds the same scenes in
+the same order. A reader therefore needs no join. Column names contain units. The metadata of every file describes the
+columns. docs/reference/tables.md documents the tables for users.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHI
 from pipelines.runtime import storage
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
-SCHEMA_VERSION = "1"  # Version of names and types; descriptions may change within a version.
+SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit number of steps represents.
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit integer can store in steps.
 
 # Meanings of the categories and ground classes, used in the descriptions of columns.
 # fmt: off
@@ -52,7 +52,7 @@ GROUND_MEANING = {
 
 
 def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
-    """Make a self-describing schema from rows of (name, type, unit, description); the unit is "" for none.
+    """Make a self-describing schema from rows of (name, type, unit, description); "" means that there is no unit.
 
     Every field has the metadata `unit` and `description`. DuckDB does not show field metadata. The metadata of the
     table therefore repeats the rows as JSON under `pritti_columns`.
@@ -80,21 +80,21 @@ _SEQUENCE = ("sequence", pa.string(), "",
              "seed.")
 
 SCENES = _make_schema(
-    "One row per scene, a crop of the world ahead of one ego pose (64 x 64 m unless extended), with its labels "
-    "and totals. " + _FRAME,
+    "One row per scene: labels and totals of a crop of the world ahead of one ego pose (64 x 64 m unless "
+    "extended). " + _FRAME,
     _SCENE_ID,
     _SEQUENCE,
     ("frame",                pa.int64(),   "1; av2: ns",
      "Frame number (av2: timestamp), ascending along the drive; for generated scenes, the index within the run."),
     ("x_m",                  pa.float64(), "m",
-     "x of the scene's origin in the world frame: one frame for kitti360, one per city for av2, else one per "
-     "sequence."),
+     "x of the scene's origin in the world frame. kitti360 has one world frame, av2 has one per city, and other "
+     "sources have one per sequence."),
     ("y_m",                  pa.float64(), "m",
      "y of the scene's origin in the world frame; the origin of a sampled scene is (0, 0, 0)."),
     ("z_m",                  pa.float64(), "m",
-     "z (up) of the scene's origin in the world frame: height of the vehicle's origin, not of the road."),
+     "z (up) of the scene's origin in the world frame. This is the height of the vehicle's origin, not of the road."),
     ("yaw_rad",              pa.float64(), "rad",
-     "Direction of the scene's x axis in the world frame, from the world's x axis, in [-pi, pi]."),
+     "Angle from the world's x axis to the scene's x axis, in [-pi, pi]."),
     # A list of variable size, because Parquet has no null value for a list of fixed size.
     ("world_from_imu",       pa.list_(pa.float64()), "1; m",
      "Full pose in the source dataset, a 3 x 4 matrix row by row with the translation (m) in its last column; or "
@@ -155,7 +155,7 @@ RASTERS = _make_schema(
     ("occupied",       pa.binary(),  "",
      "One bit per (class, row, col) in C order, most significant first; 1 if the class covers the pixel's centre."),
     ("resolution_m",   pa.float64(), "m",   "Edge length of a pixel."),
-    ("height_step_m",  pa.float64(), "m",   "Height of one unit of `height`."),
+    ("height_step_m",  pa.float64(), "m",   "Height that one unit of `height` represents."),
     ("rows",           pa.int32(),   "1",   "Number of pixel rows; row 0 is the farthest ahead."),
     ("cols",           pa.int32(),   "1",   "Number of pixel columns; column 0 is the leftmost."),
     ("front_m",        pa.float64(), "m",
@@ -218,10 +218,11 @@ def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
         scene: Scene whose ground heights lie within ±327.67 m.
 
     Returns:
-        (height, occupied) as bytes. Only occupied pixels have a height, stored as the difference to the previous one.
+        (height, occupied) as bytes. Only occupied pixels have a height. It is stored as the difference to the previous
+        height.
 
     Raises:
-        ValueError: A ground height exceeds the range of a 16-bit number of steps.
+        ValueError: A ground height, expressed in steps, exceeds the range of 16-bit integers.
     """
     steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
     if len(steps) and np.abs(steps).max() > 32767:
@@ -243,7 +244,7 @@ def decode_ground(
         step_m: Column `height_step_m` (m).
 
     Returns:
-        height_m (G, H, W) float32, 0 outside the mask, and occupied (G, H, W) bool.
+        height_m (G, H, W) float32, which is 0 outside the mask; and occupied (G, H, W) bool.
     """
     steps, mask = list_ground_steps(height, occupied, shape)
     height_m = np.zeros(shape, np.float32)
@@ -252,7 +253,7 @@ def decode_ground(
 
 
 def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Decode the heights of occupied pixels, in steps, and the mask from one row of `rasters`.
+    """Decode one row of `rasters`: the heights of occupied pixels (in steps) and the mask.
 
     Args:
         height: Column `height`.
@@ -304,7 +305,7 @@ def make_primitives_table(scenes: Sequence[Scene]) -> pa.Table:
     """Make the rows of `primitives` for several scenes.
 
     Args:
-        scenes: Scenes of one shard; may be empty.
+        scenes: Scenes of one shard; the sequence may be empty.
 
     Returns:
         One row per primitive, in the order of the scenes.
@@ -381,9 +382,9 @@ def parse_scenes(
     """Yield the Scenes of one shard.
 
     Args:
-        scenes: Rows of `scenes` of the shard.
-        primitives: Rows of `primitives` of the shard.
-        rasters: Rows of `rasters` of the shard.
+        scenes: Rows of the shard in the table `scenes`.
+        primitives: Rows of the shard in the table `primitives`.
+        rasters: Rows of the shard in the table `rasters`.
         source: Value of the source column.
         split: Value of the split column.
         rows: Row numbers of the scenes to return, in this order (default: all).
@@ -399,8 +400,8 @@ def parse_scenes(
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
         if scene["scene_id"] != raster["scene_id"]:
             raise ValueError(
-                f"the tables of the shard are not aligned: scenes holds {scene['scene_id']} where rasters holds"
-                f" {raster['scene_id']}"
+                f"the tables of the shard are not aligned: in one row, scenes holds {scene['scene_id']} but rasters "
+                f"holds {raster['scene_id']}"
             )
         here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
@@ -438,7 +439,7 @@ def find_category_indices(names: pa.ChunkedArray) -> np.ndarray:
         (n,) int8 index into CATEGORIES.
 
     Raises:
-        ValueError: A name is no category of this version.
+        ValueError: A name is not a category of this version.
     """
     category = pc.index_in(names, pa.array(CATEGORIES))  # pyright: ignore[reportAttributeAccessIssue]
     if category.null_count:
@@ -487,7 +488,7 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """One shard of a dataset directory: one Parquet file with the same number in each table.
+    """One shard of a dataset directory: the Parquet files with the same number, one in each table.
 
     Attributes:
         root: Dataset directory.
@@ -568,7 +569,7 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
         split: Value of the split column (default: all splits).
 
     Returns:
-        The shards; never an empty list, because no job accepts empty input.
+        The shards; the list is never empty.
 
     Raises:
         ValueError: The directory holds no matching shard.
