@@ -25,10 +25,12 @@ class SceneGenerator(Protocol):
     @property
     def spec(self) -> LayoutSpec:
         """Layout of the scenes."""
+        ...
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
         """Shape (c, h, w) of a latent."""
+        ...
 
     def encode(self, scenes: Sequence[Scene]) -> Tensor:
         """Encode scenes to latents.
@@ -39,17 +41,19 @@ class SceneGenerator(Protocol):
         Returns:
             (b, c, h, w) latents.
         """
+        ...
 
     def decode(self, latents: Tensor, identities: Sequence[Scene]) -> list[Scene]:
         """Decode latents to scenes.
 
         Args:
             latents: (b, c, h, w) latents.
-            identities: Scenes that provide ids and labels.
+            identities: Scenes whose ids and labels are copied to the results.
 
         Returns:
             One scene per latent.
         """
+        ...
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
         """Return an empty Scene with the id of a generated scene.
@@ -63,6 +67,7 @@ class SceneGenerator(Protocol):
         Returns:
             The empty scene.
         """
+        ...
 
     def label_tensor(self, labels: Sequence[str]) -> Tensor:
         """Convert labels to class indices.
@@ -73,6 +78,7 @@ class SceneGenerator(Protocol):
         Returns:
             (b,) class indices.
         """
+        ...
 
     def inpaint_latents(
         self,
@@ -91,15 +97,16 @@ class SceneGenerator(Protocol):
             condition: Known latents and masks.
             labels: Label of each scene.
             seed: Seed of the noise, or one seed per scene.
-            indices: Key of each scene; it keys the noise.
+            indices: Key of each scene; the noise depends on the seed and this key.
             repaint: Options of RePaint.
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `PrITTIPipeline.generate`.
-            purpose: Purpose of the noise (models/sampling/diffusion.py).
+            purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
 
         Returns:
             (b, c, h, w) latents.
         """
+        ...
 
     def inpaint(
         self,
@@ -119,16 +126,17 @@ class SceneGenerator(Protocol):
 
         Args:
             scenes: Scenes on the model's grid.
-            regions: Mask (rows, cols) per scene, True = regenerate.
+            regions: One mask (rows, cols) per scene; True marks the pixels to regenerate.
             labels: Label of each scene.
-            contents: What to regenerate: "both", "ground" or "objects".
+            contents: Part of the scene to regenerate: "both", "ground" or "objects".
             seed: Seed of the noise.
-            indices: Key of each scene; it keys the noise.
-            repaint: Options of RePaint (default: the paper's).
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            indices: Key of each scene; the noise depends on the seed and this key.
+            repaint: Options of RePaint; None: the options of the paper.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `PrITTIPipeline.generate`.
-            composite: Take everything outside the regions from the input.
+            composite: If True, copy everything outside the regions from the input.
 
         Returns:
             The regenerated scenes.
         """
+        ...
