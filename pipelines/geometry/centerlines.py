@@ -1,8 +1,8 @@
-"""Extract the road network of a Scene from its road mask: centrelines with height and width, joined at nodes.
+"""Extract the road network of a Scene from its road mask: centrelines with heights and widths, which meet at nodes.
 
-The mask is cleaned, thinned to a skeleton one pixel wide, and cut at its forks. Spurs that the shape of the outline
-causes are removed. Forks that are closer together than the road width become one node. Edge values extend the mask
-beyond the scene's border, so that a road crosses the border in a straight line.
+The mask is cleaned and thinned to a skeleton of one pixel width. The skeleton is cut at its forks. Spurs, which are
+artefacts of an uneven outline, are removed. Forks that are closer together than the road width become one node. The
+mask is padded with its edge values beyond the scene's border. A road therefore crosses the border in a straight line.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from skimage.morphology import skeletonize
 from models.scene import ROAD_CLASSES, Scene
 from pipelines.geometry.masks import find_nearest_true, label_parts, measure_depth
 
-CELL_M = 0.5  # Cell size of the mask that is thinned.
-HOLE_M2, ISLAND_M2 = 25.0, 40.0  # Smaller holes are filled and smaller islands are removed.
-MARGIN_M = 16.0  # Width of the mask's extension beyond the scene's border.
-SPUR = 1.6  # A dead end shorter than this multiple of the half width at its fork is not a road.
-ONE_NODE = 1.0  # Forks closer than this multiple of the sum of their half widths become one node.
+CELL_M = 0.5  # Cell size of the mask for thinning.
+HOLE_M2, ISLAND_M2 = 25.0, 40.0  # Minimum area of a hole, and minimum area of an island.
+MARGIN_M = 16.0  # Width of the padding beyond the scene's border.
+SPUR = 1.6  # Minimum length of a dead end, as a multiple of the half width at its fork.
+ONE_NODE = 1.0  # Minimum distance between forks, as a multiple of the sum of their half widths.
 SMOOTH_M = 3.0  # Standard deviation of the Gaussian that smooths a line.
-LEAST_M = 4.0  # A shorter line is not a road.
+LEAST_M = 4.0  # Minimum length of a road.
 AROUND = np.ones((3, 3), int)  # Neighbourhood of eight pixels.
 
 
@@ -35,8 +35,8 @@ class Road:
     Attributes:
         xyz_m: Points on the ground (m).
         width_m: Width of the whole road at each point (m).
-        start: Node at the first point, or -1 if the road leaves the scene or ends.
-        end: Node at the last point, or -1.
+        start: Node at the first point; -1 if the road leaves the scene there or is a dead end.
+        end: Node at the last point; -1 as for `start`.
         number: Number of the road in the network.
     """
 
@@ -134,9 +134,9 @@ def _make_road_mask(scene: Scene) -> np.ndarray:
 
 
 def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) -> np.ndarray:
-    """Return the 4-connected parts of a mask with at least the given area.
+    """Return the 4-connected parts of a mask that have at least the given area.
 
-    `border` also keeps the parts that touch the border of the mask.
+    With `border`, smaller parts that touch the border of the mask are kept as well.
     """
     parts, count = label_parts(mask)
     keep = np.bincount(parts.ravel(), minlength=count + 1) * CELL_M**2 >= area_m2
@@ -177,13 +177,13 @@ def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
 
 
 def _join(graph: nx.MultiGraph, u: int, v: int, path: np.ndarray) -> None:
-    """Add an edge whose path (k, 2) leads from u to v, and extend the path to both nodes."""
+    """Add an edge with a path (k, 2) from u to v, and extend the path to both nodes."""
     path = np.concatenate([[graph.nodes[u]["place"]], path, [graph.nodes[v]["place"]]])
     graph.add_edge(min(u, v), max(u, v), path=path if u <= v else path[::-1])
 
 
 def _order_pixels(pixels: np.ndarray) -> np.ndarray:
-    """Sort the pixels (k, 2) of an 8-connected line without forks from one end to the other."""
+    """Sort the pixels (k, 2) of an 8-connected line from one end to the other. The line has no forks."""
     left = {tuple(p) for p in pixels.tolist()}
 
     def beside(p: tuple[int, int]) -> Iterator[tuple[int, int]]:
@@ -208,7 +208,7 @@ def _measure_half_width(graph: nx.MultiGraph, node: int, half_m: np.ndarray) -> 
 
 
 def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
-    """Remove spurs, the shortest first, and join the two remaining lines at each former fork."""
+    """Remove spurs in order of length, the shortest first. At each former fork, join the two lines that remain."""
     while True:
         spurs = []
         for u, v, key, path in graph.edges(keys=True, data="path"):
@@ -226,21 +226,24 @@ def _prune(graph: nx.MultiGraph, half_m: np.ndarray, margin: int) -> None:
 
 
 def _straighten(graph: nx.MultiGraph) -> None:
-    """Join the two lines at every node where only two lines meet."""
+    """Join the two lines at each node where exactly two lines meet."""
     for node in [n for n, degree in graph.degree() if degree == 2]:
         edges = list(graph.edges(node, keys=True, data="path"))
-        if len(edges) == 2:  # Otherwise, a single line leads from the node to itself.
+        if len(edges) == 2:  # A loop also has degree 2, but it is a single edge.
             parts, ends = [], []
             for u, v, _, path in edges:
                 other = v if u == node else u
                 ends.append(other)
-                parts.append(path if other <= node else path[::-1])  # Directed towards the node.
+                parts.append(path if other <= node else path[::-1])  # Each path leads towards the node.
             graph.remove_node(node)
             _join(graph, ends[0], ends[1], np.concatenate([parts[0][1:-1], parts[1][::-1][1:-1]]))
 
 
 def _unite_close_nodes(graph: nx.MultiGraph, half_m: np.ndarray) -> None:
-    """Merge two forks into one node if their line is shorter than the road width, the closest pair first."""
+    """Merge two forks into one node if the line between them is shorter than the road width.
+
+    The closest pair is merged first.
+    """
     while True:
         close = []
         for u, v, path in graph.edges(data="path"):
@@ -277,7 +280,7 @@ def _smooth(line: np.ndarray, sigma: float) -> np.ndarray:
 def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, bool, bool]]:
     """Yield the sections of a line (k, 2) inside the scene.
 
-    The two flags state whether a section includes the first and the last point of the line.
+    Two flags state whether the section includes the first point and the last point of the line.
     """
     inside = ((line >= -0.5) & (line <= np.array(shape) - 0.5)).all(axis=1)
     border = np.flatnonzero(np.diff(inside.astype(int), prepend=0, append=0)).reshape(-1, 2)
@@ -286,9 +289,9 @@ def _find_inside(line: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.
 
 
 def _straighten_ends(line: np.ndarray, half_m: np.ndarray, margin: int) -> np.ndarray:
-    """Replace the end of a line (k, 2) at the scene's border by a straight continuation.
+    """At the scene's border, replace the end of a line (k, 2) by a straight continuation.
 
-    Without this step, the line bends towards the extended mask within half a road width of the border.
+    Without this step, the padded mask bends the line within half a road width of the border.
     """
     half = half_m[tuple(np.round(line[-1] + margin).astype(int))] / CELL_M
     left = len(line) - int(2 * half)
@@ -309,7 +312,10 @@ def _resample_line(line: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
-    """Return the height (h, w) of the road in cells of CELL_M; other cells take the height of the nearest road."""
+    """Return the height (h, w) of the road in cells of CELL_M.
+
+    Cells without road get the height of the nearest road.
+    """
     index = [scene.ground_classes.index(name) for name in ROAD_CLASSES if name in scene.ground_classes]
     known = np.any(scene.occupied[index], axis=0)
     height_m = np.where(scene.occupied[index], scene.height_m[index], -np.inf).max(axis=0, initial=-np.inf)
@@ -324,8 +330,8 @@ def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
 def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
     """Plan a smooth path on the ground along the roads.
 
-    The path begins at the end of a road nearest to start_m. At each node, the path continues along the road with the
-    smallest change of direction that it has not used before.
+    The path begins at the road end that is nearest to start_m. At each node, the path continues along an unused road:
+    the one with the smallest change of direction.
 
     Args:
         network: Roads.
@@ -334,7 +340,7 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
             half.
 
     Returns:
-        (k, 3) points in the scene frame (m), spaced like those of the roads; (0, 3) without roads.
+        (k, 3) points in the scene frame (m), with the spacing of the roads' points; (0, 3) if there are no roads.
     """
     starts = [r for road in network.roads for r in (road, road.reverse()) if r.start == -1]
     starts = starts or [r for road in network.roads for r in (road, road.reverse())]
@@ -364,6 +370,6 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
 
 
 def _compute_direction(road: Road) -> np.ndarray:
-    """Return the direction (2,) of a road near its start, away from the start."""
+    """Return the direction (2,) in which a road leaves its start."""
     way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
     return way / np.linalg.norm(way)

@@ -1,4 +1,4 @@
-"""Wrappers of scipy.ndimage functions on masks; scipy's own annotations lack the exact return types."""
+"""Wrappers of scipy.ndimage functions for masks. They add exact return types, which scipy's annotations lack."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def label_parts(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[
         structure: Neighbourhood of an element, as in `scipy.ndimage.label` (default: elements that share a face).
 
     Returns:
-        (...) int32 number of each element's part (1, 2, ... inside the mask and 0 outside), and the number of parts.
+        (...) int32 part number of each element (1, 2, ... inside the mask, 0 outside), and the number of parts.
     """
     return cast("tuple[np.ndarray, int]", ndimage.label(mask, structure))
 
@@ -34,7 +34,7 @@ def measure_depth(mask: np.ndarray) -> np.ndarray:
 
 
 def find_nearest_true(mask: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Find the element of a mask that is nearest to each element.
+    """For each element, find the nearest element inside the mask.
 
     Args:
         mask: (...) bool with at least one True element.

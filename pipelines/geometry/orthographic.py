@@ -10,9 +10,9 @@ import numpy as np
 from models.scene import ELLIPSOID, Grid, Scene
 from pipelines.geometry.rasterize import concatenate_ranges, fill_triangles, list_integers_between
 
-FILL = 0.95  # Share of the image width or height that the scene fills; the tighter of the two sets the scale.
-ROUNDING_M = 1e-6  # Tolerance that exceeds the rounding error of a depth.
-BELOW_M, ABOVE_M = 2.0, 14.0  # Vertical range below and above the ego vehicle's origin that the camera covers.
+FILL = 0.95  # Share of the image that the scene fills, in the direction (width or height) that limits the scale.
+ROUNDING_M = 1e-6  # Tolerance for depths, larger than their rounding errors.
+BELOW_M, ABOVE_M = 2.0, 14.0  # Vertical range that the camera covers, relative to the ego vehicle's origin.
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Camera:
 
 
 def make_top_camera(view: Grid) -> Camera:
-    """Return the camera that looks straight down; its frame is the scene frame.
+    """Return the camera that looks straight down. The camera frame equals the scene frame.
 
     Args:
         view: Pixel grid in the scene frame.
@@ -55,7 +55,7 @@ def make_top_camera(view: Grid) -> Camera:
 
 
 def make_oblique_camera(grid: Grid, width: int, height: int, azimuth_deg: float, elevation_deg: float) -> Camera:
-    """Return an oblique camera that shows the whole grid as large as the image allows.
+    """Return an oblique camera that shows the whole grid at the largest scale that fits the image.
 
     Args:
         grid: Horizontal extent of the scene.
@@ -71,7 +71,7 @@ def make_oblique_camera(grid: Grid, width: int, height: int, azimuth_deg: float,
         ValueError: elevation_deg lies outside (0, 90].
     """
     if not 0 < elevation_deg <= 90:
-        raise ValueError(f"elevation_deg is {elevation_deg}, must be above 0 and at most 90")
+        raise ValueError(f"elevation_deg is {elevation_deg}, expected a value in (0, 90]")
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     ahead, left = (
         np.array([np.cos(azimuth), np.sin(azimuth), 0]),
@@ -111,8 +111,8 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
         camera: Orthographic camera.
 
     Returns:
-        depth_m (H, W) float64, z in the camera frame (m), -inf without a hit; and primitive (H, W) int64, index of the
-        primitive, -1 without a hit.
+        depth_m (H, W) float64: z in the camera frame (m), -inf if there is no hit. primitive (H, W) int64: index of the
+        primitive, -1 if there is no hit.
     """
     pixel, chord, chords = _compute_chords(scene, camera)
     shape = camera.view.rows, camera.view.cols
@@ -123,10 +123,10 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
-    """Find the pixels where `cast_ellipsoids` returns a larger depth than a given one.
+    """Find the pixels where the depth from `cast_ellipsoids` exceeds the depth in `depth_m`.
 
-    The function first compares a lower bound of the depth. It computes the exact depth only where this bound does not
-    exceed the given depth.
+    The function first compares a lower bound of the ellipsoid's depth with `depth_m`. It computes the exact depth only
+    where this bound does not exceed `depth_m`.
 
     Args:
         scene: Scene.
@@ -134,7 +134,7 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
         depth_m: (H, W) depth to compare with: z in the camera frame (m).
 
     Returns:
-        Flat pixel indices; a pixel may occur several times.
+        Flat pixel indices. The same pixel may occur several times.
     """
     pixel, chord, chords = _compute_chords(scene, camera)
     there_m = depth_m.reshape(-1).take(pixel)
@@ -145,7 +145,10 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
 
 
 class _Chords(NamedTuple):
-    """Chords of ellipsoids along rows of pixel centres, seen from a camera; m chords, ordered by ellipsoid."""
+    """The m chords of ellipsoids along rows of pixel centres, as seen from a camera.
+
+    Chords are ordered by ellipsoid.
+    """
 
     primitive: np.ndarray  # (m,) index of the primitive in the scene.
     row_start: np.ndarray  # (m,) flat index of the first pixel in the row.
@@ -154,11 +157,11 @@ class _Chords(NamedTuple):
 
 
 def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
-    """Return the flat pixel index and the chord of each pixel centre inside an ellipsoid (k,), and the chords.
+    """Return the flat pixel index (k,) and chord index (k,) of each pixel centre inside an ellipsoid, and the chords.
 
     Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| = 1. L is
-    lower triangular. Therefore x determines the first entry of s, and y then determines the second. The positive root
-    gives the third.
+    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The positive
+    root is the third entry.
     """
     view = camera.view
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
@@ -186,7 +189,7 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def _compute_depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
-    """Return the depth (k,) of ellipsoids at flat pixel indices on their chords."""
+    """Return the depth (k,) of ellipsoids at pixels on their chords; pixels are flat indices."""
     y, shift, l11, rest, middle, l21, l22 = chords.terms
     col = pixel - chords.row_start.take(chord)
     s1 = (view.y_m().take(col) - y.take(chord) - shift.take(chord)) / l11.take(chord)

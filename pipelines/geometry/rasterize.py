@@ -1,8 +1,9 @@
-"""Rasterise triangles exactly, seen from above, by vertical rays through pixel centres.
+"""Rasterise triangles from above. The result is exact for vertical rays through pixel centres.
 
-A vertical ray meets a triangle if the pixel centre lies inside the triangle's vertical projection. Each triangle is
-filled row by row: each row has an interval of columns, a plane gives the height, and the highest hit is kept. The same
-code serves the ground rasters (paper, Sec. 3.1), the BEV images and, after a rotation of the mesh, the 3D images.
+A vertical ray hits a triangle if the pixel centre lies inside the triangle's vertical projection. The code fills each
+triangle row by row. A row is an interval of columns, and the triangle's plane gives the heights. Each pixel keeps the
+highest hit. The same code makes the ground rasters (paper, Sec. 3.1) and the BEV images. It also makes the 3D images,
+after a rotation of the mesh.
 """
 
 from __future__ import annotations
@@ -11,15 +12,16 @@ import numpy as np
 
 from models.scene import Grid
 
-EDGE_PX = 1e-7  # A pixel centre this close to an edge counts as inside, which prevents gaps between adjacent triangles.
-# Slope (m per pixel) above which hits are clamped to the height range of their triangle, for sliver triangles.
+# A pixel centre within this distance of an edge counts as inside. This prevents gaps between adjacent triangles.
+EDGE_PX = 1e-7
+# For steeper triangles (m per pixel), such as slivers, hits are clamped to the triangle's height range.
 STEEP = 1e3
 
 
 def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Concatenate the integer ranges first[i] .. first[i] + count[i] - 1.
 
-    np.repeat(x, count) gives the corresponding values of x.
+    For values x per range, `np.repeat(x, count)` gives the value for each integer.
 
     Args:
         first: (n,) first integer of each range.
@@ -40,7 +42,7 @@ def list_integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple
         size: Upper bound of all integers, exclusive.
 
     Returns:
-        First integer of each interval, and the number of integers in it; (n,) int64 both.
+        First integer of each interval, and number of integers in each interval, both (n,) int64.
     """
     first = np.minimum(np.maximum(np.ceil(low), 0), size)
     count = np.maximum(np.minimum(np.floor(high) + 1, size) - first, 0)
@@ -48,20 +50,20 @@ def list_integers_between(low: np.ndarray, high: np.ndarray, size: int) -> tuple
 
 
 def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the hits of vertical rays through pixel centres with triangles.
+    """Return the points where vertical rays through pixel centres hit triangles.
 
     Args:
         triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
         grid: Pixel grid.
-        owner: (t,) value to report for the hits of each triangle.
+        owner: (t,) value that is returned with each hit of a triangle.
 
     Returns:
-        Flat pixel index, owner and height (m) of each hit, (m,) each, ordered by triangle.
+        Flat pixel index, owner and height (m) of each hit; three arrays (m,), ordered by triangle.
     """
     x, y, z = np.ascontiguousarray(triangles_m.astype(np.float64).T)  # each is (3, t)
     u = (grid.front_m - x) / grid.resolution_m - 0.5
     v = (grid.left_m - y) / grid.resolution_m - 0.5
-    # The plane of a triangle is z = z0 + du (u - u0) + dv (v - v0), solved by Cramer's rule.
+    # The plane of a triangle is z = z0 + du (u - u0) + dv (v - v0). Cramer's rule gives du and dv.
     (u1, u2), (v1, v2), (z1, z2) = [(w[1] - w[0], w[2] - w[0]) for w in (u, v, z)]
     area = u1 * v2 - u2 * v1
     first, rows = list_integers_between(u.min(axis=0) - EDGE_PX, u.max(axis=0) + EDGE_PX, grid.rows)
@@ -88,7 +90,7 @@ def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[n
 def _find_column_intervals(
     row: np.ndarray, spans: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest column coordinate of triangles in pixel rows (s,).
+    """Return the lowest and highest column coordinate of a triangle in each of its pixel rows (s,).
 
     The argument spans (t,) is the number of rows per triangle. The arguments u and v (3, t) are row and column
     coordinates of the corners, in pixels. Pixel centres have integer coordinates.
@@ -108,7 +110,7 @@ def fill_triangles(
 ) -> None:
     """Draw hits into images in place: each pixel keeps the highest value and its owner.
 
-    Among equal values of the hits, the last hit wins. A hit also wins over an equal value that the image already holds.
+    If several hits have the same value, the last hit wins. A hit also replaces the same value in the image.
 
     Args:
         pixel: (m,) flat pixel index of each hit.
@@ -127,17 +129,18 @@ def cast_rays_down(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the highest hit of the vertical ray through each pixel centre, per layer.
 
-    Among equal heights, the last triangle wins. Vertical triangles have no area seen from above and are skipped.
+    If several triangles have the same height, the last triangle wins. Vertical triangles have no area seen from above
+    and are skipped.
 
     Args:
         triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
         grid: Pixel grid.
-        layer: (t,) layer of each triangle, in 0 .. num_layers - 1 (default: 0).
+        layer: (t,) layer of each triangle, in 0 .. num_layers - 1 (default: layer 0).
         num_layers: Number of layers.
 
     Returns:
-        height_m (num_layers, H, W) float64, -inf without a hit. triangle (num_layers, H, W) int64: index of the
-        triangle, -1 without a hit.
+        height_m (num_layers, H, W) float64: height (m), -inf if there is no hit. triangle (num_layers, H, W) int64:
+        index of the triangle, -1 if there is no hit.
     """
     pixel, triangle, value = find_hits(triangles_m, grid, np.arange(len(triangles_m)))
     if layer is not None:
@@ -149,7 +152,7 @@ def cast_rays_down(
 
 
 def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
-    """Return only the heights of `cast_rays_down`, in half the memory and less time.
+    """Return only the heights from `cast_rays_down`. This function needs half the memory and less time.
 
     Args:
         triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).
@@ -158,7 +161,7 @@ def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, nu
         num_layers: Number of layers.
 
     Returns:
-        (num_layers, H, W) float32 height (m), -inf without a hit.
+        (num_layers, H, W) float32 height (m), -inf if there is no hit.
     """
     pixel, layer_start, value = find_hits(triangles_m, grid, np.asarray(layer, np.int64) * (grid.rows * grid.cols))
     height = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
@@ -167,7 +170,7 @@ def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, nu
 
 
 def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return the pixels whose centres lie inside a polygon, by the even-odd rule.
+    """Return a mask of the pixel centres inside a polygon, according to the even-odd rule.
 
     Args:
         outline_m: (n, 2) vertices (x, y) of any simple polygon (m); the last vertex connects to the first.
@@ -181,7 +184,7 @@ def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
     u_next, v_next = np.roll(u, -1), np.roll(v, -1)
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
-    # The interval is half-open, so a vertex on a row counts once.
+    # The interval is half-open. A vertex on a row therefore counts once.
     beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)
     row, edge = concatenate_ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])

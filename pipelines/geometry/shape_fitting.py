@@ -15,8 +15,8 @@ Shapes = tuple[np.ndarray, np.ndarray, np.ndarray]
 def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit boxes to edge vectors.
 
-    The longest edge determines the first axis of the box. Rounding errors change the direction of a short edge most. A
-    first axis along a short edge would displace the corners of a long box.
+    The longest edge determines the first axis of the box. A short edge is unsuitable, because rounding errors change
+    its direction more. The error would displace the corners of a long box.
 
     Args:
         edges_m: (n, 3, 3); columns are the edge vectors of a box (m).
@@ -26,7 +26,7 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
         rotation (n, 3, 3) and size_m (n, 3).
 
     Raises:
-        ValueError: A corner of the fitted box is off by more than FIT_M, or a size lies outside LIMITS_M.
+        ValueError: A corner of the fitted box deviates by more than FIT_M, or a size lies outside LIMITS_M.
     """
     order = np.argsort(-np.linalg.norm(edges_m, axis=1), axis=1, kind="stable")[:, None, :]
     first, second, third = np.moveaxis(np.take_along_axis(edges_m, order, axis=2), 2, 0)
@@ -41,7 +41,7 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
     np.put_along_axis(rotation, np.broadcast_to(order, rotation.shape), np.stack([u, v, w], axis=2), axis=2)
     size_m = (rotation * edges_m).sum(axis=1)
     off_m = np.linalg.norm(edges_m - rotation * size_m[:, None], axis=1).sum(axis=1) / 2
-    _refuse(~(off_m <= FIT_M), center_m, "is no box, because its corners are not square")
+    _refuse(~(off_m <= FIT_M), center_m, "is not a box, because its edges are not perpendicular")
     _refuse_sizes(size_m, center_m)
     return rotation, size_m
 
@@ -50,7 +50,7 @@ def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
     """Fit boxes to their eight corners.
 
     The two shortest vectors from one corner to the others are edges. The third edge is the vector to the opposite
-    corner minus these two.
+    corner, minus these two edges.
 
     Args:
         corners_m: (n, 8, 3) corners of each box in any order (m).
@@ -59,7 +59,7 @@ def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
         Centre, rotation and size of each box.
 
     Raises:
-        ValueError: Eight points are not the corners of a box.
+        ValueError: The points of an entry are not the corners of a box.
     """
     center_m, start_m = corners_m.mean(axis=1), corners_m[:, 0]
     ways_m = corners_m[:, 1:] - start_m[:, None]
@@ -95,11 +95,14 @@ def fit_ellipsoids(clouds: list[np.ndarray]) -> Shapes:
 
 
 def _fit_ellipsoid(points_m: np.ndarray) -> Shapes:
-    """Fit the quadric x^T M x + 2 b^T x = 1 to points, in coordinates in which all axes have equal spread."""
+    """Fit the quadric x^T M x + 2 b^T x = 1 to points.
+
+    The fit uses coordinates in which the points have the same spread along all axes.
+    """
     mean_m = points_m.mean(axis=0)
     _, spread, axes = np.linalg.svd(points_m - mean_m, full_matrices=False)
     if not spread[-1] > 1e-9 * spread[0]:
-        raise _make_refusal(mean_m, "is flat and therefore no ellipsoid")
+        raise _make_refusal(mean_m, "is flat and therefore not an ellipsoid")
     world_from_local = axes.T * (spread / np.sqrt(len(points_m) / 3))
     local = np.linalg.solve(world_from_local, (points_m - mean_m).T).T
     x, y, z = local.T
@@ -128,7 +131,7 @@ def _refuse(bad: np.ndarray, center_m: np.ndarray, what: str) -> None:
 
 
 def _make_refusal(center_m: np.ndarray, what: str, count: int = 1) -> ValueError:
-    """Return the error for the piece at center_m (3,), one of `count` pieces with the same defect."""
+    """Return the error for the piece at center_m (3,), which is one of `count` pieces with the same defect."""
     x, y, z = center_m
     return ValueError(
         f"the piece at x {x:.2f}, y {y:.2f}, z {z:.2f} m {what} ({count} such pieces); export primitives as"

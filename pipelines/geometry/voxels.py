@@ -1,18 +1,19 @@
-"""Convert scenes to semantic voxels, in which layouts of any method are comparable (paper, Sec. 4.1 Metrics, Tab. 1).
+"""Convert scenes to semantic voxels, which make the layouts of different methods comparable (paper, Sec. 4.1 Metrics,
+Tab. 1).
 
-The class of a voxel follows these rules, which only this module implements:
+These rules determine the class of a voxel:
 
 * A primitive fills a voxel if it contains the centre of the voxel. The test is exact for rotated boxes and ellipsoids
-  and includes the boundary (EDGE_M). Of several primitives, the finer category wins (PRECEDENCE). The order of
-  primitives has no effect.
-* Ground fills one voxel per column: the voxel at the height of the fused surface (`Scene.surface`) under the centre of
-  the column. Primitives take precedence over ground.
+  and includes the boundary (EDGE_M). If several primitives contain it, the finest category wins (PRECEDENCE). The order
+  of primitives has no effect.
+* Ground fills one voxel per column. This voxel contains the fused surface (`Scene.surface`) at the centre of the
+  column. Primitives take precedence over ground.
 * All other voxels are EMPTY. Class ids are those of the palette.
 
 The paper does not define the range in z, the thickness of the ground, or the precedence of overlapping primitives.
 
-A column of voxels is one integer with one bit per level. A primitive meets a column in one run of levels. A scene
-therefore consists of a few hundred thousand runs instead of millions of voxels.
+The code stores a column of voxels as one integer with one bit per level. A primitive intersects a column in one run of
+levels. A scene therefore needs a few hundred thousand runs instead of millions of voxels.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Grid, Scene
 from pipelines.geometry.rasterize import concatenate_ranges
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_ground_ids
 
-# Fine categories come before coarse ones. A traffic sign inside a tree crown is kept, and a hedge inside a building is
-# not.
+# Fine categories come before coarse ones. A traffic sign inside a tree crown is visible. A hedge inside a building is
+# hidden.
 PRECEDENCE = (
     "human",
     "two_wheelers",
@@ -42,25 +43,25 @@ PRECEDENCE = (
     "vegetation_cuboid",
     "construction_big",
 )
-EDGE_M = 1e-9  # A voxel centre this close to the boundary of a primitive counts as inside.
+EDGE_M = 1e-9  # A voxel centre within this distance of a primitive's boundary counts as inside.
 LEVEL_AXIS = 1e-12  # An axis with a smaller |z| counts as horizontal.
 NUM_CLASSES = len(CLASS_COLORS)
 CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
 MAX_LEVELS = 64  # Number of bits in the integer of a column.
-PART_COLUMNS = 2**20  # Number of columns that are processed together, which takes 100 MB.
+PART_COLUMNS = 2**20  # Number of columns that are processed together (100 MB).
 
 assert sorted(PRECEDENCE) == sorted(CATEGORIES) and EMPTY == 0
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Voxels over the pixels of a grid: `levels` of equal height between bottom_m and top_m.
+    """A voxel grid: one column of voxels per pixel of a horizontal grid, with levels of the same height.
 
-    By default, the grid has the paper's 256 x 256 x 32 voxels, and voxels are cubes of 0.25 m. The paper does not
-    define the range in z.
+    The default is the paper's 256 x 256 x 32 voxels, with an edge length of 0.25 m. The paper does not define the
+    range in z.
 
     Attributes:
-        columns: Horizontal grid; one column of voxels per pixel.
+        columns: Horizontal grid, with one column of voxels per pixel.
         bottom_m: Lower end of the range in z, in the scene frame (m).
         top_m: Upper end of the range in z, in the scene frame (m).
         levels: Number of levels, at most 64.
@@ -73,7 +74,7 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         if not 1 <= self.levels <= MAX_LEVELS:
-            raise ValueError(f"VoxelGrid: levels is {self.levels}, must be 1 to {MAX_LEVELS}")
+            raise ValueError(f"VoxelGrid: levels is {self.levels}, expected 1 to {MAX_LEVELS}")
         if not (np.isfinite([self.bottom_m, self.top_m]).all() and self.bottom_m < self.top_m):
             raise ValueError(f"VoxelGrid: bottom_m {self.bottom_m} must lie below top_m {self.top_m}")
 
@@ -103,7 +104,8 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
         (rows, cols, levels) uint8 class ids. Rows and columns have the order of the rasters; levels ascend.
     """
     rows, cols, levels = voxels.shape
-    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)  # Entry k has the bits of all levels below k.
+    # In entry k, the bits of all levels below k are set.
+    below = np.array([2**k - 1 for k in range(levels + 1)], np.uint64)
     place = np.empty(len(CATEGORIES), np.int64)
     place[[CATEGORY_INDEX[name] for name in PRECEDENCE]] = np.arange(len(PRECEDENCE))
     filled = np.zeros((len(PRECEDENCE), rows * cols), np.uint64)
@@ -149,9 +151,9 @@ def _unpack_grid(planes: np.ndarray, levels: int) -> np.ndarray:
 
 
 def _find_levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first level with its centre in [low, high] and the level after the last one.
+    """Return the first level with a centre in [low, high], and the level after the last such level.
 
-    Both numbers are equal if no centre lies in the interval.
+    The two numbers are equal if no centre lies in the interval.
     """
     first = np.ceil((low_m - EDGE_M - voxels.bottom_m) / voxels.step_m - 0.5).clip(0, voxels.levels)
     beyond = np.floor((high_m + EDGE_M - voxels.bottom_m) / voxels.step_m + 0.5).clip(0, voxels.levels)
@@ -159,7 +161,7 @@ def _find_levels(low_m: np.ndarray, high_m: np.ndarray, voxels: VoxelGrid) -> tu
 
 
 def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the height of the fused surface under each column's centre (columns,) and its class id.
+    """Return the height (columns,) and the class id (columns,) of the fused surface at the centre of each column.
 
     The height is NaN where the scene has no ground.
     """
@@ -185,9 +187,9 @@ class _Runs(NamedTuple):
 
 
 def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
-    """Yield the scene in parts that cover about PART_COLUMNS columns.
+    """Yield the scene in parts that cover about PART_COLUMNS columns each.
 
-    The parts limit the memory, because an untrained model predicts large primitives.
+    The parts limit memory use, which would be high for the large primitives of an untrained model.
     """
     step_m = voxels.columns.resolution_m
     shadow_px = (np.abs(scene.rotation[:, :2]) @ scene.size_m[:, :, None])[..., 0] / step_m + 1
@@ -200,9 +202,10 @@ def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
 def _list_pixels(
     middle_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, first_m: float, step_m: float, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels along an axis with centres in [middle + low, middle + high], and the interval index of each pixel.
+    """Return the pixels along an axis with centres in the intervals [middle + low, middle + high], and the index of the
+    interval for each pixel.
 
-    Pixel numbers increase against the axis: the centre of a pixel lies at first_m - (pixel + .5) step_m.
+    Pixel numbers decrease along the axis. The centre of a pixel lies at first_m - (pixel + .5) step_m.
     """
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
@@ -212,7 +215,7 @@ def _list_pixels(
 
 
 def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
-    """Compute the runs of all boxes: in a column, a box is the intersection of its three slabs."""
+    """Compute the runs of all boxes. In each column, the run is the intersection of the box's three slabs."""
     grid, chosen = voxels.columns, np.flatnonzero(scene.category != ELLIPSOID)
     center_m, rotation = scene.center_m[chosen].astype(np.float64), scene.rotation[chosen].astype(np.float64)
     half_m = scene.size_m[chosen].astype(np.float64) / 2
@@ -226,8 +229,8 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     col, span = _list_pixels(center_m[box, 1], low_m, high_m, grid.left_m, grid.resolution_m, grid.cols)
     dy = grid.y_m()[col] - center_m[box, 1].take(span)
 
-    # Slab j covers z within center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j|. If R_2j is 0, the slab adds no limit
-    # to the vertical projection of the box.
+    # Slab j covers the range center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j| in z. If R_2j is 0, the slab adds no
+    # limit to the vertical projection of the box.
     leans = np.abs(rotation[:, 2]) > LEVEL_AXIS
     inverse = np.where(leans, 1.0, 0.0) / np.where(leans, rotation[:, 2], 1.0)
     reach_m = np.where(leans, half_m * np.abs(inverse), np.inf)
@@ -242,9 +245,9 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 
 def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the y range of the vertical projection of box[i] at dx_m[i] from its centre, (m,) both.
+    """Return the lower and upper y (m,) of the vertical projection of box[i] at x offset dx_m[i] from its centre.
 
-    The result is relative to the centre. The projection of a box with half edges (n, 3, 2) is a hexagon that is
+    Both values are relative to the centre. The projection of a box with half edges (n, 3, 2) is a hexagon that is
     point-symmetric about the centre. Its upper side starts at the rearmost corner and follows the three edges, the
     steepest first.
     """
@@ -254,7 +257,7 @@ def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) 
     x, y = np.moveaxis(np.take_along_axis(edges_m, steepest_first[..., None], axis=1), -1, 0)  # each is (n, 3)
     start = 2 * (np.cumsum(x, axis=1) - x) - x.sum(axis=1, keepdims=True)
     start, step, y = start[box], np.where(x > 0, 2 * x, 1)[box], y[box]
-    upright = (x == 0)[box]  # An edge without extent in x always counts in full.
+    upright = (x == 0)[box]  # An edge without extent in x always contributes its full length.
 
     def upper(dx: np.ndarray) -> np.ndarray:
         walked = np.where(upright, 1.0, ((dx[:, None] - start) / step).clip(0, 1))
@@ -268,7 +271,7 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
     Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| <= 1. L is
     lower triangular. Therefore x determines the first entry of s, and y then determines the second. The third entry
-    lies between the two roots.
+    lies between the two roots of a quadratic.
     """
     grid, chosen = voxels.columns, np.flatnonzero((scene.category == ELLIPSOID) & (scene.size_m > 0).all(axis=1))
     center_m = scene.center_m[chosen].astype(np.float64)
@@ -294,12 +297,12 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 @dataclass(frozen=True)
 class OutsideCounts:
-    """Counts of ground and primitives above or below a voxel grid; counts of several scenes add up.
+    """Numbers of ground columns and primitives above or below a voxel grid. The numbers of several scenes can be added.
 
     Attributes:
-        ground: (2,) int64: number of columns with ground, and number of these whose ground lies outside.
-        objects: (11, 3) int64: per category, the number of primitives, of those partly or wholly outside, and of those
-            wholly outside.
+        ground: (2,) int64: number of columns with ground, and number of columns with ground outside the grid.
+        objects: (11, 3) int64: per category, the number of all primitives, of primitives partly or wholly outside, and
+            of primitives wholly outside.
     """
 
     ground: np.ndarray
@@ -310,7 +313,7 @@ class OutsideCounts:
 
 
 def count_outside(scene: Scene, voxels: VoxelGrid) -> OutsideCounts:
-    """Count columns with ground, and primitives, that lie outside the range in z.
+    """Count the ground columns and the primitives that lie outside the range in z.
 
     Args:
         scene: Scene.

@@ -353,7 +353,7 @@ FAULTS = {
     ),
     "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class colour"),
     "colour": (export_green_box, r"colour #0ac80a \(sRGB\) of 8 vertices is no class colour"),
-    "sheared": (export_sheared_box, "eight vertices that are not the corners of a box|corners are not square"),
+    "sheared": (export_sheared_box, "eight vertices that are not the corners of a box|edges are not perpendicular"),
     "welded": (lambda: export_welded_boxes("vehicle_small"), "more than eight vertices but is no vegetation"),
     "bush": (lambda: export_welded_boxes("vegetation_cuboid"), "neither on a box nor on an ellipsoid"),
     "ball": (
