@@ -1,7 +1,7 @@
-"""Import files of other methods for the evaluation, in one Ray Data graph with one task per batch of files.
+"""Import output files of other methods for evaluation.
 
-GLB meshes become scene tables with source=imported-<name>. Voxel grids contain no primitives and therefore become
-images from above. An unreadable file becomes a row of `rejects`.
+One Ray Data graph runs one task per batch of files. GLB meshes become scene tables with source=imported-<name>. Voxel
+grids contain no primitives. They therefore become images from above. An unreadable file becomes a row of `rejects`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ImportRequest:
 
     @property
     def files_per_shard(self) -> int:
-        """Return the number of files of each shard except the last."""
+        """Return the number of files per shard; the last shard may have fewer."""
         return min(MAX_FILES_PER_SHARD, -(-len(self.files) // WANTED_SHARDS))
 
     def files_of(self, shard: Shard) -> Iterator[tuple[int, str, str]]:
@@ -66,7 +66,7 @@ class ImportRequest:
             shard: Shard of the import.
 
         Yields:
-            Index of the file in the import, scene id and URI.
+            Index of the file within the import, scene id, and URI.
         """
         start = shard.number * self.files_per_shard
         for index, file in enumerate(self.files[start : start + self.files_per_shard], start):
@@ -90,7 +90,7 @@ class ImportRequest:
 
 
 def make_scene_id(file: str) -> str:
-    """Return the scene id for a file name: "night/007.glb" gives night-007.
+    """Return the scene id for a file name. For example, "night/007.glb" gives "night-007".
 
     Args:
         file: File name relative to the directory of the import.
@@ -109,7 +109,7 @@ def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
         suffix: File name extension, such as .glb.
 
     Returns:
-        Directory, and sorted names relative to it.
+        Directory, and sorted file names relative to this directory.
 
     Raises:
         ValueError: No file matches, or two files give the same scene id.
@@ -140,7 +140,7 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
     Args:
         request: Import.
         shard: Shard of the import.
-        read: Called with index, scene id and URI of each file.
+        read: Function that reads one file; its arguments are index, scene id and URI.
 
     Returns:
         Scene ids of the readable files, and the results of `read`.
@@ -157,8 +157,8 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
     return names, contents
 
 
-# The writer writes rejects before the shard and deletes them after it. A shard without rejects is therefore complete,
-# even if its writer is killed.
+# The writer writes the rejects before the shard and deletes them after the shard. A shard without rejects is therefore
+# complete, even if the writer was killed.
 
 
 def write_tables(row: dict, request: ImportRequest) -> dict:
@@ -229,17 +229,17 @@ def make_pictures_shard(path: str) -> np.ndarray:
 def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
     """Import all files of a request.
 
-    A second call resumes an interrupted one and reads shards with rejects again.
+    A second call resumes an interrupted import. It reads shards with rejects again.
 
     Args:
         request: Files, name and output directory.
-        on_shard: Called with the number of files of each finished shard.
+        on_shard: Function that is called after each shard, with the number of its files.
 
     Returns:
-        Content of imported-<name>.json: ids of the scenes in order, and number of rejected files.
+        Content of imported-<name>.json: the scene ids in order, and the number of rejected files.
 
     Raises:
-        ValueError: The output holds an import of other files under this name, or no file is readable.
+        ValueError: The output directory holds an import with the same name but different files, or no file is readable.
     """
     record = storage.join_uri(request.output, f"imported-{request.name}.json")
     options = {"base": request.base, "files": list(request.files), "kind": request.kind, "axes": list(request.axes)}

@@ -1,10 +1,10 @@
-"""Convert raw drives to Parquet tables in two passes, with one Ray Data graph per pass (paper, supplement A).
+"""Convert raw drives to Parquet tables in two passes (paper, supplement A).
 
-Pass 1 creates scenes. Each task writes the files of one shard to a staging directory, first under temporary names. A
-killed task therefore leaves no partial file, and a finished shard is not written again. Pass 2 needs the whole training
-split. Pass 2 computes density thresholds, slots per category and value bounds. It then labels the scenes and moves all
-files to the dataset directory. The last file is dataset.json, which marks the dataset as complete. The driver process
-reads only manifests and never a scene.
+Each pass is one Ray Data graph. Pass 1 creates scenes. Each task writes the files of one shard to a staging directory,
+first under temporary names. A killed task therefore leaves no partial file, and a finished shard is not written again.
+Pass 2 needs the whole training split. Pass 2 computes density thresholds, slots per category and value bounds. It then
+labels the scenes and moves all files to the dataset directory. The file dataset.json is written last and marks the
+dataset as complete. The driver process reads only manifests, not scenes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ STAGING = ".staging"
 
 
 def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
-    """Ray task that reads a drive into the object store, once for all its shards; return a str if the read fails."""
+    """Ray task that reads a drive into the object store.
+
+    All shards of the drive share the result, which is a str if reading fails.
+    """
     try:
         return read_drive(source, key)
     except ValueError as error:
@@ -45,7 +48,7 @@ def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
 def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[dict]:
     """Yield manifests in order of completion, from one Ray task per shard.
 
-    A drive with several shards has one more task, which reads the drive.
+    If a drive has several shards, one additional task reads the drive.
 
     Args:
         tasks: Shards to write.
@@ -70,7 +73,7 @@ def write_shards(tasks: list[ShardTask], staging: str, grid: Grid) -> Iterator[d
         return found
 
     def write(row: dict) -> dict:
-        """Write the shard of the task number in the row, and return its manifest."""
+        """Write the shard of the task whose number is in the row, and return the manifest."""
         return {"manifest": json.dumps(write_shard(tasks[row["task"]], staging, grid, read))}
 
     dataset = ray.data.from_items([{"task": k} for k in range(len(tasks))], override_num_blocks=len(tasks))
@@ -96,7 +99,7 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
     def move(row: dict) -> dict:
         """Move the files of the shard in the row.
 
-        The scenes are last, because their file marks the shard as written.
+        The scenes file is moved last, because it marks the shard as written.
         """
         staged, final = (Shard(base, row["source"], row["split"], row["number"]) for base in (staging, root))
         moved = ["primitives", "rasters"] * bool(row["scenes"]) + ["rejects"] * bool(row["rejects"])
@@ -122,11 +125,11 @@ class IngestResult:
     """Result of a run of `ingest_drives`.
 
     Attributes:
-        scenes: Number of scenes by split.
-        rejects: Number of rejected scenes by reason.
+        scenes: Number of scenes per split.
+        rejects: Number of rejected scenes per reason.
         duplicates: Number of dropped duplicate objects.
         seconds: Duration of the run (s).
-        already_complete: Whether an earlier run had completed the dataset.
+        already_complete: Whether an earlier run already completed the dataset.
     """
 
     scenes: dict[str, int]
@@ -147,30 +150,30 @@ def ingest_drives(
 ) -> IngestResult:
     """Write a dataset directory.
 
-    A second call resumes an interrupted one.
+    A second call resumes an interrupted run.
 
     Args:
         tasks: Shards to write.
         root: Dataset directory.
-        options: Options of the user, which dataset.json records.
-        slots: Number of slots per category (default: 95th percentiles of the counts in the training split).
+        options: User options, which are recorded in dataset.json.
+        slots: Number of slots per category (default: 95th percentile of the category's count in the training scenes).
         grid: Raster grid of the scenes (default: the paper's).
-        skip_unreadable: Whether unreadable drives become rejects. Otherwise, the run raises an error after all other
-            drives are staged.
-        on_shard: Called with the manifest of each finished shard.
+        skip_unreadable: Whether unreadable drives become rejects. If False, an unreadable drive is an error; it is
+            raised after all other drives are staged.
+        on_shard: Function that is called with the manifest of each finished shard.
 
     Returns:
         Number of scenes and rejects.
 
     Raises:
-        ValueError: The directory has other options, no drive exists, or a drive is unreadable.
+        ValueError: The directory belongs to a run with other options, no drive exists, or a drive is unreadable.
     """
     started = time.perf_counter()
     grid = grid or Grid()
     description, staging = storage.join_uri(root, DESCRIPTION), storage.join_uri(root, STAGING)
     _refuse_other_options(root, options)
     if storage.exists(description):
-        storage.delete_directory(staging)  # A run that was killed during its last step leaves the staging directory.
+        storage.delete_directory(staging)  # If a run is killed during its last step, the staging directory remains.
         made = storage.read_json(description)
         rejects, duplicates = made.get("rejects", {}), made.get("duplicates", 0)
         return IngestResult(made["scenes"], rejects, duplicates, time.perf_counter() - started, already_complete=True)

@@ -1,4 +1,4 @@
-"""Write one shard: read its drives, crop its scenes, and write its tables and a manifest.
+"""Write one shard: read the drives, crop the scenes, and write the tables and a manifest.
 
 A worker keeps at most BATCH_SCENES scenes in memory, even for a long drive.
 """
@@ -31,14 +31,14 @@ ReadDrive = Callable[[str, tuple], tuple[Drive, dict]]
 
 
 def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
-    """Read a drive and report the objects that its reader dropped.
+    """Read a drive, and report the objects that the reader dropped.
 
     Args:
         source: town, kitti360, av2 or own.
-        key: Arguments of the reader of the source.
+        key: Arguments for the reader of this source.
 
     Returns:
-        The drive, and the report as a dictionary, which is empty for most sources.
+        The drive, and a report on dropped objects as a dictionary. The dictionary is empty for most sources.
 
     Raises:
         ValueError: A file cannot be read; the message names the file.
@@ -54,7 +54,7 @@ def read_drive(source: str, key: tuple) -> tuple[Drive, dict]:
 
 
 class Rejected(ValueError):
-    """Error with the reason why a scene becomes a reject."""
+    """Error that makes a scene a reject; the message is the reason."""
 
 
 def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
@@ -79,7 +79,7 @@ def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
     highest_m = np.abs(scene.height_m).max(initial=0)
     if not highest_m <= MAX_HEIGHT_M:
         raise Rejected(
-            f"the ground lies {highest_m:.3g} m above or below the vehicle, but tables hold at most {MAX_HEIGHT_M:g} m"
+            f"the ground lies {highest_m:.3g} m above or below the vehicle, but tables store at most {MAX_HEIGHT_M:g} m"
         )
     # The paper drops poses without any annotation (supplement A).
     if len(scene) == 0 and not scene.occupied.any():
@@ -88,20 +88,20 @@ def cut_scenes(drive: Drive, pose: int, split: str, grid: Grid) -> Scene:
 
 
 def _check_poses(drive: Drive, part: ShardPart, poses: tuple[int, ...]) -> Drive:
-    """Return the drive, or raise ValueError if its poses differ from the planned poses of the part."""
+    """Return the drive. Raise ValueError if the poses of the drive differ from the planned poses of the part."""
     if drive.frame.take(poses, mode="clip").tolist() != list(part.frames or ()):
         raise ValueError(f"the poses of {part.sequence} changed after this run began; run the same command again")
     return drive
 
 
 class ShardCut:
-    """Iterator over the scenes of a task, which collects rejected scenes and unreadable drives."""
+    """Iterator over the scenes of a task. It collects rejected scenes and unreadable drives."""
 
     def __init__(self, task: ShardTask, grid: Grid, read: ReadDrive = read_drive) -> None:
         self.task, self.grid, self.read = task, grid, read
         self.rejects: list[dict] = []
         self.unreadable: list[str] = []  # One reason per unreadable drive.
-        self.reports: dict[str, dict] = {}  # Report on dropped objects, by sequence.
+        self.reports: dict[str, dict] = {}  # Report on dropped objects for each sequence.
 
     def __iter__(self) -> Iterator[Scene]:
         for part in self.task.parts:
@@ -132,7 +132,7 @@ def compute_extremes(scenes: list[Scene]) -> Extremes:
         scenes: Scenes.
 
     Returns:
-        Extremes of cholesky (m^0.5), height (m) and z (m); a name without values is absent.
+        Lowest and highest values of cholesky (m^0.5), height (m) and z (m). Names without values are omitted.
     """
     values = {
         "cholesky": np.concatenate([compute_cholesky_parameters(s.rotation, s.size_m) for s in scenes]),
@@ -143,13 +143,13 @@ def compute_extremes(scenes: list[Scene]) -> Extremes:
 
 
 def join_tables(parts: list[dict[str, pa.Table]]) -> dict[str, pa.Table]:
-    """Concatenate the tables of several batches of scenes to the tables of one shard.
+    """Concatenate the tables of several scene batches into the tables of one shard.
 
     Args:
-        parts: Tables of each batch by name.
+        parts: Tables of each batch, as a map from table name to table.
 
     Returns:
-        Tables of the shard by name, with updated primitive offsets.
+        Map from table name to the table of the shard, with updated primitive offsets.
     """
     tables = {name: pa.concat_tables([part[name] for part in parts]) for name in parts[0]}
     scenes = tables["scenes"]
@@ -175,8 +175,8 @@ def make_manifest_path(staging: str, task: ShardTask) -> str:
 def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = read_drive) -> dict:
     """Write one shard and its manifest; a finished shard is not written again.
 
-    A finished shard is written again if its parts changed since the run began, because a drive was added or its poses
-    were repaired.
+    There is one exception: if the parts of the shard have changed since the run began, the shard is written again.
+    Parts change if a drive is added or if poses are repaired.
 
     Args:
         task: Shard to write.
@@ -204,7 +204,7 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
     if tables:
         joined = join_tables(tables)
         num_scenes = len(joined["scenes"])
-        # A shard counts as written once its scenes exist, so its scenes are written last.
+        # The scenes file marks the shard as written. It is therefore written last.
         for name in ("primitives", "rasters", "scenes"):
             storage.write_parquet(joined[name], shard.path(name))
     if cuts.rejects:
@@ -222,6 +222,6 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
         "ground_classes": list(classes),
         "seconds": time.perf_counter() - started,
     }
-    if not cuts.unreadable:  # The shard is written again after a repair of the unreadable file.
+    if not cuts.unreadable:  # Without a manifest, the next run writes the shard again.
         storage.write_json(manifest, path)
     return manifest

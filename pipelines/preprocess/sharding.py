@@ -1,4 +1,4 @@
-"""Plan the shards of a dataset before any scene is created; runs resume and scale by shard."""
+"""Plan the shards of a dataset before scenes are created. The shard is the unit of resumption and of parallel work."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ShardPart:
-    """Some poses of one drive.
+    """A set of poses of one drive.
 
     Attributes:
         key: Arguments of the reader of the source (shard_writer.read_drive).
         sequence: Name of the drive.
-        poses: Indices of the poses; None means all poses.
-        frames: Frames of these poses, used in the rejects of an unreadable drive.
+        poses: Indices of the poses; None: all poses.
+        frames: Frames of these poses. If the drive is unreadable, the rejects list them.
     """
 
     key: tuple
@@ -80,8 +80,8 @@ def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) 
 
     Args:
         root: Directory of KITTI-360.
-        split: Whether to use the paper's split; otherwise all poses are train.
-        skip_unreadable: Whether a sequence with missing or invalid poses becomes a reject instead of an error.
+        split: Whether to use the paper's split. If False, all poses are train.
+        skip_unreadable: Whether a sequence with missing or invalid poses becomes a reject. If False, it is an error.
 
     Returns:
         The tasks.
@@ -98,12 +98,14 @@ def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) 
 
 
 def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) -> list[ShardTask]:
-    """Plan tasks of at most SHARD_SCENES poses of one own drive and one split.
+    """Plan tasks for a user's own drives.
+
+    A task has at most SHARD_SCENES poses of one drive and one split.
 
     Args:
         root: Directory of all drives.
-        split: Whether to use the paper's split if splits.json is absent; otherwise all poses are train.
-        skip_unreadable: Whether a drive with missing or invalid poses becomes a reject instead of an error.
+        split: Whether to use the paper's split if splits.json is absent. If False, all poses are train.
+        skip_unreadable: Whether a drive with missing or invalid poses becomes a reject. If False, it is an error.
 
     Returns:
         The tasks.
@@ -127,7 +129,9 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
 
 
 def plan_argoverse2(root: str) -> list[ShardTask]:
-    """Plan tasks of LOGS_PER_SHARD logs each; train logs become train, and val logs become test.
+    """Plan tasks of LOGS_PER_SHARD logs each.
+
+    The split train is kept, and val becomes test.
 
     Args:
         root: Directory of the sensor dataset.
@@ -151,7 +155,7 @@ Poses = tuple[np.ndarray, np.ndarray]  # frame (p,) and world_from_imu (p, 3, 4)
 def _read_poses(
     names: list[str], read: Callable[[str], Poses], skip_unreadable: bool
 ) -> tuple[dict[str, Poses], list[str]]:
-    """Return the poses of all readable drives, and the names of the other drives."""
+    """Return the poses of all readable drives, and the names of the unreadable drives."""
     poses, unreadable = {}, []
     for name in names:
         try:
@@ -167,9 +171,10 @@ def _read_poses(
 def _plan_drives(
     source: str, keys: dict[str, tuple], frames: dict[str, np.ndarray], labels: dict[str, np.ndarray]
 ) -> list[ShardTask]:
-    """Plan tasks one drive after the other, so that consecutive tasks share a drive in memory.
+    """Plan the tasks drive by drive.
 
-    A drive without frames is unreadable. The task of an unreadable drive writes one reject.
+    Consecutive tasks can then share a drive in memory. A drive without frames is unreadable. The task of an unreadable
+    drive writes one reject.
     """
     plan = [(UNUSED, (ShardPart(key, name),)) for name, key in keys.items() if name not in frames]
     for name, frame in frames.items():
@@ -183,7 +188,7 @@ def _plan_drives(
 
 
 def _number_tasks(source: str, plan: list[tuple[str, tuple[ShardPart, ...]]]) -> list[ShardTask]:
-    """Make tasks from (split, parts), and number the shards within each split."""
+    """Make tasks from pairs (split, parts). Shards are numbered within each split."""
     tasks: list[ShardTask] = []
     numbers: dict[str, int] = dict.fromkeys((TRAIN, TEST, UNUSED), 0)
     for split, parts in plan:

@@ -1,12 +1,13 @@
-"""Read Argoverse 2's sensor dataset as a Drive: one pose, and therefore one Scene, per annotated sweep (10 Hz) of a
-log.
+"""Read a log of Argoverse 2's sensor dataset as a Drive.
+
+Each annotated sweep (10 Hz) is one pose and yields one Scene.
 
     ROOT/{train,val}/LOG/annotations.feather              boxes in the ego frame of their sweep
     ROOT/{train,val}/LOG/city_SE3_egovehicle.feather      city from ego, 200 Hz
     ROOT/{train,val}/LOG/map/                             polygons (city frame) and a raster of ground heights
 
-The ego frame is x forward, y left, z up, with its origin on the rear axle. The world frame is the city frame. An
-invalid log raises ValueError, which names file, value and remedy.
+In the ego frame, x points forward, y left and z up. The origin lies on the rear axle. The world frame is the city
+frame. An invalid log raises ValueError; the message names file, value and remedy.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SOURCE = "av2"
 SPLITS = ("train", "val")
 GROUND_CLASSES = ("road", "crossing")
 
-# The paper names only the seven groups; it does not assign the 30 categories to them.
+# The paper names only the seven groups. It does not state which of the 30 categories belong to each group.
 CATEGORY_LABELS = {
     "vehicle_big": (
         "BUS",
@@ -54,7 +55,7 @@ CATEGORY_LABELS = {
     "object": ("CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STROLLER", "WHEELCHAIR", "ANIMAL", "DOG"),
 }
 CATEGORY_OF = {label: CATEGORY_INDEX[name] for name, labels in CATEGORY_LABELS.items() for label in labels}
-EGO_LABEL = "EGO_VEHICLE"  # Some logs annotate the recording car.
+EGO_LABEL = "EGO_VEHICLE"  # Some logs contain a box for the recording car itself.
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
@@ -67,7 +68,9 @@ MAX_HEIGHT_M = 1e4
 
 
 def list_logs(root: str | Path) -> list[tuple[str, str]]:
-    """Return the annotated logs: train, then val. The test split has no annotations.
+    """Return the annotated logs: first train, then val.
+
+    The test split has no annotations.
 
     Args:
         root: Directory of the sensor dataset.
@@ -95,8 +98,8 @@ def list_logs(root: str | Path) -> list[tuple[str, str]]:
 def read_drive(root: str | Path, split: str, log: str) -> Drive:
     """Read the annotated sweeps of one log.
 
-    `frame` and `timestamp` are the time of a sweep (ns). `instance_id` is a hash of the track's uuid, which is equal on
-    all machines. `heading_rad` is the yaw of the box's x axis.
+    `frame` and `timestamp` are the time of a sweep (ns). `instance_id` is a hash of the track's uuid. The hash does not
+    depend on the machine. `heading_rad` is the yaw of the box's x axis.
 
     Args:
         root: Directory of the sensor dataset.
@@ -145,7 +148,7 @@ def read_drive(root: str | Path, split: str, log: str) -> Drive:
 
 
 def _read_annotations(path: Path) -> dict[str, np.ndarray]:
-    """Return the required columns of the annotations, (n,) each, after all checks."""
+    """Return the required columns (n,) of the annotations, after all checks."""
     numbers = (*SIZE, *QUATERNION, *TRANSLATION)
     columns = _read_feather(path, integers=("timestamp_ns",), texts=("track_uuid", "category"), numbers=numbers)
     if len(columns["category"]) == 0:
@@ -179,7 +182,10 @@ def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
 def _read_feather(
     path: Path, integers: tuple[str, ...], texts: tuple[str, ...], numbers: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """Return columns of a feather file as int64, str objects or float64, without nulls and with finite numbers."""
+    """Return columns of a feather file as int64, str objects or float64.
+
+    Columns have no nulls and only finite numbers.
+    """
     _check_file(path)
     try:
         table = pyarrow.feather.read_table(path, memory_map=False)
@@ -244,12 +250,12 @@ def _read_columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.
 
 
 def _make_rotation(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotations of quaternions (n, 4), scalar first."""
+    """Return the rotations (n, 3, 3) of quaternions (n, 4), with the scalar first."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
 
 
 def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
-    """(n,) int64 >= 0: the first 63 bits of the BLAKE2 hash of each uuid (n,)."""
+    """Return the first 63 bits of the BLAKE2 hash of each uuid (n,), as (n,) int64 >= 0."""
     hashes = {
         uuid: int.from_bytes(hashlib.blake2b(uuid.encode(), digest_size=8).digest(), "big") >> 1
         for uuid in set(track_uuid)
@@ -261,7 +267,10 @@ def _hash_ids(track_uuid: np.ndarray) -> np.ndarray:
 
 
 def _read_ground(folder: Path) -> MapGround:
-    """Return drivable areas as road and pedestrian crossings as crossing, with heights from the log's raster."""
+    """Return the ground: drivable areas have class road, and pedestrian crossings have class crossing.
+
+    Heights come from the log's raster.
+    """
     path = _find_only_file(folder, "log_map_archive_*.json")
     content = _read_json(path)
     areas, crossings = (_read_section(path, content, name) for name in ("drivable_areas", "pedestrian_crossings"))
@@ -302,7 +311,7 @@ def _read_section(path: Path, content: dict, name: str) -> list[dict]:
 
 
 def _read_points(path: Path, entry: dict, name: str, least: int, most: int | None = None) -> np.ndarray:
-    """(n, 2) x and y of the points entry[name] in the city frame, in metres."""
+    """Return x and y (n, 2) of the points in entry[name], in the city frame (m)."""
     points = entry.get(name)
     if not isinstance(points, list) or len(points) < least or (most is not None and len(points) > most):
         raise ValueError(
@@ -317,24 +326,25 @@ def _read_points(path: Path, entry: dict, name: str, least: int, most: int | Non
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:
-    """Return whether all JSON values are numbers in [-largest, largest]; NaN and true are not."""
+    """Return whether all JSON values are numbers in [-largest, largest]. NaN and true do not count as numbers."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
 def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
-    """(4, 2) outline between two edges (2, 2), whose directions may be equal or opposite."""
+    """Return the outline (4, 2) between two edges (2, 2). The edges may have the same or opposite directions."""
     if (edge1_m[1] - edge1_m[0]) @ (edge2_m[1] - edge2_m[0]) < 0:
         edge2_m = edge2_m[::-1]
     return np.concatenate([edge1_m, edge2_m[::-1]])
 
 
 def _read_heights(path: Path) -> np.ndarray:
-    """(rows, cols) heights in the city frame, in metres, NaN where unknown."""
+    """Return the heights (rows, cols) in the city frame (m). NaN marks unknown heights."""
     _check_file(path)
     try:
-        # Memory mapping avoids a large allocation if the header states a wrong shape.
+        # Memory mapping avoids a large allocation if the shape in the header is wrong.
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy evaluates the header as Python, so a broken header can raise any error.
+    # numpy evaluates the header as Python code. A broken header can therefore raise any error.
+    except Exception as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise ValueError(f"{path}: broken npy file ({reason}); download the log again") from error
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
@@ -351,7 +361,7 @@ def _read_heights(path: Path) -> np.ndarray:
 
 
 def _read_sim2(path: Path) -> np.ndarray:
-    """(3, 3) raster_from_city: (column, row, 1) of a city point (x, y, 1), from p = s (R p_city + t)."""
+    """Return raster_from_city (3, 3), which maps a city point (x, y, 1) to (column, row, 1): p = s (R p_city + t)."""
     content = _read_json(path)
     rotation, translation, scale = content.get("R"), content.get("t"), content.get("s")
     if not (

@@ -5,9 +5,9 @@
     ROOT/DRIVE/poses.parquet       or poses.json: one row per pose, and therefore per scene
     ROOT/splits.json               optional: {"DRIVE": "train" or "test"}
 
-Each drive has one right-handed world frame with z up. The ego frame is x forward, y left, z up. Units are metres and
-radians. A JSON file is a list of objects with the Parquet column names as keys; a missing key means null. Row numbers
-start at 0. Invalid input raises ValueError, which names file, row, value and remedy.
+Each drive has one right-handed world frame with z up. In the ego frame, x points forward, y left and z up. Units are
+metres and radians. A JSON file is a list of objects with the Parquet column names as keys; a missing key means null.
+Row numbers start at 0. Invalid input raises ValueError; the message names file, row, value and remedy.
 """
 
 from __future__ import annotations
@@ -53,24 +53,25 @@ PANDAS_INDEX = "__index_level_0__"  # pandas adds this column automatically.
 # Categories whose x axis is the direction of travel, unless heading_known is set.
 HEADED = tuple(CATEGORY_INDEX[name] for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human"))
 
-MAX_COORDINATE_M = 1e7  # Largest valid world coordinate; UTM northings reach this value.
+MAX_COORDINATE_M = 1e7  # Largest valid world coordinate; UTM northings can be this large.
 MAX_HEIGHT_M = 1e4
 MIN_SIZE_M = 1e-3
 MAX_SIZE_M = 1e3
-MAX_YAW_RAD = 6.2832  # One full turn in each direction; larger values are probably degrees.
+MAX_YAW_RAD = 6.2832  # One full turn in each direction. Larger values are probably in degrees.
 MAX_WHOLE = 2**63 - 1
 MAX_EXACT_FLOAT = 2**53
-# The cosine between the up axes of ego and world must reach this value. The cosine is larger on real roads
-# and smaller for camera frames.
+# Minimum cosine of the angle between the z axes of ego and world frame. Real roads give larger values, and camera
+# frames give smaller values.
 MIN_UP = 0.5
-SIGHT_M = 100.0  # At least one pose must lie within this distance; a crop extends to 72 m.
+# At least one pose must lie within this distance of the content. The farthest corner of a crop is 72 m away.
+SIGHT_M = 100.0
 
 
 # ----------------------------------------------------------------------------------------------------- the root
 
 
 def list_drives(root: str | Path) -> list[str]:
-    """Return the drives: all folders whose name does not begin with a dot.
+    """Return the drives: all folders except those with a dot at the beginning of their name.
 
     Args:
         root: Directory of all drives.
@@ -103,10 +104,11 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
         root: Directory of all drives.
 
     Returns:
-        Map from drive to train or test; None if the file is absent.
+        Map from drive name to "train" or "test"; None if the file is absent.
 
     Raises:
-        ValueError: The file is invalid, lacks a drive, names an unknown drive, or names another split.
+        ValueError: The file is invalid, omits a drive, contains an unknown drive, or contains a split other than train
+            and test.
     """
     path = Path(root, "splits.json")
     if not path.exists():
@@ -131,7 +133,7 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
 def read_ground_classes(root: str | Path) -> tuple[str, ...]:
     """Return the ground classes of all drives.
 
-    The function ignores an unreadable polygons file, for which `read_drive` raises an error.
+    The function ignores unreadable polygon files, because `read_drive` raises an error for them.
 
     Args:
         root: Directory of all drives.
@@ -156,14 +158,14 @@ def read_ground_classes(root: str | Path) -> tuple[str, ...]:
 def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = None) -> Drive:
     """Read all boxes, the ground and the poses of one drive.
 
-    `timestamp` is the frame of a moving box, or STATIC. `instance_id` is the given number, or a hash of a given text,
-    which is equal on all machines; -1 means none. `heading_rad` is the yaw of the x axis if x is the direction of
-    travel.
+    `timestamp` is the frame of a moving box, or STATIC. `instance_id` is the number in the file, or a hash of the text
+    in the file. The hash does not depend on the machine. If the value is null, `instance_id` is -1. `heading_rad` is
+    the yaw of the x axis if x is the direction of travel.
 
     Args:
         root: Directory of all drives.
         name: Name of the drive.
-        classes: Ground classes of the whole dataset (default: only those of this drive).
+        classes: Ground classes of the whole dataset (default: the classes of this drive).
 
     Returns:
         The drive in its world frame (float64).
@@ -203,14 +205,14 @@ def read_drive(root: str | Path, name: str, classes: tuple[str, ...] | None = No
 
 @dataclass(frozen=True)
 class _Table:
-    """A file as columns of Python values; its methods check every value."""
+    """The columns of a file as Python values. The methods check every value."""
 
     path: Path
     rows: int
     columns: dict[str, list]  # Columns with at least one value.
 
     def numbers(self, names: Sequence[str], low: float, high: float, unit: str = "") -> np.ndarray:
-        """(rows, len(names)) float64 within low..high."""
+        """Return float64 values (rows, len(names)) in [low, high]."""
         for name in names:
             for row, value in enumerate(self.columns[name]):
                 if type(value) not in (int, float) or not low <= value <= high:
@@ -221,7 +223,7 @@ class _Table:
         return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
 
     def frames(self, missing: int | None = None) -> np.ndarray:
-        """(rows,) int64 >= 0; an absent frame becomes `missing`, or raises an error if `missing` is None."""
+        """Return frames (rows,) int64 >= 0. An absent frame becomes `missing`; if `missing` is None, it is an error."""
         values = self._optional("frame")
         for row, value in enumerate(values):
             if value is None and missing is not None:
@@ -239,7 +241,10 @@ class _Table:
         return np.array([missing if value is None else int(value) for value in values], np.int64)
 
     def texts(self, name: str, allowed: Sequence[str] = (), optional: bool = False) -> list:
-        """(rows) str, each one of `allowed` if given; None for absent values if `optional`."""
+        """Return `rows` texts.
+
+        If `allowed` is not empty, it must contain each text. With `optional`, absent values become None.
+        """
         values = self._optional(name)
         for row, value in enumerate(values):
             if value is None and optional:
@@ -254,7 +259,7 @@ class _Table:
         return values
 
     def flags(self, name: str) -> list:
-        """(rows) True, False or None."""
+        """Return `rows` values, each True, False or None."""
         values = self._optional(name)
         for row, value in enumerate(values):
             if value is not None and type(value) is not bool:
@@ -262,7 +267,7 @@ class _Table:
         return values
 
     def rotations(self) -> np.ndarray:
-        """(rows, 3, 3) rotations from yaw_rad or from a quaternion, depending on which columns the file has."""
+        """Return rotations (rows, 3, 3) from the column yaw_rad or, if the file lacks it, from quaternions."""
         given = [form for form in (("yaw_rad",), QUATERNION) if any(name in self.columns for name in form)]
         if self.rows and len(given) != 1:
             raise ValueError(
@@ -285,7 +290,7 @@ class _Table:
         return Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
 
     def places(self) -> np.ndarray:
-        """(rows, 3) points in the world frame."""
+        """Return points (rows, 3) in the world frame."""
         xy_m = self.numbers(PLACE[:2], -MAX_COORDINATE_M, MAX_COORDINATE_M, " m")
         return np.hstack([xy_m, self.numbers(PLACE[2:], -MAX_HEIGHT_M, MAX_HEIGHT_M, " m (z up)")])
 
@@ -299,7 +304,7 @@ class _Table:
 
 
 def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequence[str]) -> _Table:
-    """Read FOLDER/NAME.parquet or .json as columns by name, and check that all names are known."""
+    """Read FOLDER/NAME.parquet or .json as a map from name to column, and check the names."""
     paths = [folder / f"{name}.parquet", folder / f"{name}.json"]
     found = [path for path in paths if path.is_file()]
     if not found:
@@ -359,8 +364,8 @@ def _show(value: object) -> str:
     """Return a value as text for an error message, at most 40 characters."""
     if value is None:
         return "null"
-    # Python raises an error when it formats an integer of thousands of digits.
-    shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of over 40 digits"
+    # Python raises an error for the conversion of an integer with thousands of digits to text.
+    shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of more than 40 digits"
     return shown if len(shown) <= 40 else f"{shown[:37]}..."
 
 
@@ -375,7 +380,8 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         name: Name of the drive.
 
     Returns:
-        frame (p,) int64, ascending, and world_from_ego (p, 3, 4) float64 (m), with x forward, y left and z up.
+        frame (p,) int64, ascending; and world_from_ego (p, 3, 4) float64 (m). In the ego frame, x points forward, y
+        left and z up.
 
     Raises:
         ValueError: The poses are not those of an upright vehicle in driving order; the message names file and row.
@@ -410,7 +416,7 @@ def _read_direction(up: float) -> str:
 
 
 def _read_matrices(table: _Table) -> np.ndarray:
-    """Return the column world_from_ego (rows, 3, 4), which stores 12 numbers row by row."""
+    """Return the column world_from_ego as (rows, 3, 4). In the file, an entry is 12 numbers, row by row."""
     others = [name for name in (*PLACE, "yaw_rad", *QUATERNION) if name in table.columns]
     if others:
         raise ValueError(f"{table.path} has world_from_ego and {others[0]}; keep only one form of the pose")
@@ -439,17 +445,23 @@ def _read_matrices(table: _Table) -> np.ndarray:
 
 
 def _is_text(value: object) -> bool:
-    """Return whether a value is a str that files can store; JSON escapes can produce half of a surrogate pair."""
+    """Return whether a value is a str that files can store.
+
+    JSON escapes can produce half of a surrogate pair, which is not storable.
+    """
     return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
 
 
 def _is_whole(value: object) -> bool:
-    """Return whether a value is an integer of at least 0, possibly as a float, as in pandas columns with nulls."""
+    """Return whether a value is an integer of at least 0.
+
+    Floats such as 3.0 count, because pandas columns with nulls contain them.
+    """
     return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 
 
 def _are_all_numbers(values: list, largest: float) -> bool:
-    """Return whether all values are numbers in [-largest, largest]; NaN and true are not."""
+    """Return whether all values are numbers in [-largest, largest]. NaN and true do not count as numbers."""
     return all(type(value) in (int, float) and abs(value) <= largest for value in values)
 
 
@@ -486,7 +498,10 @@ def _make_boxes(table: _Table) -> dict[str, np.ndarray]:
 
 
 def _make_instance_ids(table: _Table) -> np.ndarray:
-    """(rows,) int64: numbers unchanged, texts as the first 63 bits of their BLAKE2 hash, -1 for nulls."""
+    """Return ids (rows,) int64.
+
+    A number is kept, a text becomes the first 63 bits of its BLAKE2 hash, and null becomes -1.
+    """
     ids = []
     for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
         if _is_text(value):
@@ -501,7 +516,7 @@ def _make_instance_ids(table: _Table) -> np.ndarray:
 
 
 def _check_in_sight(path: Path, points_m: np.ndarray, world_from_ego: np.ndarray) -> None:
-    """Raise ValueError if all poses are farther than SIGHT_M from the bounding box of these points (n, 3)."""
+    """Raise ValueError if every pose is farther than SIGHT_M from the bounding box of the points (n, 3)."""
     if len(points_m) == 0:
         return
     low, high, position_m = points_m.min(axis=0), points_m.max(axis=0), world_from_ego[:, :, 3]
@@ -526,7 +541,7 @@ def _read_polygons(folder: Path) -> _Table:
 
 
 def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
-    """Triangulate every outline between its own vertices."""
+    """Triangulate every outline; triangles use only the vertices of the outline."""
     of_row = [classes.index(name) for name in table.texts("class", classes)]
     parts = [_triangulate_polygon(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
     return SurfaceGround(
@@ -536,7 +551,7 @@ def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
 
 
 def _triangulate_polygon(path: Path, row: int, value: object) -> np.ndarray:
-    """(t, 3, 3) corners of the constrained Delaunay triangulation of one outline, in the world frame."""
+    """Return the triangles (t, 3, 3) of one outline in the world frame, from a constrained Delaunay triangulation."""
     outline_m = _make_outline(path, row, value)
     flat = outline_m[:, :2] - outline_m[0, :2]
     reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
@@ -553,7 +568,7 @@ def _triangulate_polygon(path: Path, row: int, value: object) -> np.ndarray:
 
 
 def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
-    """(n, 3) float64 vertices of an open outline, without repeated successive points."""
+    """Return the vertices (n, 3) float64 of an open outline, without repeated successive points."""
     if type(value) is not list:
         raise ValueError(f"{path}: outline of row {row} is {_show(value)}, expected a list of points [x, y, z]")
     for k, point in enumerate(value):

@@ -1,7 +1,7 @@
-"""A Drive holds all annotations along one sequence in the world frame.
+"""Drives: all annotations along one sequence, in the world frame.
 
-Every source is read as a Drive, and the same code crops all Scenes (paper, supplement A, Dataset Construction). This
-module depends only on numpy. The town can therefore be used without ray or pyarrow.
+Each reader returns a Drive. The same code therefore crops the Scenes of all sources (paper, supplement A, Dataset
+Construction). This module depends only on numpy. The town can therefore be used without ray or pyarrow.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Pose:
 
     Attributes:
         xyz_m: Position of the vehicle in the world frame (m).
-        yaw_rad: Angle of the vehicle's x axis from the world's x axis (rad).
+        yaw_rad: Angle from the world's x axis to the vehicle's x axis (rad).
     """
 
     xyz_m: np.ndarray  # (3,) float64
@@ -59,7 +59,9 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class SlabGround:
-    """Ground as extruded polygons (KITTI-360 and the town): closed triangle meshes with one class per slab.
+    """Ground as extruded polygons (KITTI-360 and the town).
+
+    Each polygon is a slab: a closed triangle mesh with one class.
 
     Attributes:
         slab_class: Index of each slab's class in the drive's ground_classes.
@@ -98,8 +100,8 @@ class SlabGround:
     def _upper(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the triangles except undersides, and the slab of each triangle.
 
-        A vertical ray hits the top or a side of an extruded slab before its underside. In the format of KITTI-360, the
-        second half of an extruded slab's vertices is the first half, shifted down.
+        Undersides are not needed: a vertical ray first hits the top or a side of an extruded slab. In KITTI-360's
+        format, the second half of a slab's vertices is the first half, shifted down.
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]
@@ -116,9 +118,9 @@ class SlabGround:
         return self.triangles[upper], slab[upper]
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rasterise the tops of the slabs, seen from above.
+        """Rasterise the tops of the slabs from above.
 
-        As in the paper (supplement A), a ground polygon counts only if at least one of its vertices lies in the crop.
+        As in the paper (supplement A), only ground polygons with at least one vertex in the crop are used.
 
         Args:
             pose: Ego pose of the scene.
@@ -144,9 +146,9 @@ class MapGround:
 
     Attributes:
         polygon_class: Index of each polygon's class in the drive's ground_classes.
-        polygons_m: Outlines (n, 2) in the world frame, which is the city frame (m).
-        raster_m: Ground heights in the world frame (m), NaN where unknown.
-        raster_from_world: Similarity from a world point to pixel coordinates (column, row).
+        polygons_m: Outlines (n, 2) in the world frame (m). The world frame is the city frame.
+        raster_m: Ground heights in the world frame (m); NaN marks unknown heights.
+        raster_from_world: Similarity transform from world points to pixel coordinates (column, row).
     """
 
     polygon_class: list[int]
@@ -155,7 +157,9 @@ class MapGround:
     raster_from_world: np.ndarray  # (3, 3)
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> MapGround:
-        """Select the polygons whose bounding box meets a rectangle; the height raster is kept whole.
+        """Select the polygons whose bounding box intersects a rectangle.
+
+        The height raster is not cropped.
 
         Args:
             low_m: (2,) lower corner in the world frame (m).
@@ -172,7 +176,9 @@ class MapGround:
         )
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rasterise the polygons; a pixel is occupied if a polygon covers its centre and the height there is known.
+        """Rasterise the polygons.
+
+        A pixel is occupied if a polygon covers its centre and the ground height is known.
 
         Args:
             pose: Ego pose of the scene.
@@ -215,7 +221,7 @@ class SurfaceGround:
     triangle_class: np.ndarray  # (t,)
 
     def near(self, low_m: np.ndarray, high_m: np.ndarray) -> SurfaceGround:
-        """Select the triangles whose bounding box meets a rectangle.
+        """Select the triangles whose bounding box intersects a rectangle.
 
         Args:
             low_m: (2,) lower corner in the world frame (m).
@@ -229,10 +235,11 @@ class SurfaceGround:
         return SurfaceGround(self.triangles_m[kept], self.triangle_class[kept])
 
     def rasterise(self, pose: Pose, grid: Grid, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Rasterise the surface at pixel centres; of two surfaces of one class, the upper one counts.
+        """Rasterise the surface at pixel centres.
 
-        A polygon counts in every pixel that it covers, even if none of its vertices lies in the crop. A road of 1 km
-        may have no vertex there. This differs from SlabGround.
+        Where two surfaces of the same class overlap, the upper surface is used. In contrast to SlabGround, a polygon
+        fills every pixel that it covers, even if it has no vertex in the crop. For example, a road of 1 km may have no
+        vertex in the crop.
 
         Args:
             pose: Ego pose of the scene.
@@ -253,7 +260,7 @@ class SurfaceGround:
 def _interpolate_heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return float32 heights and the mask of pixels with a height.
 
-    Pixels without a height are -inf in the input, which is overwritten, and 0 in the result.
+    Pixels without a height have value -inf in the input and 0 in the result. The input is overwritten.
     """
     occupied = height_m > -np.inf
     height_m[~occupied] = 0.0
@@ -261,13 +268,15 @@ def _interpolate_heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compute_reach_m(grid: Grid) -> float:
-    """Return the distance from the ego vehicle to the farthest corner of its crop (m)."""
+    """Return the distance from the ego vehicle to the farthest corner of the crop (m)."""
     return float(np.hypot(max(abs(grid.front_m), abs(grid.back_m)), max(abs(grid.left_m), abs(grid.right_m))))
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """All n boxes, the ground and all p poses of one sequence, in the world frame (z up, m, float64).
+    """All n boxes, the ground and all p poses of one sequence.
+
+    The world frame has z up; values are float64 (m).
 
     Attributes:
         source: Value of the source column.
@@ -278,9 +287,9 @@ class Drive:
         heading_rad: Yaw of the direction of travel in the world frame; NaN if unknown.
         instance_id: Number of the object, or -1.
         label: Class name in the source dataset.
-        timestamp: Frame to which the position of a moving box belongs; STATIC for other boxes.
+        timestamp: Frame in which a moving box has this position; STATIC for static boxes.
         frame: Frame of each pose.
-        world_from_imu: Pose matrices with x forward.
+        world_from_imu: Pose matrices; the x axis points forward.
     """
 
     source: str
@@ -303,7 +312,9 @@ class Drive:
         return len(self.frame)
 
     def at(self, poses: np.ndarray, grid: Grid | None = None) -> Drive:
-        """Select poses and the content that their crops can contain, which makes the creation of scenes faster.
+        """Select poses and the content that can lie in their crops.
+
+        A smaller drive makes cropping faster.
 
         Args:
             poses: Indices of the poses.
@@ -343,8 +354,8 @@ class Drive:
     def scene(self, index: int, split: str = "unused", grid: Grid | None = None) -> Scene:
         """Crop the Scene ahead of a pose.
 
-        The scene contains the primitives whose centre lies in the crop. These primitives are static or belong to
-        the frame of the pose.
+        The scene contains the primitives with a centre in the crop, if they are static or belong to the frame of the
+        pose.
 
         Args:
             index: Index of the pose.

@@ -1,12 +1,11 @@
-"""Read KITTI-360's own files as a Drive: 3D boxes and ground polygons of a sequence (XML), and its poses.
+"""Read KITTI-360's original files as a Drive: the 3D boxes and ground polygons of a sequence (XML), and the poses.
 
     ROOT/data_3d_bboxes/train_full/2013_05_28_drive_0003_sync.xml
     ROOT/data_poses/2013_05_28_drive_0003_sync/poses.txt
 
 The name of a sequence is its four digits. The z axis of the world frame points up. The axes of the IMU are x forward, y
-right and z down. The XML file (over 100 MB for the longest drives) is streamed. The reader skips and reports single
-defective objects. The reader raises ValueError for a file that
-is invalid as a whole.
+right and z down. The XML file (over 100 MB for the longest drives) is streamed. The reader skips and reports defective
+objects. It raises ValueError if the file itself is invalid.
 """
 
 from __future__ import annotations
@@ -27,8 +26,9 @@ from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 
 SOURCE = "kitti360"
 
-# Labels of each category, from the paper's table "object categories". `_convert_to_plain` removes case, blanks and
-# underscores from labels. The XML's "trafficSign" therefore equals the development kit's "traffic sign".
+# Labels of each category, from the paper's table "object categories". `_convert_to_plain` converts labels to lower case
+# and removes blanks and underscores. "trafficSign" in the XML and "traffic sign" in the development kit are therefore
+# the same label.
 CATEGORY_LABELS = {
     "vegetation_cuboid": ("vegetation",),  # A sphere mesh becomes vegetation_ellipsoid.
     "vehicle_big": ("truck", "bus"),
@@ -41,7 +41,7 @@ CATEGORY_LABELS = {
     "traffic_control": ("trafficlight", "trafficsign", "lamp"),
     "object": ("trashbin", "box", "unknownobject"),
 }
-# The XML uses "ground" for terrain, "unknownGround" for ground, and "driveway" for parking.
+# Names differ in the XML: "ground" is terrain, "unknownGround" is ground, and "driveway" is parking.
 GROUND_LABELS = {
     "road": ("road",),
     "sidewalk": ("sidewalk",),
@@ -71,18 +71,17 @@ HEADED_LABELS = {label for name in ("vehicle_big", "vehicle_small", "two_wheeler
 HEADED_LABELS |= {"rider"}
 
 SPHERE_VERTICES = 63
-# Some objects occur twice, in two adjacent annotation windows. Both copies have equal sizes to a micrometre. The
-# windows
-# were registered separately: real copies differ by up to 0.4 m and 0.33 degrees. An object with a larger shift,
-# or with a shift above half its size, is another object.
+# Some objects occur twice, in two adjacent annotation windows. The sizes of the two copies agree to a micrometre. The
+# windows were registered separately. Real copies therefore differ by up to 0.4 m and 0.33 degrees. An object with a
+# larger shift is a different object. The same holds for a shift of more than half the object's size.
 DUPLICATE_SIZE_M = 1e-3
 DUPLICATE_SHIFT_M = 0.5
 DUPLICATE_TURN_RAD = 0.01
 MAX_COORDINATE_M = 1e5  # Largest valid coordinate; the real world frame spans several km.
 MAX_SIZE_M = 1e3
 MIN_SIZE_M = 1e-3
-# Minimum singular value of the unit axes. If two axes are closer than about 40 degrees, the box is invalid rather than
-# sheared.
+# Minimum singular value of the unit axes. If the angle between two axes is smaller than about 40 degrees, the box is
+# invalid.
 MIN_SINGULAR = 0.5
 
 SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
@@ -105,12 +104,14 @@ class Defect:
 
 @dataclass(frozen=True)
 class ReadReport:
-    """Number of objects of one XML file by outcome: `objects` is the sum of boxes, slabs and all dropped objects.
+    """Numbers of objects in one XML file, by result.
+
+    `objects` is the sum of boxes, slabs and all dropped objects.
 
     Attributes:
-        dropped: Number of objects by label, for known labels without a category.
-        unknown: Number of objects by label, for labels in no table.
-        duplicates: Number of second copies of an object.
+        dropped: Number of objects per label; known labels without a category.
+        unknown: Number of objects per label; labels that are in none of the tables.
+        duplicates: Number of dropped second copies.
         defects: Objects that cannot be read.
     """
 
@@ -146,7 +147,7 @@ def list_sequences(root: str | Path) -> list[str]:
         Four digits of each sequence, in ascending order.
 
     Raises:
-        ValueError: No sequence exists, or none has poses.
+        ValueError: No sequence exists, or no sequence has poses.
     """
     folder = Path(root) / "data_3d_bboxes" / "train_full"
     names = sorted(match[1] for path in folder.glob("*.xml") if (match := SEQUENCE_NAME.fullmatch(path.stem)))
@@ -166,8 +167,8 @@ def list_sequences(root: str | Path) -> list[str]:
 def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
     """Read all annotations along one sequence.
 
-    `instance_id` is the track number (dynamicSeq) of a moving object, or the index of a static object in the file. The
-    two kinds are numbered separately. `timestamp` is the frame of a moving box, or STATIC.
+    For a moving object, `instance_id` is the track number (dynamicSeq). For a static object, it is the index in the
+    file. Moving and static objects are numbered separately. `timestamp` is the frame of a moving box, or STATIC.
 
     Args:
         root: Directory of KITTI-360.
@@ -194,7 +195,10 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
 
 
 def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
-    """Return the boxes and slabs of one XML file in file order without duplicates, and a report on dropped objects."""
+    """Return the boxes and slabs of one XML file, and a report on dropped objects.
+
+    The order is that of the file, and duplicates are dropped.
+    """
     boxes: list[_Box] = []
     slabs: list[_Slab] = []
     seen: dict[tuple, list[np.ndarray]] = {}
@@ -250,10 +254,10 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
         sequence: Four digits of the sequence.
 
     Returns:
-        frame (p,) int64, ascending, and world_from_imu (p, 3, 4) float64 (m).
+        frame (p,) int64, ascending; and world_from_imu (p, 3, 4) float64 (m).
 
     Raises:
-        ValueError: The file is missing, or a line is no valid pose; the message names file and line.
+        ValueError: The file is missing, or a line is not a valid pose; the message names file and line.
     """
     path = _make_poses_path(root, sequence)
     text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
@@ -283,7 +287,7 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
     bad = np.flatnonzero((skew > 1e-2) | (np.linalg.det(rotation) < 0))
     if len(bad):
         raise ValueError(f"{path}: the matrix of frame {frame[bad[0]]} is no rotation; restore the line")
-    if not text.endswith(("\n", "\r")):  # A file that ends within its last number would give a wrong pose.
+    if not text.endswith(("\n", "\r")):  # If the file is cut off within its last number, the last pose is wrong.
         raise ValueError(
             f"{path}: line {number} has no line end, so the file may be truncated; unpack data_poses.zip again"
         )
@@ -296,7 +300,8 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
 def _stream_objects(path: Path) -> Iterator[dict]:
     """Yield the fields of each <objectN> as a map from tag to element, and free the previous elements.
 
-    The function raises ValueError for a missing or malformed file, and for a document type, which entity bombs need.
+    The function raises ValueError for a missing or malformed file. It also rejects files with a document type, because
+    entity bombs need one.
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:
@@ -336,19 +341,19 @@ def _read_text(fields: dict, tag: str, default: str | None = None) -> str:
 
 
 def _read_label(fields: dict) -> str:
-    """Return the label of an object as written, or "" if absent."""
+    """Return the label of an object as in the file, or "" if the object has no label."""
     return " ".join(_read_text(fields, "label", " ").split())[:40]
 
 
 def _read_integer(fields: dict, tag: str) -> int:
     text = _read_text(fields, tag)
     if not re.fullmatch(r"-?\d{1,18}", text):
-        raise DefectiveObject(f"{tag} is {text[:20]!r}, not a whole number")
+        raise DefectiveObject(f"{tag} is {text[:20]!r}, which is not a whole number")
     return int(text)
 
 
 def _read_index(fields: dict) -> int:
-    """Return the <index> of an object, or -1 if absent."""
+    """Return the <index> of an object, or -1 if it has no index."""
     try:
         return _read_integer(fields, "index")
     except DefectiveObject:
@@ -356,7 +361,7 @@ def _read_index(fields: dict) -> int:
 
 
 def _read_floats(words: list[str]) -> np.ndarray | None:
-    """Return (n,) float64, or None if a word is no finite number."""
+    """Return (n,) float64, or None if a word is not a finite number."""
     try:
         values = np.array(words, np.float64)
     except ValueError:
@@ -375,12 +380,12 @@ def _read_matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
         raise DefectiveObject(f"{tag} is {rows} x {stated_cols} with {len(words)} numbers, expected n x {cols}")
     values = _read_floats(words)
     if values is None:
-        raise DefectiveObject(f"{tag} holds something that is not a finite number")
+        raise DefectiveObject(f"{tag} contains a value that is not a finite number")
     return values.reshape(rows, cols)
 
 
 def _read_vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return local vertices (v, 3), world_from_local (4, 4) and world vertices (v, 3), in metres, all float64."""
+    """Return local vertices (v, 3), world_from_local (4, 4) and world vertices (v, 3). All are float64 (m)."""
     world_from_local = _read_matrix(fields, "transform", 4)
     if world_from_local.shape != (4, 4) or np.abs(world_from_local[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DefectiveObject("transform is not an affine 4 x 4 matrix")
@@ -433,18 +438,19 @@ def compute_box_geometry(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute centre, rotation and size of a box or ellipsoid mesh under an affine transform.
 
-    A mirrored transform gives the same box with its y axis flipped, because x may be a heading. A sheared transform
-    gives the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+    For a mirrored transform, the y axis of the box is flipped. The x axis is kept, because it may be the heading. For a
+    sheared transform, the result is the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
 
     Args:
         world_from_local: (4, 4) transform.
-        vertices: (v, 3) local vertices. Only their extent counts: 1 for the unit cube, 2 for the sphere of radius 1.
+        vertices: (v, 3) local vertices. The function uses only their extent: 1 for the unit cube, 2 for the sphere of
+            radius 1.
 
     Returns:
         center_m (3,), proper rotation (3, 3) and full size_m (3,) in the world frame.
 
     Raises:
-        DefectiveObject: The box has no volume or an implausible size, or its axes are too close to each other.
+        DefectiveObject: The box has zero volume or an implausible size, or two axes are nearly parallel.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     axes_m = world_from_local[:3, :3] * (high - low)
@@ -501,7 +507,7 @@ def _parse_slab(fields: dict, plain: str) -> _Slab:
 
 
 def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
-    """Return all slabs as one set of meshes."""
+    """Return all slabs as one SlabGround."""
     counts = np.array([len(slab.vertices_m) for slab in slabs], np.int64)
     first = np.cumsum(counts) - counts
     no_triangles = np.zeros((0, 3), np.int64)
@@ -517,7 +523,10 @@ def _stack_slabs(slabs: list[_Slab]) -> SlabGround:
 
 
 def _find_copies(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np.ndarray) -> bool:
-    """Return whether `seen` holds a copy of this object at nearly the same position; otherwise add the object."""
+    """Return whether `seen` contains a copy of this object at nearly the same position.
+
+    If not, add the object to `seen`.
+    """
     center_m = vertices_m.mean(axis=0)
     low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
     for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):

@@ -1,4 +1,7 @@
-"""Add single objects and groups of objects to a Sheet: cars, trees, hedges, walls and gardens (m)."""
+"""Add single objects and groups of objects to a Sheet: cars, trees, hedges, walls and gardens.
+
+All lengths are in metres.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
 Rect = tuple[float, float, float, float]  # s0, s1, t0, t1
 
-# Per label: median (l, w, h), spread of the common factor, spread of each extent, smallest (l, w, h), largest (l, w, h)
+# Values per label: median (l, w, h); spread of the common factor; spread per axis; smallest and largest (l, w, h).
 SIZES = {
     "building": ((16, 12, 11), 0.16, 0.14, (8, 6.5, 4), (34, 22, 24)),
     "garage": ((8, 6.4, 3.4), 0.10, 0.08, (5, 3, 2.4), (12, 9, 5)),
@@ -37,7 +40,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Site:
-    """A block under construction: its sheet, random generator, district and mood."""
+    """State while a block is built: sheet, random generator, district and mood."""
 
     sheet: Sheet
     rng: np.random.Generator
@@ -48,7 +51,7 @@ class Site:
 def draw_sizes(
     rng: np.random.Generator, what: str, n: int, scale: float | np.ndarray | tuple[float, float, float] = 1.0
 ) -> np.ndarray:
-    """Sample sizes (n, 3) of a kind of object, in metres, with length >= width; `scale` is one factor or (3,)."""
+    """Sample sizes (n, 3) of a kind of object (m), with length >= width. `scale` is one factor, or three factors."""
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
     drawn = (np.array(median) * scale * factor).clip(low, high)
@@ -66,7 +69,7 @@ def plant_strip(
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
-    """Park cars at s; most of them point in the direction of the adjacent lane."""
+    """Place parked cars at s. Most cars point in the direction of the adjacent lane."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
     site.sheet.boxes(
@@ -80,7 +83,7 @@ def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: floa
 
 
 def plant_trees(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray, what: str) -> None:
-    """Add ellipsoids at (s, t); tree crowns start above the ground, and bushes start on the ground."""
+    """Add ellipsoids at (s, t). Tree crowns begin above the ground, and bushes begin at the ground."""
     n = len(s)
     scale = site.district.tree_scale * site.mood.tree_size if what == "tree" else 1.0
     size = draw_sizes(site.rng, what, n, scale)
@@ -91,7 +94,7 @@ def plant_trees(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray, wha
 def plant_border(
     site: Site, frame: LocalFrame, s0: float, t0: float, s1: float, t1: float, kind: str, cover: float
 ) -> None:
-    """Build a hedge or wall from (s0, t0) to (s1, t1), in pieces; `cover` is the covered share of its length."""
+    """Build a hedge or wall from (s0, t0) to (s1, t1) in pieces. The pieces cover the share `cover` of the length."""
     length = float(np.hypot(s1 - s0, t1 - t0))
     if length < 1.5:
         return
@@ -119,7 +122,7 @@ def plant_border(
 def plant_garden(
     site: Site, frame: LocalFrame, width: float, depth: float, taken: list[Rect], lush: float = 1.0
 ) -> None:
-    """Plant shrubs, bushes and trees in a rectangle, outside the `taken` rectangles (s0, s1, t0, t1)."""
+    """Plant shrubs, bushes and trees in a rectangle, but not in the `taken` rectangles (s0, s1, t0, t1)."""
     free = width * depth - sum((b - a) * (d - c) for a, b, c, d in taken)
     wanted = (
         ("shrub", site.district.shrubs_per_100m2 * site.mood.green),
@@ -135,7 +138,7 @@ def plant_garden(
         s, t = s[clear][:n], t[clear][:n]
         if what == "shrub":
             size = draw_sizes(site.rng, "shrub", len(s))
-            turned = np.minimum(s, width - s) < np.minimum(t, depth - t)  # Parallel to the nearest border.
+            turned = np.minimum(s, width - s) < np.minimum(t, depth - t)  # The plant is parallel to the nearest border.
             yaw = np.pi / 2 * turned + site.rng.normal(0, 0.05, len(s))
             edge = site.rng.random(len(s)) < 0.55
             s = np.where(edge & turned, np.where(s < width / 2, size[:, 1] / 2, width - size[:, 1] / 2), s)

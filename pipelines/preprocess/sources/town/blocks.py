@@ -1,6 +1,7 @@
-"""Build the content of a block: sidewalks and street furniture on its sides, and houses, a park or a court inside.
+"""Build the content of a block.
 
-All positions are in local frames (land.py): s along the street and t away from it, in metres.
+Its sides have sidewalks and street furniture; its interior has houses, a park or a court. Positions are in local frames
+(land.py), in metres: s runs along the street, and t points away from the street.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def furnish_block(site: Site, block: CityBlock) -> None:
 
 
 def _fill_interior(block: CityBlock, depths: list) -> tuple[LocalFrame, float, float]:
-    """Return the interior of a block: a frame along its longer side, width and depth."""
+    """Return the interior of a block: a frame along the longer side, the width and the depth."""
     south, east, north, west = (d[0] for d in depths)
     width, depth = block.u1 - block.u0 - west - east, block.v1 - block.v0 - south - north
     if width >= depth:
@@ -74,7 +75,7 @@ def _fill_interior(block: CityBlock, depths: list) -> tuple[LocalFrame, float, f
 
 
 def _compute_side_depth(site: Site) -> tuple[float, bool, bool]:
-    """Return the depth of one side, and whether it has a sidewalk and parking bays."""
+    """Return the depth of one side, whether the side has a sidewalk, and whether it has parking bays."""
     sidewalk, bay = bool(site.rng.random() < site.district.sidewalks), bool(site.rng.random() < site.district.bays)
     return float(site.rng.uniform(2.25, 3.0)) + BAY_DEPTH_M * bay, sidewalk, bay
 
@@ -102,7 +103,7 @@ def _build_side(site: Site, block: CityBlock, k: int, depths: list) -> None:
 def _build_corner(
     site: Site, frame: LocalFrame, r: float, size: float, depth: float, depth_before: float, ground_class: str
 ) -> None:
-    """Build the sidewalk around a kerb of radius r; `size` is its extent along both streets."""
+    """Build the sidewalk around a kerb of radius r. `size` is the extent of the sidewalk along both streets."""
     inside = [(0.0, size), (depth_before, size), (depth_before, depth), (size, depth), (size, 0.0)]
     site.sheet.slab(frame, ground_class, inside + trace_kerb(0.0, 0.0, r))
 
@@ -135,7 +136,8 @@ def _place_curb_cars(site: Site, frame: LocalFrame, start: float, end: float) ->
         return
     at = start + (np.arange(slots) + 0.5) * (end - start) / slots
     taken = site.rng.random(slots) < min(0.85, site.district.curb_parking * site.mood.cars)
-    place_cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)  # Most cars park half on the sidewalk.
+    # Most cars stand partly on the sidewalk.
+    place_cars(site, frame, at[taken], -0.9 if site.rng.random() < 0.3 else 0.1)
     free = at[~taken]
     trucks = free[site.rng.random(len(free)) < site.district.trucks_per_100m * CAR_SLOT_M / 100]
     if len(trucks):
@@ -194,7 +196,7 @@ def _place_sign(site: Site, frame: LocalFrame, s: np.ndarray, t: np.ndarray) -> 
 
 
 def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """Build a lawn with a path, trees, a hedge or wall around it, benches and pedestrians."""
+    """Build a park: a lawn with a path, trees, benches and pedestrians, and a hedge or wall around the lawn."""
     frame, width, depth = interior
     middle = float(site.rng.uniform(0.35, 0.65)) * depth
     for low, high, ground_class in (
@@ -231,7 +233,7 @@ def _build_park(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
 
 
 def _build_meadow(site: Site, block: CityBlock) -> None:
-    """Build the area outside the outermost street corners: a lawn if the district has lawns, and vegetation."""
+    """Build the area beyond the outermost street corners: vegetation and, if the district has lawns, a lawn."""
     frame, width, depth = (
         LocalFrame((block.u0, block.v0), (1.0, 0.0), (0.0, 1.0)),
         block.u1 - block.u0,
@@ -244,7 +246,7 @@ def _build_meadow(site: Site, block: CityBlock) -> None:
 
 
 def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """Build a court between two rows of garages, with hedges behind them and a house at one end."""
+    """Build a court between two rows of garages. There are hedges behind the garages and a house at one end."""
     frame, width, depth = interior
     g = draw_sizes(site.rng, "garage", 1)[0]
     margin, aisle = (depth - 2 * g[0] - 9.0) / 2, 9.0
@@ -273,7 +275,7 @@ def _build_garage_court(site: Site, interior: tuple[LocalFrame, float, float]) -
 
 
 def _build_court(site: Site, interior: tuple[LocalFrame, float, float]) -> None:
-    """Build a large building behind its car park, with parked cars, a garden, and a wall at the back."""
+    """Build a large building with a car park in front of it, parked cars, a garden, and a wall at the back."""
     frame, width, depth = interior
     lot = float(site.rng.uniform(16.0, 19.0))
     beds = np.linspace(0, width, max(2, round(width / 22)) + 1).tolist()

@@ -1,4 +1,4 @@
-"""Parameters of the districts of a town and of the random variation between their blocks."""
+"""Parameters of the districts of a town, and of the random variation between blocks."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import numpy as np
 class District:
     """Parameters of one kind of neighbourhood.
 
-    Shares are probabilities. Names with `per_100m2` and `per_100m` are intensities per area and per length.
+    Shares are probabilities. Names with `per_100m2` are intensities per area. Names with `per_100m` are intensities per
+    length.
     """
 
     house_scale: tuple[float, float, float]
     setback_m: float  # Median distance from sidewalk to house.
-    gap_m: tuple[float, float]  # Free ground between houses, next to driveways.
+    gap_m: tuple[float, float]  # Width of the free ground between houses, next to driveways.
     garages: float
     terrain_front: float
     terrain_back: float
     court_front: float  # Share of front yards that are paved.
-    rough_drives: float  # Share of driveways with the class ground instead of parking.
+    rough_drives: float  # Share of driveways whose class is ground; the other driveways have the class parking.
     terrace: float
     sidewalks: float
     bays: float
@@ -45,8 +46,8 @@ class District:
     trucks_per_100m: float
 
 
-# Values are fitted on samples of 1,000 scenes so that `measure_town` agrees with TARGETS (TOWN_VERSION 1). Over plan
-# seeds 0..2, all means lie within their tolerance, and most lie within half of it.
+# The values were fitted to make the results of `measure_town` on 1,000 scenes agree with TARGETS (TOWN_VERSION 1). For
+# the plan seeds 0, 1 and 2, all means lie within the tolerance, and most means lie within half the tolerance.
 DISTRICTS = {
     "centre": District(
         house_scale=(1.16, 1.14, 1.03),
@@ -148,7 +149,7 @@ DISTRICTS = {
 class Mood:
     """Random variation between the blocks of a district: factors with mean 1."""
 
-    room: float  # Scale of houses and of the gaps between them.
+    room: float  # Scale of the houses and of the gaps between houses.
     vacant: float  # Share of plots without a house.
     garages: float
     green: float
@@ -165,8 +166,8 @@ class Mood:
 def draw_mood(rng: np.random.Generator) -> Mood:
     """Sample the Mood of a block.
 
-    The gamma distributions give the counts more variance than a Poisson distribution. A smaller shape gives more
-    variance.
+    The gamma distributions increase the variance of the counts beyond that of a Poisson distribution. A smaller shape
+    parameter gives more variance.
     """
 
     def gamma(shape: float) -> float:

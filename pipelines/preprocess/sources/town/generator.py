@@ -1,4 +1,4 @@
-"""A procedural town with a seed: the built-in source, fitted to statistics of KITTI-360 (reference_statistics.py).
+"""The built-in source: a procedural town from a seed, fitted to statistics of KITTI-360 (reference_statistics.py).
 
     drive = generate_town(7)       # one town and one drive through its streets
     scene = drive.scene(0)         # the scene ahead of the first pose
@@ -49,7 +49,7 @@ POSE_SPACING_M = 10.0
 IMU_HEIGHT_M = 0.93  # Height above the real road surface, as in KITTI-360.
 METRES_PER_FRAME = 0.7
 
-# Category of each KITTI-360 label in the spelling of its XML. The shape determines the category of vegetation.
+# Category of each KITTI-360 label; labels are spelled as in the XML. The shape determines the category of vegetation.
 LABEL_CATEGORY = {
     "vegetation": "vegetation_cuboid",
     "truck": "vehicle_big",
@@ -73,16 +73,16 @@ LABEL_CATEGORY = {
     "box": "object",
 }
 
-# Main district and edge district of a town, by seed modulo 4. Four successive seeds give all four pairs.
+# Main district and edge district of a town; the index is the seed modulo 4. Four successive seeds give all four pairs.
 TOWN_KINDS = (("suburb", "green"), ("centre", "suburb"), ("green", "suburb"), ("suburb", "centre"))
 SPACING_M = {"centre": (54, 69), "suburb": (54, 71), "green": (70, 98)}
 
 
 def generate_town(seed: int) -> Drive:
-    """Generate one town, and one drive of up to MAX_POSES poses through its streets, at least 10 m apart.
+    """Generate one town, and one drive through its streets with up to MAX_POSES poses.
 
-    Frames ascend along the drive, and a moving box has the frame that it belongs to. Seed modulo 4 determines the
-    districts. A random generator with this seed determines all other properties.
+    Poses are at least 10 m apart. Frame numbers ascend along the drive. Each moving box belongs to one frame. Seed
+    modulo 4 determines the districts. A random generator with this seed determines all other properties.
     """
     rng = np.random.default_rng([7301, seed])
     main, edge = TOWN_KINDS[seed % len(TOWN_KINDS)]
@@ -118,10 +118,11 @@ def generate_town(seed: int) -> Drive:
 
 
 def plan_town_parts(num_train: int = 10_000, num_test: int = 1_000, seed: int = 0) -> list[tuple[int, str, int]]:
-    """Return (town seed, split, number of scenes) of every town, with num_train and num_test scenes in total.
+    """Return (town seed, split, number of scenes) of every town.
 
-    Train and test use different towns. Small requests also use several towns. `select_poses` selects the poses of a
-    town. `seed` selects other towns.
+    The totals are num_train and num_test scenes. Training and test scenes come from different towns. Even a small
+    number of scenes comes from several towns. `select_poses` selects the poses of a town. Another `seed` gives other
+    towns.
     """
     plan = []
     for split, wanted, start in (("train", num_train, TRAIN_SEEDS_START), ("test", num_test, TEST_SEEDS_START)):
@@ -162,7 +163,7 @@ def _measure_travel(route: Route, land: Land) -> np.ndarray:
 
 
 def _sample_poses(rng: np.random.Generator, route: Route, land: Land) -> np.ndarray:
-    """Return the route samples that become poses, each at least POSE_SPACING_M from all others."""
+    """Return the route samples that become poses. Any two poses are at least POSE_SPACING_M apart."""
     xy = land.xy(route.uv)
     kept: list[int] = []
     points = np.empty((0, 2))
@@ -179,9 +180,9 @@ def _sample_poses(rng: np.random.Generator, route: Route, land: Land) -> np.ndar
 
 
 def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: Land) -> np.ndarray:
-    """Return world_from_imu (p, 3, 4) with x forward, y right and z down.
+    """Return world_from_imu (p, 3, 4), with the axes x forward, y right and z down.
 
-    The poses are tilted by about 3 degrees, like the IMU of a car.
+    The poses are tilted by about 3 degrees, as the IMU of a real car is.
     """
     xy = land.xy(route.uv[at])
     ahead = land.direction(route.uv[at], route.heading[at])
@@ -201,7 +202,7 @@ def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: La
 def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
     """Add moving boxes: cars ahead and oncoming, a few trucks and bicycles, and pedestrians on the sidewalk.
 
-    A track appears at a few successive poses. Each of its boxes belongs to the frame of one pose.
+    A track has boxes at a few successive poses. Each box belongs to the frame of one pose.
     """
     vehicles = np.array([label in ("car", "truck", "bus") for label in sheet.box_label])
     parked = np.concatenate(sheet.box_rows)[vehicles, :2]
@@ -236,7 +237,7 @@ def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.
 
 
 def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[str, np.ndarray]:
-    """Return the per-box arrays of a Drive: boxes on the surface, rotated with the streets."""
+    """Return the per-box arrays of a Drive. Boxes stand on the surface and are rotated with the streets."""
     rows, label = np.concatenate(sheet.box_rows), np.array(sheet.box_label, dtype=object)
     category = np.array([CATEGORY_INDEX[LABEL_CATEGORY[name]] for name in label], np.int8)
     category[rows[:, 8] > 0] = CATEGORY_INDEX["vegetation_ellipsoid"]
@@ -244,7 +245,7 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
     along = land.direction(rows[:, :2], rows[:, 2:4])
     grade = land.grade(xy)
 
-    # Low objects follow the slope, and tall objects are upright. A few objects are tilted, like annotated boxes.
+    # Low objects follow the slope, and tall objects are upright. A few objects are tilted, as in real annotations.
     leans = np.isin(label, ["car", "truck", "bus", "bicycle", "motorcycle", "wall", "fence", "gate", "guardrail"])
     leans |= np.isin(category, CATEGORY_INDEX["vegetation_cuboid"])
     tilt = np.where(leans[:, None], -grade, 0.0)
@@ -263,7 +264,8 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
     heading = np.where(directed, np.arctan2(along[:, 1], along[:, 0]), np.nan)
     timestamp, track = rows[:, 9].astype(np.int64), rows[:, 10].astype(np.int64)
     static = timestamp == STATIC
-    instance = np.where(static, np.arange(len(label)) + 1, track)  # Numbered separately, as in KITTI-360.
+    # Static and moving objects are numbered separately, as in KITTI-360.
+    instance = np.where(static, np.arange(len(label)) + 1, track)
     return {
         "category": category,
         "center_m": center,
@@ -277,7 +279,10 @@ def _collect_boxes(sheet: Sheet, rng: np.random.Generator, land: Land) -> dict[s
 
 
 def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
-    """Return closed slabs with tops SLAB_THICKNESS_M / 2 above the surface: n top vertices, then n bottom vertices."""
+    """Return closed slabs: n top vertices, then n bottom vertices.
+
+    The tops lie SLAB_THICKNESS_M / 2 above the surface.
+    """
     outlines = [subdivide_outline(outline) for _, outline in sheet.slabs]
     xy = land.xy(np.concatenate(outlines))
     middle = land.surface_m(xy)
@@ -296,7 +301,7 @@ def _collect_ground(sheet: Sheet, land: Land) -> SlabGround:
 
 
 def list_slab_faces(top: list[tuple[int, int, int]], n: int) -> np.ndarray:
-    """Return the faces (4 n - 4, 3) of a slab in KITTI-360's order: top, bottom, then two per side."""
+    """Return the faces (4 n - 4, 3) of a slab in KITTI-360's order: top, bottom, then two faces per side."""
     upper = np.array(top)
     ring = np.arange(n - 1)
     first = np.stack([ring, ring + 1, n + ring], axis=1)

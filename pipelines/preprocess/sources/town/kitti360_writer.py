@@ -1,9 +1,12 @@
-"""Write a Drive in KITTI-360's own file format, including typical defects, to test the reader without the dataset.
+"""Write a Drive in KITTI-360's file format, including typical defects.
+
+The reader can then be tested without the dataset.
 
     ROOT/data_3d_bboxes/train_full/2013_05_28_drive_0007_sync.xml
     ROOT/data_poses/2013_05_28_drive_0007_sync/poses.txt
 
-The reader returns the same drive from these files. A mirrored box is the same box, and a duplicate is an exact copy.
+The reader returns the same drive from these files. Mirrored boxes are equivalent to the original boxes, and duplicates
+are exact copies.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ XML_GROUND = {
     "terrain": "ground",
     "ground": "unknownGround",
 }
-# Labels without a category, placed at random among the objects.
+# Labels without a category. The writer inserts objects with these labels at random positions.
 STRAY_LABELS = ("stop", "caravan", "sky", "vendingmachine", "railtrack", "train")
 
 BOX_VERTICES = np.array(
@@ -50,7 +53,7 @@ BOX_FACES = np.array(
 def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (63, 3) and faces (80, 3) of the unit sphere.
 
-    The mesh has 7 rows from pole to pole of y and 9 columns, of which the first equals the last.
+    The mesh has 7 rows from pole to pole (y axis) and 9 columns. The first column equals the last column.
     """
     row, column = np.meshgrid(np.arange(7) * np.pi / 6, np.arange(9) * np.pi / 4, indexing="ij")
     vertices = np.stack([-np.sin(row) * np.cos(column), np.cos(row), np.sin(row) * np.sin(column)], axis=-1)
@@ -63,10 +66,12 @@ def make_sphere_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: int = 0) -> None:
-    """Write the XML file and poses.txt of one drive, as sequence int(drive.sequence) % 10000.
+    """Write the XML file and poses.txt of one drive.
+
+    The sequence number is int(drive.sequence) % 10000.
 
     Args:
-        drive: Drive with slab ground.
+        drive: Drive whose ground is a SlabGround.
         root: Directory in KITTI-360's layout.
         defects: Whether to add the defects of KITTI-360's files: mirrored and slightly sheared boxes, duplicate objects
         at borders of annotation windows, empty plane matrices, labels without a category, and random order of fields
@@ -74,7 +79,7 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
         seed: Seed of the defects.
 
     Raises:
-        ValueError: The drive's ground is not slabs.
+        ValueError: The ground of the drive is not a SlabGround.
     """
     ground = drive.ground
     if not isinstance(ground, SlabGround):
@@ -133,7 +138,10 @@ def write_kitti360(drive: Drive, root: str | Path, defects: bool = True, seed: i
 
 
 def _list_windows(drive: Drive, points_m: np.ndarray) -> list[list[int]]:
-    """Return the annotation windows of each object: the window of its nearest pose, and the next window at a border."""
+    """Return the annotation windows of each object.
+
+    An object belongs to the window of its nearest pose and, near a border, also to the next window.
+    """
     poses = drive.world_from_imu[:, :2, 3]
     found = []
     for point in points_m[:, :2]:
@@ -167,20 +175,20 @@ def _write_head(drive: Drive, label: str, category: str, box: int | None, window
 def _transform(drive: Drive, k: int, scale: float, rng: np.random.Generator | None) -> np.ndarray:
     """Return world_from_mesh (4, 4) of the unit mesh.
 
-    With a random generator, a few transforms are mirrored or sheared by less than 1 mm.
+    If a random generator is given, a few transforms are mirrored, or sheared by less than 1 mm.
     """
     matrix = np.eye(4)
     matrix[:3, :3] = drive.rotation[k] * drive.size_m[k] * scale
     matrix[:3, 3] = drive.center_m[k]
     if rng is not None and rng.random() < 0.05:
-        matrix[:3, int(rng.integers(1, 3))] *= -1  # The first axis may be a heading, so it is not mirrored.
+        matrix[:3, int(rng.integers(1, 3))] *= -1  # The first axis is not mirrored, because it may be a heading.
     if rng is not None and rng.random() < 0.05:
         matrix[:3, :3] += rng.normal(0, 1e-4, (3, 3)) * drive.size_m[k].min() * scale
     return matrix
 
 
 def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices (2 n, 3), the n top vertices first, and faces (4 n - 4, 3) of each slab."""
+    """Return vertices (2 n, 3) and faces (4 n - 4, 3) of each slab. The n top vertices come first."""
     first = np.searchsorted(ground.vertex_slab, np.arange(len(ground.slab_class) + 1))
     owner = ground.vertex_slab[ground.triangles[:, 0]]
     at = np.searchsorted(owner, np.arange(len(ground.slab_class) + 1))
@@ -191,7 +199,7 @@ def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _write_slab(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
-    """Write a slab relative to its centre, and its mid-plane, which is the real surface."""
+    """Write a slab relative to its centre. Also write its mid-plane, which is the real surface."""
     n = len(vertices) // 2
     matrix = np.eye(4)
     matrix[:3, 3] = vertices.mean(axis=0)

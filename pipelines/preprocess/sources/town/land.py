@@ -1,8 +1,8 @@
-"""The terrain of a town and the container of its content: bends of streets, hills, slabs and boxes.
+"""The terrain of a town (bends of streets and hills) and the container for its slabs and boxes.
 
 A town is designed in board coordinates (u, v) in metres, where every street is straight. `Land` maps the board to the
 world frame by two shears, x = u + a(v) and y = v + b(x). Shears keep areas, and adjacent shapes remain adjacent.
-Streets become curved, and not all junctions are rectangular.
+Streets become curved, and some junctions are not right-angled.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SLAB_THICKNESS_M = 0.6  # Thickness of KITTI-360's ground slabs; their mid-plane is the surface that objects stand on.
-EDGE_STEP_M = 10.0  # Maximum length of a slab edge, which limits the error at bends and hills.
+SLAB_THICKNESS_M = 0.6  # Thickness of KITTI-360's ground slabs. Objects stand on the mid-plane of the slabs.
+EDGE_STEP_M = 10.0  # Maximum length of a slab edge. It limits the error at bends and hills.
 MAX_CORNERS = 40  # Maximum number of corners of a slab, as in KITTI-360.
 
 
 @dataclass(frozen=True, eq=False)
 class Land:
-    """Map from board to world coordinates, and height of the real surface."""
+    """Map from board to world coordinates, and the height of the real surface."""
 
     bend_u: np.ndarray  # (k, 3): amplitude (m), wave number (rad/m) and phase (rad) of a(v).
     bend_v: np.ndarray  # (k, 3): amplitude (m), wave number (rad/m) and phase (rad) of b(x).
@@ -69,7 +69,7 @@ def _compute_slopes(waves: np.ndarray, at: np.ndarray) -> np.ndarray:
 def draw_land(rng: np.random.Generator) -> Land:
     """Sample the terrain of a town and its position in the world frame.
 
-    Bends are at most about 15 degrees in each direction, and the slope of hills is at most 3 %.
+    Streets bend by at most about 15 degrees in each direction. The slope of hills is at most 3 %.
     """
 
     def bends() -> np.ndarray:
@@ -77,7 +77,7 @@ def draw_land(rng: np.random.Generator) -> Land:
         slope = rng.uniform(0.0, 0.27) * rng.dirichlet([1.5, 1.5])
         return np.stack([slope / wave, wave, rng.uniform(0, 2 * np.pi, 2)], axis=1)
 
-    # The slopes of the two waves are perpendicular and never exceed 3 % together.
+    # The slopes of the two waves are perpendicular, and the total slope never exceeds 3 %.
     wave, direction = 2 * np.pi / rng.uniform(320, 760, 2), rng.uniform(0, 2 * np.pi) + np.array([0.0, np.pi / 2])
     steepest, share = rng.uniform(0.026, 0.03), rng.uniform(0.3, 1.27)
     grade = steepest * np.array([np.cos(share), np.sin(share)])
@@ -89,7 +89,7 @@ def draw_land(rng: np.random.Generator) -> Land:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Local frame on the board: s runs along a street, and t points away from it; axes are unit board directions."""
+    """Local frame on the board: s runs along a street, and t points away from the street. Axes are unit directions."""
 
     origin: tuple[float, float]
     along: tuple[float, float]
@@ -110,7 +110,7 @@ class Sheet:
     """Slabs and boxes of a town in board coordinates, before `Land` maps them to the world frame."""
 
     def __init__(self) -> None:
-        self.slabs: list[tuple[str, np.ndarray]] = []  # ground class and outline (n, 2) in either direction of rotation
+        self.slabs: list[tuple[str, np.ndarray]] = []  # ground class and outline (n, 2), clockwise or counter-clockwise
         self.box_label: list[str] = []
         self.box_rows: list[
             np.ndarray
@@ -139,10 +139,10 @@ class Sheet:
         Args:
             frame: Frame of (s, t).
             label: Label of the boxes.
-            s: (n,) or one position along the street (m).
-            t: (n,) or one position away from the street (m).
+            s: Position along the street (m): (n,), or one value for all boxes.
+            t: Distance from the street (m): (n,), or one value for all boxes.
             size_m: (n, 3) or (3,) length, width and height.
-            yaw_rad: Direction of the length axis, from s to t.
+            yaw_rad: Angle from the s axis to the length axis (rad).
             bottom_m: Height of the lower side above the surface.
             ellipsoid: Whether the primitives are ellipsoids.
             timestamp: Frame of a moving box; -1 for static boxes.
@@ -161,9 +161,10 @@ class Sheet:
 
 
 def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
-    """Return the outlines of the 4-connected patches of equal value >= 0 in a grid of cells.
+    """Return the outlines of the patches in a grid of cells.
 
-    The outlines form slabs that are not rectangles. Patches must have no holes.
+    A patch is a 4-connected set of cells with the same value >= 0. It must have no holes. Outlines need not be
+    rectangles.
 
     Args:
         cells: (len(s) - 1, len(t) - 1) int; value of each cell.
@@ -171,7 +172,7 @@ def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tu
         t: Grid lines along the second axis, ascending.
 
     Returns:
-        (value, outline) per patch.
+        Value and outline of each patch.
     """
     columns, rows = cells.shape
     patch = -np.ones((columns, rows), int)
@@ -195,7 +196,7 @@ def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tu
 
 
 def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the corners of the outer outline of a set of unit cells, counter-clockwise, with straight runs merged."""
+    """Return the corners of the outer outline of a set of unit cells, counter-clockwise. Collinear edges are merged."""
     ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in members:
         sides = (((0, -1), (i, j), (i + 1, j)), ((1, 0), (i + 1, j), (i + 1, j + 1)))
@@ -206,7 +207,7 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
     start = min(ahead)
     outline, here, step = [start], start, (0, -1)
     while True:
-        # At a corner where two cells touch, turn left to follow the same cell.
+        # Where two cells touch only at a corner, turn left to follow the same cell.
         options = ahead[here]
         there = max(options, key=lambda p: step[0] * (p[1] - here[1]) - step[1] * (p[0] - here[0]))
         options.remove(there)
@@ -221,10 +222,10 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def subdivide_outline(outline: np.ndarray) -> np.ndarray:
-    """Split long edges of an outline (m, 2) at multiples of EDGE_STEP_M, so that neighbours share the new corners.
+    """Split long edges of an outline (m, 2) at multiples of EDGE_STEP_M.
 
-    Only edges parallel to a board axis are split. The result is counter-clockwise. If it has more than MAX_CORNERS
-    corners, the step is doubled or quadrupled.
+    Neighbouring outlines therefore share the new corners. Only edges parallel to a board axis are split. The result is
+    counter-clockwise. If the result has more than MAX_CORNERS corners, the step is doubled or quadrupled.
     """
     for step in (EDGE_STEP_M, 2 * EDGE_STEP_M, 4 * EDGE_STEP_M, 1e6):
         cut = _cut(outline, step)
@@ -253,7 +254,7 @@ def _cut(outline: np.ndarray, step: float) -> np.ndarray:
 
 
 def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
-    """Triangulate a simple counter-clockwise outline (n, 2), convex or not, to n - 2 triangles (indices)."""
+    """Triangulate a simple counter-clockwise outline (n, 2), which need not be convex, into n - 2 index triples."""
     points = outline.tolist()
 
     def turn(a: int, b: int, c: int) -> float:
@@ -271,7 +272,7 @@ def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
             for k in range(n):
                 p = left[k]
                 if p in (a, b, c) or turn(left[k - 1], p, left[(k + 1) % n]) > 0:
-                    continue  # Only a reflex corner can lie in an ear.
+                    continue  # Only reflex corners can lie inside an ear.
                 if turn(a, b, p) >= 0 and turn(b, c, p) >= 0 and turn(c, a, p) >= 0:
                     ear = False
                     break

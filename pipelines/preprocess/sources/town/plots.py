@@ -11,12 +11,12 @@ from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
 
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
-SQUEEZE = 0.4  # The last plot may exceed the row by this share of its width; all plots then shrink to fit.
+SQUEEZE = 0.4  # Maximum share of the last plot that may exceed the row. All plots then shrink to fit the row.
 
 
 @dataclass(frozen=True)
 class House:
-    """Plan of a house: extent along and away from the street, height, and width of its driveway."""
+    """Plan of a house: extents along the street and away from the street, height, and driveway width."""
 
     front_m: float
     back_m: float
@@ -26,7 +26,7 @@ class House:
 
 
 def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) -> None:
-    """Build houses side by side along a street, each on its plot; plot widths are scaled to fill the row."""
+    """Build houses side by side along a street, one per plot. Plot widths are scaled to fill the row."""
     planned, used = [], 0.0
     scale = np.array(site.district.house_scale) * [site.mood.room, site.mood.room**0.5, 1.0]
     while True:
@@ -54,8 +54,9 @@ def build_house_row(site: Site, frame: LocalFrame, length: float, depth: float) 
 
 
 def build_plot(site: Site, frame: LocalFrame, width: float, depth: float, house: House) -> None:
-    """Build one plot: house, garage, driveway, path, terrace, garden, borders and small objects; or a garden without
-    house.
+    """Build one plot: house, garage, driveway, path, terrace, garden, borders and small objects.
+
+    Some plots have no house, only a garden.
     """
     if site.rng.random() < site.mood.vacant:
         lawn = TERRAIN if site.rng.random() < site.district.terrain_front else NOTHING
@@ -110,9 +111,10 @@ def _build_house(site: Site, frame: LocalFrame, walls: Rect, house: House) -> No
 def _build_garage(
     site: Site, frame: LocalFrame, width: float, depth: float, walls: Rect, room: float, left: bool
 ) -> list[tuple[int, Rect]]:
-    """Build a garage next to the house if there is room, otherwise behind it, and a driveway with an optional car.
+    """Build a garage and a driveway with an optional car.
 
-    The function returns the rectangles to paint, the driveway first, or none if the plot is too shallow.
+    The garage is behind the house if there is no room next to the house. The function returns the rectangles to paint,
+    with the driveway first. The list is empty if the plot is too shallow.
     """
     size = draw_sizes(site.rng, "garage", 1)[0]
     beside = max(2.8, min(room, size[1]))
@@ -137,7 +139,10 @@ def _compute_overlap(a: Rect, b: Rect) -> bool:
 def _plant_borders(
     site: Site, frame: LocalFrame, width: float, depth: float, setback: float, gate: tuple[float, float], court: bool
 ) -> None:
-    """Build hedges and walls around a plot, with gaps at the gate (s0, s1) and at a court; add steps and low walls."""
+    """Build hedges and walls around a plot.
+
+    There are gaps at the gate (s0, s1) and at a court. Steps and low walls are added.
+    """
     g0, g1 = gate
     lines: list[tuple[float, float, float, float]] = []
     if not court and setback > 1.2:
@@ -164,7 +169,7 @@ def _plant_borders(
 
 
 def _place_belongings(site: Site, frame: LocalFrame, walls: Rect, gate: tuple[float, float]) -> None:
-    """Place bins, boxes and bicycles in front of the house and next to its driveway."""
+    """Place bins, boxes and bicycles in front of the house and next to the driveway."""
     s0, s1, t0, _ = walls
     n = site.rng.poisson(site.district.objects_per_plot * site.mood.objects)
     if n:
@@ -189,7 +194,7 @@ def paint_plots(
     split: float,
     rects: list[tuple[int, Rect]],
 ) -> None:
-    """Paint the slabs of a plot: `front` before t = split, `back` after it, and `rects` on top.
+    """Paint the slabs of a plot: class `front` for t < split, class `back` for t > split, and `rects` on top.
 
     Each entry of `rects` is (class, (s0, s1, t0, t1)).
     """

@@ -1,4 +1,4 @@
-"""Statistics of 64 x 64 m scenes of KITTI-360, and a comparison with scenes of the town."""
+"""Statistics of KITTI-360 scenes (64 x 64 m), and a comparison with scenes of the town."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 from models.scene import CATEGORIES, DENSITIES, VEGETATION, Scene
 from pipelines.schema.density_labels import classify_density, compute_density_thresholds
 
-COUNT_TOLERANCE = 0.20  # Relative tolerance. COUNT_TOLERANCE_SMALL is absolute and applies to targets below 3.
+# Relative tolerance. For targets less than 3, the absolute tolerance COUNT_TOLERANCE_SMALL applies.
+COUNT_TOLERANCE = 0.20
 COUNT_TOLERANCE_SMALL = 0.5
 AREA_TOLERANCE = 0.05
 SIZE_TOLERANCE = 0.15
 
-# Mean number of primitives per scene with low, medium and high vegetation density.
+# Mean number of primitives in scenes with low, medium and high vegetation density.
 COUNTS = {
     "vegetation_cuboid": (14, 72, 114),
     "vegetation_ellipsoid": (12, 71, 109),
@@ -30,7 +31,7 @@ COUNTS = {
     "traffic_control": (4, 8, 8),
     "object": (2, 5, 6),
 }
-# Share of the scene's 4096 m2 with low, medium and high vegetation density.
+# Share of the scene's area (4096 m2) in scenes with low, medium and high vegetation density.
 AREAS = {
     "road": (0.19, 0.19, 0.14),
     "sidewalk": (0.12, 0.11, 0.11),
@@ -39,7 +40,7 @@ AREAS = {
     "ground": (0.06, 0.06, 0.03),
     "none": (0.48, 0.27, 0.24),
 }
-# Median length, width and height over all scenes (m); buildings and garages are separate.
+# Median length, width and height over all scenes (m). Buildings and garages have separate entries.
 SIZES_M = {
     "vegetation_cuboid": (5, 2.2, 2.0),
     "vegetation_ellipsoid": (5.5, 4.8, 6),
@@ -83,7 +84,7 @@ class Sample:
         counts: Number of primitives per category.
         vegetation_volume_m3: Total volume of vegetation (m3).
         areas: Area shares, in the order of AREAS.
-        size_m: Sizes (k, 3) of all boxes, by name in SIZES_M (m).
+        size_m: Sizes (k, 3) of all boxes for each name in SIZES_M (m).
     """
 
     counts: np.ndarray  # (n, 11)
@@ -93,11 +94,11 @@ class Sample:
 
     @property
     def vegetation_count(self) -> np.ndarray:
-        """(n,) number of vegetation primitives per scene."""
+        """Number of vegetation primitives of each scene (n,)."""
         return self.counts[:, list(VEGETATION)].sum(axis=1)
 
     def labels(self) -> np.ndarray:
-        """Return the vegetation density label of each scene (n,), from the percentiles of this sample."""
+        """Return the vegetation density label of each scene (n,). The thresholds are percentiles of this sample."""
         thresholds = compute_density_thresholds(self.vegetation_count, self.vegetation_volume_m3)
         return classify_density(self.vegetation_count, self.vegetation_volume_m3, thresholds)
 
@@ -120,9 +121,10 @@ def make_sample(scenes: Iterable[Scene]) -> Sample:
 
 
 def measure_town(scenes: Iterable[Scene] | Sample) -> list[Row]:
-    """Compare measured and target values of all TARGETS; density labels come from the percentiles of these scenes.
+    """Compare measured and target values of all TARGETS.
 
-    A category or label that never occurs gives NaN and fails the comparison.
+    Density labels are computed from the percentiles of these scenes. A category or label that does not occur gives NaN.
+    Its comparison fails.
     """
     sample = scenes if isinstance(scenes, Sample) else make_sample(scenes)
     label = sample.labels()

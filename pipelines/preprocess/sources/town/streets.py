@@ -1,4 +1,4 @@
-"""The street grid of a town: streets, junctions, the blocks between them, and the route of the car.
+"""The street grid of a town: streets, junctions, the blocks between the streets, and the route of the car.
 
 All coordinates are board coordinates (land.py). A u-street runs along v at a constant u. A v-street runs along u at a
 constant v.
@@ -15,7 +15,7 @@ import numpy as np
 
 from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
-ROAD_SLAB_M = 30.0  # Length of a road slab, which covers about 200 m2.
+ROAD_SLAB_M = 30.0  # Length of a road slab. A slab covers about 200 m2.
 BOARD = LocalFrame((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 ARMS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # east, north, west, south.
 
@@ -31,7 +31,7 @@ class Streets:
         v_m: Positions of the v-streets (m).
         half_u_m: Half widths of the u-streets (m).
         half_v_m: Half widths of the v-streets (m).
-        edges: Pairs of neighbouring nodes with a street between them, the lower node first.
+        edges: Pairs of neighbouring nodes that a street connects; the lower node comes first.
         corner_m: Radius of the kerb at each junction (m).
     """
 
@@ -47,7 +47,7 @@ class Streets:
         return (min(a, b), max(a, b)) in self.edges
 
     def arms(self, node: Node) -> list[bool]:
-        """Return whether a street leaves the node to the east, north, west and south."""
+        """Return four values: whether a street leaves the node to the east, north, west and south."""
         return [self.has(node, (node[0] + di, node[1] + dj)) for di, dj in ARMS]
 
     def at(self, node: Node) -> np.ndarray:
@@ -69,7 +69,7 @@ class CityBlock:
         v0: Lower bound along v (m).
         v1: Upper bound along v (m).
         streets: Whether the south, east, north and west side faces a street.
-        corners: Kerb radii at the corners SW, SE, NE and NW (m); 0 without a kerb.
+        corners: Kerb radii at the corners SW, SE, NE and NW (m); 0 at a corner without a kerb.
         kind: Name of the district.
     """
 
@@ -82,7 +82,7 @@ class CityBlock:
     kind: str
 
     def side(self, index: int) -> tuple[LocalFrame, float, float, float]:
-        """Return the frame of a side, its length and the radii of its two corners.
+        """Return the frame of a side, the length of the side, and the radii of its two corners.
 
         The origin of the frame is the left end of the side, seen from the middle of the street. t points into the
         block.
@@ -102,8 +102,8 @@ def lay_streets(
 ) -> tuple[Streets, list[tuple[int, int, int, int]]]:
     """Return streets with the given spacings, and blocks as node ranges (i0, i1, j0, j1).
 
-    A share `missing` of the streets between two blocks is omitted. The two blocks then become one, and the junctions at
-    the ends of the street become T-junctions.
+    The share `missing` of the streets between two blocks is omitted. The two blocks then form one block, and the
+    junctions at the ends of the omitted street become T-junctions.
     """
     u = np.concatenate([[0.0], np.cumsum(spacing_u_m)])
     v = np.concatenate([[0.0], np.cumsum(spacing_v_m)])
@@ -206,19 +206,19 @@ def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
 
 
 def trace_kerb(hu: float, hv: float, r: float) -> list[tuple[float, float]]:
-    """Return a quarter circle of radius r around a block's corner, seen from a junction with half widths hu and hv."""
-    angle = np.linspace(1.5 * np.pi, np.pi, 5)  # Angles from the arm along u to the arm along v.
+    """Return a quarter circle of radius r at a block corner, relative to a junction with half widths hu and hv."""
+    angle = np.linspace(1.5 * np.pi, np.pi, 5)  # Angles, from the arm along u to the arm along v.
     return list(zip((hu + r + r * np.cos(angle)).tolist(), (hv + r + r * np.sin(angle)).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A drive through all streets, sampled about every metre, in board coordinates.
+    """A drive through all streets in board coordinates, with about one sample per metre.
 
     Attributes:
         uv: Position on the lane (m).
         heading: Unit direction of travel.
-        lane_m: Distance from the middle of the lane to the middle of the street (m).
+        lane_m: Distance from the centre of the lane to the centre of the street (m).
     """
 
     uv: np.ndarray  # (k, 2)
@@ -257,7 +257,7 @@ def _compute_lane(streets: Streets, a: Node, b: Node) -> tuple[np.ndarray, np.nd
 
 
 def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Return a parabola (k, 2) from one lane to the next; a U-turn is a straight line."""
+    """Return a parabola (k, 2) from one lane to the next. For a U-turn, it is a straight line."""
     knee = start + heading * ((end - start) @ heading) if abs(heading @ out) < 0.5 else (start + end) / 2
     steps = max(3, int(np.linalg.norm(end - start)))
     w = np.linspace(0, 1, steps)[1:-1, None]
@@ -267,7 +267,7 @@ def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: 
 def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
     """Return the nodes of a walk over all edges.
 
-    The walk prefers unused streets and prefers straight continuation to turns. At a node without unused streets, the
+    The walk prefers unused streets, and it prefers straight streets to turns. At a node without unused streets, the
     walk goes to the nearest unused street.
     """
     near: dict[Node, list[Node]] = {}
@@ -294,7 +294,10 @@ def _walk(rng: np.random.Generator, streets: Streets) -> list[Node]:
 
 
 def _find_shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], behind: Node | None) -> list[Node]:
-    """Return the shortest path from start to the nearest goal, without start and without a U-turn at the beginning."""
+    """Return the shortest path from start to the nearest goal.
+
+    The path does not contain start and does not begin with a U-turn.
+    """
     came: dict[Node, Node] = {n: start for n in near[start] if n != behind}
     queue = deque(came)
     while queue:
@@ -308,4 +311,4 @@ def _find_shortest(near: dict[Node, list[Node]], start: Node, goals: set[Node], 
             if there not in came and there != start:
                 came[there] = here
                 queue.append(there)
-    raise AssertionError("the streets are connected, so an unused street must be reachable")
+    raise AssertionError("no unused street is reachable, although all streets are connected")
