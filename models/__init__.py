@@ -1,6 +1,6 @@
-"""Scenes, networks and their mathematics, built on torch, numpy and scipy.
+"""Scenes, neural networks and the mathematics that they need. The package uses torch, numpy and scipy.
 
-This package does not import Ray. The import of diffusers happens only when a function needs diffusers.
+This package does not import Ray. It imports diffusers only when a function needs diffusers.
 """
 
 from importlib import import_module

@@ -1,8 +1,7 @@
 """Augment training scenes: mirror a scene, or view it from a slightly moved vehicle.
 
-The paper does not augment scenes. SLEDGE, on which the paper builds, moves the vehicle by up to 1 m and rotates it by
-up to 2.5 degrees. A moved crop includes an area outside the stored crop. The area outside the stored crop is empty, so
-moves should be small.
+The paper does not augment scenes. The paper builds on SLEDGE, which moves the vehicle by up to 1 m and rotates it by up
+to 2.5 degrees. A moved crop includes an area outside the stored crop. This area is empty, so moves should be small.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from models.scene import Scene, canonicalize_boxes, make_yaw_rotation
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Random changes to training scenes; each draw depends on `seed` and the position in the sample stream only.
+    """Random changes to training scenes; each change depends only on `seed` and the position in the sample stream.
 
     Attributes:
-        flip: Mirror half of the scenes left to right.
+        flip: If True, half of the scenes are mirrored left to right.
         move_m: Largest translation of the vehicle along x and along y (metres).
         turn_rad: Largest rotation of the vehicle about z (radians).
-        seed: Seed of the draws.
+        seed: Seed of the random changes.
     """
 
     flip: bool = False
@@ -35,10 +34,11 @@ class Augmentation:
 
         Args:
             scene: Stored scene.
-            place: Position in the sample stream; it keys the random draw.
+            place: Position in the sample stream; the random change depends on it.
 
         Returns:
-            The changed scene, or `scene` itself if the random draw changes nothing.
+
+            The changed scene, or `scene` itself if nothing changes.
         """
         rng = np.random.default_rng([7303, self.seed, place])
         flip, dx, dy, turn = rng.random(), *rng.uniform(-1, 1, 3)
@@ -48,7 +48,7 @@ class Augmentation:
 
 
 def mirror_scene(scene: Scene) -> Scene:
-    """Mirror a scene left to right; the result is exact.
+    """Mirror a scene left to right, without resampling.
 
     Args:
         scene: Scene on a grid that is symmetric about the x axis.

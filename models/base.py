@@ -1,8 +1,8 @@
-"""Save and load models in diffusers' file format, without the import of diffusers (two to three seconds per process).
+"""Save and load models in the file format of diffusers without importing diffusers.
 
 `ConfiguredModel` provides the methods of diffusers' `ModelMixin` and `ConfigMixin` that this project uses. A model
-directory holds config.json and diffusion_pytorch_model.safetensors. Methods and files have the names that diffusers
-gives them.
+directory holds config.json and diffusion_pytorch_model.safetensors. Methods and files have the same names as in
+diffusers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Model = TypeVar("Model", bound="ConfiguredModel")
 
 
 class Config(dict):
-    """Constructor arguments of a model as a dictionary; entries are also readable as attributes."""
+    """Dictionary of the constructor arguments of a model; entries are also readable as attributes."""
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -39,10 +39,10 @@ class Config(dict):
 
 
 def register_to_config(init: Callable[..., None]) -> Callable[..., None]:
-    """Decorate `__init__` so that it stores its arguments, defaults included, as `self.config`.
+    """Decorate `__init__` to store all its arguments, including defaults, in `self.config`.
 
     Args:
-        init: Constructor of a `ConfiguredModel`. Arguments that are dataclasses are stored as dictionaries.
+        init: Constructor of a `ConfiguredModel`. Dataclass arguments are stored as dictionaries.
 
     Returns:
         The decorated constructor.
@@ -65,7 +65,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_config(kind: str, config: Mapping[str, Any], path: Path) -> None:
-    """Write a config as diffusers does: sorted JSON with the class name and diffusers' version.
+    """Write a config in the format of diffusers: sorted JSON with the class name and the version of diffusers.
 
     Args:
         kind: Name of the class.
@@ -80,7 +80,7 @@ def read_config(path: Path) -> dict[str, Any]:
     """Read a config without the entries that diffusers adds.
 
     Args:
-        path: JSON file that `write_config` or diffusers wrote.
+        path: JSON file written by `write_config` or by diffusers.
 
     Returns:
         Constructor arguments by name.
@@ -105,14 +105,14 @@ class ConfiguredModel(nn.Module):
     Subclasses decorate `__init__` with the function `register_to_config`.
 
     Attributes:
-        config: Constructor arguments, defaults included.
+        config: All constructor arguments, including defaults.
     """
 
     config: Config
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Convert a config that an earlier version wrote to the current constructor arguments.
+        """Convert a config written by an earlier version to the current constructor arguments.
 
         Args:
             config: Entries of a stored config.
@@ -145,17 +145,17 @@ class ConfiguredModel(nn.Module):
     def from_pretrained(
         cls: type[Model], directory: str | os.PathLike, torch_dtype: torch.dtype | None = None
     ) -> Model:
-        """Load a model from a local directory that `save_pretrained` wrote.
+        """Load a model from a local directory written by `save_pretrained`.
 
         Args:
             directory: Directory with config.json and diffusion_pytorch_model.safetensors. Nothing is downloaded.
-            torch_dtype: Data type of the parameters (default: as stored).
+            torch_dtype: Data type of the parameters; None: the stored data type.
 
         Returns:
             The model in evaluation mode.
 
         Raises:
-            ValueError: A file is missing or damaged, or the weights do not fit the architecture in config.json.
+            ValueError: A file is missing or damaged, or the weights do not match the architecture in config.json.
         """
         path = Path(directory)
         model = cls.from_config(read_config(path / CONFIG_NAME))
@@ -189,7 +189,7 @@ class ConfiguredModel(nn.Module):
         """Replace entries of the config.
 
         Args:
-            **changes: New values by name.
+            **changes: New values by entry name.
         """
         self.config = Config(self.config | changes)
 
@@ -207,7 +207,7 @@ class ConfiguredModel(nn.Module):
         """Return the number of parameters.
 
         Args:
-            only_trainable: Count only parameters that require a gradient.
+            only_trainable: If True, count only parameters that require a gradient.
 
         Returns:
             Number of scalar parameters.

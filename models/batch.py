@@ -1,4 +1,4 @@
-"""A batch of layouts as tensors; a LayoutSpec (layout.py) defines the meaning of the values.
+"""Batch of layouts as tensors. A LayoutSpec (layout.py) defines the meaning of the values.
 
 This module is separate from layout.py because data jobs do not need torch.
 """
@@ -18,9 +18,9 @@ class LayoutBatch:
 
     Attributes:
         height: Normalised ground heights H.
-        occupied: Ground masks B, 0 or 1.
+        occupied: Ground masks B with values 0 and 1.
         features: Normalised centres and Cholesky parameters F; 0 in padded slots.
-        real: The paper's padding flag p; True where a slot holds a primitive.
+        real: True for each slot that holds a primitive (padding flag p of the paper).
     """
 
     height: Float[Tensor, "batch ground rows cols"]
@@ -50,6 +50,7 @@ class LayoutBatch:
             arrays: Compact arrays with a leading batch axis, as tensors on any device.
 
         Returns:
+
             The batch on the same device, with float32 values.
         """
         return cls(

@@ -1,8 +1,8 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
-The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
-`DiTTransformer2DModel` of diffusers embeds timestep and label again in every block, which makes it 8 % larger.
-`DiTTransformer2DModel` also drops labels for guidance independently per block, so its unconditional branch is never
+The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. In diffusers,
+`DiTTransformer2DModel` has separate timestep and label embeddings in every block, so it is 8 % larger.
+It also drops labels independently in each block, so the unconditional branch of classifier-free guidance is never
 trained. Here, each sample has one embedding and one dropout mask for the whole network.
 """
 
@@ -25,7 +25,7 @@ Prediction = Literal["epsilon", "v_prediction"]
 
 
 def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
-    """Compute the sinusoidal embedding of timesteps, cosines first.
+    """Compute the sinusoidal embedding of timesteps: cosines, then sines.
 
     Args:
         timestep: Timesteps.
@@ -40,14 +40,14 @@ def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 25
 
 
 def make_sincos_positions(rows: int, width: int) -> Float[Tensor, "tokens d"]:
-    """Make fixed 2D sine-cosine positions of a square token grid.
+    """Return the fixed 2D sine-cosine position embeddings of a square token grid.
 
     Args:
         rows: Number of rows and of columns.
         width: Number of channels; the first half encodes the column, the second half the row.
 
     Returns:
-        Positions of the tokens in row-major order.
+        Position embeddings of the tokens in row-major order.
     """
 
     def axis(position: Tensor) -> Tensor:
@@ -90,7 +90,7 @@ class DiTBlock(nn.Module):
 
         Args:
             x: Tokens.
-            modulation: Shifts, scales and gates; output of `self.modulation` for the condition.
+            modulation: Shifts, scales and gates, which `self.modulation` computes from the condition.
 
         Returns:
             Tokens of the same shape.
@@ -98,7 +98,7 @@ class DiTBlock(nn.Module):
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=1)
         width = x.shape[-1:]
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift1, scale1)
-        q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # (b, heads, n, dh) each
+        q, k, v = self.qkv(y).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # q, k, v: (b, heads, n, dh).
         y = self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
         x = torch.addcmul(x, gate1[:, None], y)
         y = modulate(F.layer_norm(x, width, eps=1e-6), shift2, scale2)
@@ -106,7 +106,7 @@ class DiTBlock(nn.Module):
 
 
 class DiT(ConfiguredModel):
-    """Predict the noise in a latent (b, channels, size, size) at timestep t under label y.
+    """Predict the noise in latents (b, channels, size, size), conditioned on timestep and label.
 
     Args:
         channels: Number of latent channels.
@@ -116,16 +116,16 @@ class DiT(ConfiguredModel):
         depth: Number of blocks.
         heads: Number of attention heads.
         label: Kind of label, a key of `models.labels.LABELS`.
-        num_labels: Number of labels; this index is the null label of classifier-free guidance.
-        layout: LayoutSpec of the training scenes as a dict, or None.
-        shift: Value per channel that is subtracted from VAE latents before diffusion. The paper uses no shift.
-        scale: Value per channel that divides VAE latents after the shift. The paper uses no scale.
+        num_labels: Number of labels. The index `num_labels` is the null label of classifier-free guidance.
+        layout: LayoutSpec of the training scenes as a dictionary, or None.
+        shift: One value per channel, subtracted from VAE latents before diffusion. The paper uses no shift.
+        scale: One divisor per channel, applied to VAE latents after the shift. The paper uses no scale.
         prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is sqrt(alpha_bar)
             noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the noise. With
-            "v_prediction", a small network need not transport the noise of its input through all layers.
+            "v_prediction", a small network does not need to pass the noise of its input through all layers.
 
     Raises:
-        ValueError: `prediction` is unknown, or `patch` or `heads` does not divide the size or the width.
+        ValueError: `prediction` is unknown, `patch` does not divide `size`, or `heads` does not divide `width`.
     """
 
     positions: Tensor
@@ -151,9 +151,7 @@ class DiT(ConfiguredModel):
         if prediction not in get_args(Prediction):
             raise ValueError(f"DiT: prediction {prediction!r}, expected one of: {', '.join(get_args(Prediction))}")
         if size % patch or width % heads or width % 4:
-            raise ValueError(
-                f"DiT: size {size} / patch {patch} and width {width} / heads {heads} must be whole numbers"
-            )
+            raise ValueError(f"DiT: patch {patch} must divide size {size}, and heads {heads} must divide width {width}")
         self.patch_in = nn.Conv2d(channels, width, patch, stride=patch)
         self.timestep_mlp = nn.Sequential(nn.Linear(FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
         self.label_embedding = nn.Embedding(num_labels + 1, width)
@@ -163,12 +161,12 @@ class DiT(ConfiguredModel):
         self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
         alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
-        self.register_buffer("noise_shares", shares, persistent=False)  # factors of latent and v
+        self.register_buffer("noise_shares", shares, persistent=False)  # Factors of the latent and of v.
         self.init_weights()
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Rename predictions in a config that a version before 0.2 wrote.
+        """Convert prediction names in a config written by a version before 0.2.
 
         Args:
             config: Entries of a stored config.
@@ -181,7 +179,7 @@ class DiT(ConfiguredModel):
         return config | {"prediction": renamed.get(prediction, prediction)}
 
     def init_weights(self) -> None:
-        """Initialise the weights as DiT does: Xavier, with zeros for every residual branch and the output."""
+        """Initialise the weights as in DiT: zeros for the output and every residual branch, Xavier elsewhere."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -196,7 +194,7 @@ class DiT(ConfiguredModel):
             nn.init.zeros_(layer.bias)
 
     def list_modulations(self) -> list[nn.Linear]:
-        """Return the layers that map the condition to modulations: one per block, then that of the output."""
+        """Return the layers that map the condition to modulations: one layer per block, then the output layer."""
         return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
 
     @property
@@ -205,7 +203,7 @@ class DiT(ConfiguredModel):
         return self.config.num_labels
 
     def condition(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> Float[Tensor, "batch d"]:
-        """Compute the condition that modulates every block: SiLU of timestep embedding plus label embedding.
+        """Compute the condition that modulates every block: SiLU(timestep embedding + label embedding).
 
         Args:
             timestep: Timesteps.
@@ -225,22 +223,23 @@ class DiT(ConfiguredModel):
             label: Class indices.
 
         Returns:
-            List of tensors: (b, 6 d) shifts, scales and gates of every block; (b, 2 d) shift and scale of the output;
-            (b, 2) factors of latent and network output in the noise.
+            List of tensors. For each block: (b, 6 d) shifts, scales and gates. For the output: (b, 2 d) shift and
+            scale. Last: (b, 2) factors of the latent and the network output; the noise is the sum of both products.
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]
 
     def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
-        """Return the weight of the squared noise error in training.
+        """Return the weight of the squared noise error in the training loss.
 
-        With this weight, the squared error of the network's own output (noise or v) counts once at every timestep.
+        With this weight, the squared error of the network output (noise or v) has weight 1 at every timestep.
 
         Args:
             timestep: Timesteps.
 
         Returns:
-            Weight per sample.
+
+            One weight per sample.
         """
         if self.config.prediction == "epsilon":
             return torch.ones(len(timestep), device=timestep.device)
@@ -263,21 +262,21 @@ class DiT(ConfiguredModel):
 
     @torch.no_grad()
     def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
-        """Compute the modulations of the given timesteps and labels once and return `forward` for them.
+        """Precompute the modulations for timesteps and labels, and return a faster `forward` for them.
 
-        The modulation layers hold a third of the weights. Without this method, each step would read these weights for
-        only one or two rows.
+        The modulation layers hold a third of the weights. Without precomputation, each step reads all these weights to
+        compute only one or two rows.
 
         Args:
-            timesteps: Timesteps that will be used.
-            labels: Class indices that will be used, including the null label if guidance needs it.
+            timesteps: All timesteps that the denoiser will receive.
+            labels: All class indices that the denoiser will receive, including the null label if guidance needs it.
 
         Returns:
             A denoiser. The denoiser raises IndexError for other timesteps or labels.
         """
         timestep = torch.as_tensor(sorted(set(timesteps)), device=self.positions.device)
         labels = sorted(set(labels))
-        # Compute each label separately, because the rounding of its rows must not depend on the other labels.
+        # Compute each label separately. In a batch, the rounding could depend on the other labels.
         rows = [torch.cat(self.modulations(timestep, torch.full_like(timestep, label)), dim=1) for label in labels]
         table, sizes = torch.cat(rows), [*(layer.out_features for layer in self.list_modulations()), 2]
         row_of = torch.full((int(timestep[-1]) + 1, labels[-1] + 1), len(table), device=timestep.device)
@@ -296,7 +295,7 @@ class DiT(ConfiguredModel):
 
         Args:
             latent: Noisy latents.
-            modulations: Output of `modulations`.
+            modulations: Output of the method `modulations`.
 
         Returns:
             Predicted noise.

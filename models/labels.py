@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from models.scene import DENSITIES
 
-# Names of the labels by kind of label. The index of a joint label is 3 * vegetation + vehicle.
+# Names of the labels for each kind of label. The index of a joint label is 3 * vegetation + vehicle.
 LABELS = {
     "vegetation": DENSITIES,
     "vehicle": DENSITIES,
@@ -26,7 +26,7 @@ def find_label_index(kind: str, name: str) -> int:
         Index of the class.
 
     Raises:
-        ValueError: The name is unknown; the message lists the names of this kind.
+        ValueError: The name is unknown. The message lists the valid names.
     """
     if name not in LABELS[kind]:
         raise ValueError(f"label {name!r} is unknown to a {kind} model, expected one of: {', '.join(LABELS[kind])}")
@@ -38,11 +38,11 @@ def compose_label(kind: str, vegetation: str | None, vehicle: str | None) -> str
 
     Args:
         kind: Kind of label, a key of `LABELS`.
-        vegetation: Density label of the vegetation, or None if it is unknown.
-        vehicle: Density label of the vehicles, or None if it is unknown.
+        vegetation: Density label of the vegetation; None: unknown.
+        vehicle: Density label of the vehicles; None: unknown.
 
     Returns:
-        Name of the label, or None if a density label that this kind needs is unknown.
+        Name of the label; None if this kind needs a density label that is None.
     """
     if kind == "joint":
         return None if vegetation is None or vehicle is None else f"{vegetation}-{vehicle}"
@@ -50,14 +50,14 @@ def compose_label(kind: str, vegetation: str | None, vehicle: str | None) -> str
 
 
 def split_label(kind: str, label: str) -> tuple[str | None, str | None]:
-    """Return the density labels of vegetation and vehicles that a label requests.
+    """Return the density labels of vegetation and vehicles that belong to a label.
 
     Args:
         kind: Kind of label, a key of `LABELS`.
         label: Name of the label.
 
     Returns:
-        Density label of the vegetation and of the vehicles; None where the label does not determine it.
+        Density label of the vegetation, then of the vehicles; None if the label does not specify this density.
     """
     if kind == "joint":
         vegetation, vehicle = label.split("-")

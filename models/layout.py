@@ -1,7 +1,7 @@
 """LayoutSpec defines the meaning of the values of a LayoutBatch (batch.py).
 
 pipelines/preprocess/ingest.py computes one LayoutSpec per dataset and writes it to dataset.json. Each checkpoint stores
-a copy of the LayoutSpec. A model therefore decodes its outputs to scenes without the dataset.
+a copy of the LayoutSpec. A model can therefore decode its outputs to scenes without the dataset.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from models.scene import CATEGORIES, GROUND_CLASSES, KITTI_GROUND_CLASSES, Grid
 
 FEATURES = 9  # 3 centre coordinates, 6 Cholesky parameters (paper, Sec. 3.1)
 
-# Paper, supplement Tab. "object categories": predicted count per category, N = 514.
+# Number of slots per category, N = 514 in total (paper, supplement Tab. "object categories").
 PAPER_SLOTS = (178, 159, 2, 18, 6, 5, 16, 77, 19, 17, 17)
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lower and upper bound of each entry, for the affine map to [0, 1].
+    """Lower and upper bound of each entry of a vector. Normalisation maps the interval between the bounds to [0, 1].
 
     Attributes:
         low: Lower bound of each entry.
-        high: Upper bound of each entry; it must exceed the lower bound.
+        high: Upper bound of each entry; must be greater than `low`.
     """
 
     low: tuple[float, ...]
@@ -34,13 +34,13 @@ class Bounds:
 
     def __post_init__(self) -> None:
         if len(self.low) != len(self.high) or any(not a < b for a, b in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"bounds need low < high entry by entry, got low={self.low} high={self.high}")
+            raise ValueError(f"each lower bound must be less than its upper bound, got low={self.low} high={self.high}")
 
     def normalise(self, value: np.ndarray) -> np.ndarray:
-        """Map values from their bounds to [0, 1] and clip them.
+        """Map values linearly from the interval between their bounds to [0, 1]; clip values outside the bounds.
 
         Args:
-            value: (..., k) values, one entry per bound.
+            value: (..., k) values in the units of the bounds.
 
         Returns:
             (..., k) normalised values in [0, 1].
@@ -49,7 +49,7 @@ class Bounds:
         return ((value - low) / (high - low)).clip(0, 1)
 
     def restore(self, value: np.ndarray) -> np.ndarray:
-        """Map normalised values back to their bounds.
+        """Map normalised values from [0, 1] back to the interval between their bounds.
 
         Args:
             value: (..., k) normalised values.
@@ -65,8 +65,8 @@ class Bounds:
 class LayoutSpec:
     """Meaning of a layout tensor: categories, slots, ground classes, grid and normalisation bounds.
 
-    The slots of a category are consecutive. Within a category, the nearest primitive comes first. Bounds come from the
-    training split.
+    The slots of a category are consecutive. Within a category, primitives are sorted by distance from the ego vehicle.
+    Bounds come from the training split.
 
     Attributes:
         categories: Names of the categories.
@@ -76,8 +76,8 @@ class LayoutSpec:
         center_bounds_m: Bounds of the centre x, y, z (metres, scene frame).
         cholesky_bounds: Bounds of the six Cholesky parameters (sqrt(metres)).
         height_bounds_m: Bounds of the ground height (metres, scene frame).
-        surface: Reference surface of the ground heights. "top" is the top of the slabs, 0.3 m above the true surface,
-            as in the authors' data. Any other value means that heights are those of the true surface.
+        surface: Reference surface of the ground heights. "top" is the top of the ground slabs in the authors' data, 0.3
+            m above the true surface. With any other value, heights are those of the true surface.
     """
 
     categories: tuple[str, ...] = CATEGORIES
@@ -98,16 +98,16 @@ class LayoutSpec:
 
     @property
     def num_slots(self) -> int:
-        """Number of slots of all categories."""
+        """Total number of slots over all categories."""
         return sum(self.slots)
 
     @property
     def slot_category(self) -> np.ndarray:
-        """(N,) index into `categories` of each slot."""
+        """(N,) category of each slot, as an index into `categories`."""
         return np.repeat(np.arange(len(self.slots)), self.slots)
 
     def with_resolution(self, pixels: int) -> LayoutSpec:
-        """Return this spec with a square pixel grid of another resolution over the same area.
+        """Return a copy of this spec whose square pixel grid has a different resolution over the same area.
 
         Args:
             pixels: Number of rows and of columns.
@@ -121,13 +121,14 @@ class LayoutSpec:
     def feature_unit(self, length_m: float) -> tuple[float, ...]:
         """Convert a length to normalised feature units.
 
-        Cholesky parameters are square roots of lengths, so the square root of `length_m` is used for them.
+        Cholesky parameters have the unit sqrt(metres), so the function uses sqrt(`length_m`) for them.
 
         Args:
             length_m: Length (metres).
 
         Returns:
-            Nine numbers: the length in normalised units of each centre coordinate and Cholesky parameter.
+            Nine numbers: the length in the normalised units of each of the 3 centre coordinates and 6 Cholesky
+            parameters.
         """
         return tuple(
             unit / (high - low)
@@ -136,7 +137,7 @@ class LayoutSpec:
         )
 
     def to_dict(self) -> dict:
-        """Return the spec as plain dictionaries, lists, strings and numbers, as JSON can store it."""
+        """Return the spec as a dictionary that JSON can store."""
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod
@@ -177,10 +178,10 @@ class LayoutSpec:
 
         Args:
             other: Spec to compare.
-            what: Owner of `other`, as the message names it.
+            what: Name of the owner of `other` for the error message.
 
         Raises:
-            ValueError: The specs differ; the message names the first field that differs.
+            ValueError: The specs differ. The message names the first different field.
         """
         if self == other:
             return

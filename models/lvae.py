@@ -1,7 +1,7 @@
 """The layout VAE (paper, Sec. 3.2 and supplement B.2).
 
-The layout VAE has a ground branch and an object branch. The latents of both branches are stacked along the channels of
-one joint latent.
+The layout VAE has a ground branch and an object branch. The latents of both branches are concatenated along the channel
+axis to one joint latent.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectDecoder, ObjectEncoder
 from models.vae.outputs import LayoutOutput, Posterior
 
-# Posteriors start narrow (sigma 0.14), so the latent dominates the noise from the first step. With the default
-# sigma 1, the loss after the same number of steps is 1.5 times as high (tests/unit/test_models.py: one batch, 300
-# steps).
+# Initial log-variance of the posterior (sigma 0.14). With this small sigma, the latent mean is larger than the noise
+# from the first step. With sigma 1, the loss after 300 steps on one batch is 1.5 times as high
+# (tests/unit/test_models.py).
 INITIAL_LOGVAR = -4.0
-SOLVED_LOGVAR = -8.0  # sigma 0.018, for a ground branch with a closed-form shortcut (models/vae/ground.py)
+SOLVED_LOGVAR = -8.0  # Sigma 0.018, for a ground branch with a shortcut (models/vae/ground.py).
 
 BRANCHES = ("both", "ground", "objects")
-OBJECT_DECODER = "object_decoder."  # Prefix of parameter names.
+OBJECT_DECODER = "object_decoder."  # Prefix of the names of its parameters.
 EMPTY_LOGIT = -6.0  # Occupancy logit of a model without a ground branch.
 
 
 def compute_clamped_logit(probability: Tensor) -> Tensor:
-    """Compute the logit of a probability that is first clamped to [0.01, 0.99].
+    """Clamp probabilities to [0.01, 0.99] and compute their logits.
 
     Args:
         probability: Probabilities, any shape.
@@ -49,14 +49,14 @@ class LayoutVAE(ConfiguredModel):
     """Encode layouts to latents (2 c, h, w) and decode latents to layouts; h = w = pixels / `ground.cell_px`.
 
     Args:
-        layout: LayoutSpec as a dict, with which a saved model decodes its outputs.
+        layout: LayoutSpec as a dictionary. It is saved with the model and is needed to decode outputs.
         latent_channels: Number c of latent channels per branch.
         ground: Options of the ground branch.
         objects: Options of the object branch.
         shortcut: See `LayoutVAEConfig`.
         split_latent: See `LayoutVAEConfig`.
-        branches: "both", "ground" or "objects". With one branch, the latent has c channels and the other part of a
-            decoded layout is empty.
+        branches: "both", "ground" or "objects". A model with only one branch has c latent channels; the other part of
+            its decoded layouts is empty.
 
     Raises:
         ValueError: An option is unknown, or the grid does not divide into latent cells.
@@ -77,13 +77,15 @@ class LayoutVAE(ConfiguredModel):
         if branches not in BRANCHES:
             raise ValueError(f"LayoutVAE: branches is {branches!r}, expected one of {BRANCHES}")
         if objects.decoder not in ("detr", "cells"):
-            raise ValueError(f"LayoutVAE: decoder is {objects.decoder!r}, expected 'detr' (the paper's) or 'cells'")
+            raise ValueError(f"LayoutVAE: decoder is {objects.decoder!r}, expected 'detr' (as in the paper) or 'cells'")
         spec = LayoutSpec.from_dict(layout)
         if spec.grid.rows != spec.grid.cols or spec.grid.rows % ground.cell_px:
-            raise ValueError(f"LayoutVAE needs a square grid divisible by {ground.cell_px}, got {spec.grid}")
+            raise ValueError(
+                f"LayoutVAE: the side of the square grid must be a multiple of {ground.cell_px} px, got {spec.grid}"
+            )
         size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
-        # Proposals of a cell decoder are relative to their cell, so losses measure distances in cells. DETR queries
-        # search the whole scene, so losses measure distances in normalised units.
+        # Units of distances in losses. The cell decoder predicts centres relative to a cell, so the unit is one cell.
+        # DETR predicts centres relative to the whole scene, so the unit is the normalised unit.
         self.feature_unit = (
             spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
             if objects.decoder == "cells"
@@ -94,7 +96,7 @@ class LayoutVAE(ConfiguredModel):
             size,
             size,
         )
-        seen = latent_channels if split_latent else self.latent_shape[0]  # number of channels that a decoder reads
+        seen = latent_channels if split_latent else self.latent_shape[0]  # Number of channels that each decoder reads.
         self.ground_encoder = self.ground_decoder = self.object_encoder = self.object_decoder = None
         if branches != "objects":
             self.ground_encoder = GroundEncoder(num_classes, latent_channels, ground, shortcut)
@@ -116,7 +118,7 @@ class LayoutVAE(ConfiguredModel):
         """Convert the options of the branches to dataclasses.
 
         Args:
-            config: Config of this version, or a flat one of a version before 0.2.
+            config: Current config, or a flat config written by a version before 0.2.
 
         Returns:
             Keyword arguments of the constructor.
@@ -125,10 +127,10 @@ class LayoutVAE(ConfiguredModel):
 
     @torch.no_grad()
     def init_from_data(self, batch: LayoutBatch) -> None:
-        """Initialise every output to its mean over a sample of training layouts.
+        """Initialise the outputs to their means over a sample of training layouts.
 
-        Adam moves a bias by about the learning rate per step. From zero, Adam would need thousands of steps to learn
-        that poles are thin and that most pixels are not road. The initialisation of shortcuts is described in
+        Adam moves a bias by about the learning rate per step. Starting from zero, it would take thousands of steps to
+        learn that poles are thin and that most pixels are not road. For the initialisation of the shortcuts, see
         models/vae/ground.py.
 
         Args:
@@ -144,10 +146,10 @@ class LayoutVAE(ConfiguredModel):
         self.object_decoder.init_from_data(compute_clamped_logit(features), count)
 
     def freeze_all_but_object_decoder(self, state: dict[str, Tensor]) -> None:
-        """Load the weights of another model with the same encoders, and train only the object decoder.
+        """Load the weights of another model, and freeze all parameters except those of the object decoder.
 
-        This model and the other one then encode a scene to the same latent. A diffusion transformer that was trained on
-        the latents of the other model remains valid.
+        The other model must have the same encoders. Both models then encode a scene to the same latent. A diffusion
+        transformer that was trained on the latents of the other model can therefore be used with this model.
 
         Args:
             state: State dict of the other model; its object decoder is ignored.
@@ -159,7 +161,7 @@ class LayoutVAE(ConfiguredModel):
             parameter.requires_grad_(name.startswith(OBJECT_DECODER))
 
     def learning_rate_factors(self) -> dict[str, float]:
-        """Return factors of the learning rate by prefix of the parameter name.
+        """Return factors of the learning rate, keyed by prefix of the parameter name.
 
         Parameters that are initialised in closed form have factors below 1.
         """
@@ -179,7 +181,7 @@ class LayoutVAE(ConfiguredModel):
             batch: Layouts.
 
         Returns:
-            Posterior with the channels [ground; objects].
+            Posterior; its channels are the ground channels, then the object channels.
         """
         moments = []
         if self.ground_encoder:
@@ -192,12 +194,14 @@ class LayoutVAE(ConfiguredModel):
     def decode(self, latent: Float[Tensor, "batch c2 h w"]) -> LayoutOutput:
         """Decode latents to layouts.
 
-        With `split_latent`, each decoder reads its own half of the channels; otherwise both read all channels.
+        With `split_latent`, each decoder reads only its half of the channels. Otherwise, both decoders read all
+        channels.
 
         Args:
             latent: Joint latents.
 
         Returns:
+
             Output of both decoders.
         """
         split = self.config.split_latent and self.config.branches == "both"
@@ -213,7 +217,7 @@ class LayoutVAE(ConfiguredModel):
             latent: Channels that the ground decoder reads.
 
         Returns:
-            Normalised heights and occupancy logits. Without a ground branch, all pixels are unoccupied.
+            Normalised heights and occupancy logits. If the model has no ground branch, all pixels are unoccupied.
         """
         if self.ground_decoder:
             return self.ground_decoder(latent).chunk(2, dim=1)
@@ -228,8 +232,8 @@ class LayoutVAE(ConfiguredModel):
             latent: Channels that the object decoder reads.
 
         Returns:
-            Features, existence logits, proposals per category and weights of the matching cost. Without an object
-            branch, there are no proposals.
+            Features, existence logits, number of proposals per category, and weights of the matching cost. If the model
+            has no object branch, there are no proposals.
         """
         if self.object_decoder:
             return *self.object_decoder(latent), self.object_decoder.proposals, self.object_decoder.match_weights
@@ -244,15 +248,15 @@ class LayoutVAE(ConfiguredModel):
     ) -> tuple[LayoutOutput, Posterior]:
         """Sample latents from the posterior and decode them.
 
-        Differs from the paper, which adds no corruption to the latent. Zheng et al. (RAE, 2025) train decoders with
-        such noise. Here, encoders are trained together with the decoders, and each scene has its own noise level
+        The paper adds no corruption to the latent. Zheng et al. (RAE, 2025) also train decoders with noisy latents.
+        Here, encoders are trained together with the decoders, and each scene has its own noise level
         (`models.training.sample_corruption`).
 
         Args:
             batch: Layouts.
             noise: Standard normal noise of the reparameterisation.
-            corruption: Additional noise on the latent, in units of each channel's standard deviation over the cells of
-                a scene (default: none). The noise makes decoders tolerate errors in sampled latents.
+            corruption: Noise that is added to the latent; None: no noise. The unit is the standard deviation of each
+                channel over the cells of a scene. This noise makes decoders tolerate errors in sampled latents.
 
         Returns:
             Output of the decoders, and the posterior.

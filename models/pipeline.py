@@ -104,7 +104,7 @@ class PrITTIPipeline:
             DDPM).
         noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`). The
             paper does not scale the noise.
-        existence_threshold: Primitives with a higher existence probability are kept; 0.3 in the paper.
+        existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
 
     Raises:
         ValueError: The DiT was trained on layouts of another LayoutSpec.
@@ -134,7 +134,7 @@ class PrITTIPipeline:
         Args:
             directory: Directory that `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town"
                 (models/pretrained.py).
-            torch_dtype: Data type of the parameters (default: as stored).
+            torch_dtype: Data type of the parameters; None: the stored data type.
 
         Returns:
             The pipeline in evaluation mode on the CPU.
@@ -316,8 +316,9 @@ class PrITTIPipeline:
 
         Args:
             latents: Latents.
-            identities: Scenes that provide ids and labels.
-            existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
+            identities: Scenes whose ids and labels are copied to the results.
+            existence_threshold: Only primitives with a higher existence probability are kept; None: the threshold of
+                the pipeline.
 
         Returns:
             One scene per latent.
@@ -443,10 +444,10 @@ class PrITTIPipeline:
             labels: Label of each scene.
             seed: One seed for all scenes, or one per scene.
             indices: Index of each scene within the run.
-            num_inference_steps: Number of denoising steps; 250 in the paper.
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            num_inference_steps: Number of denoising steps; the paper uses 250.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
-            noise_scaling: Divisor of the predicted noise (default: the pipeline's).
+            noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
 
         Returns:
             Latents.
@@ -494,14 +495,15 @@ class PrITTIPipeline:
             labels: Label of each scene, such as "low".
             seed: Seed of the run.
             indices: Index of each scene within the run (default: 0, 1, ...).
-            num_inference_steps: Number of denoising steps; 250 in the paper.
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            num_inference_steps: Number of denoising steps; the paper uses 250.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             run: Run name, which is part of the scene ids.
             generator: Generator that draws the seed, or one generator per scene. A generator replaces `seed`.
             callback_on_step_end: Function that is called as f(pipeline, step, timestep, {"latents": ...}) after each
                 step. The function returns such a dict with the latents for the next step.
-            noise_scaling: Divisor of the predicted noise (default: the pipeline's).
-            existence_threshold: Primitives with a higher existence probability are kept (default: the pipeline's).
+            noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
+            existence_threshold: Only primitives with a higher existence probability are kept; None: the threshold of
+                the pipeline.
 
         Returns:
             The scenes in the order of the labels.
@@ -532,17 +534,17 @@ class PrITTIPipeline:
     ) -> Float[Tensor, "b c h w"]:
         """Sample latents with RePaint (paper, Sec. 3.3).
 
-        The latents equal the condition bit for bit where its mask is 0.
+        The latents equal the condition exactly where its mask is 0.
 
         Args:
             condition: Known latents and masks.
             labels: Label of each scene.
             seed: One seed for all scenes, or one per scene.
-            indices: Key of each scene; it keys the noise.
+            indices: Key of each scene; the noise depends on the seed and this key.
             repaint: Options of RePaint.
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
-            purpose: Purpose of the noise (models/sampling/diffusion.py).
+            purpose: Purpose of the noise: GENERATE, OUTPAINT or INPAINT (models/sampling/diffusion.py).
 
         Returns:
             Latents.
@@ -590,13 +592,13 @@ class PrITTIPipeline:
             contents: "objects" regenerates objects on the known ground, "ground" regenerates the ground under the known
                 objects, and "both" regenerates both.
             seed: Seed of the run.
-            indices: Key of each scene within the run (default: 0, 1, ...).
-            repaint: Options of RePaint (default: the paper's).
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
-            generator: As for `generate`.
-            callback_on_step_end: As for `generate`.
-            composite: Take everything outside the regions from the input. If False, everything outside is the decoders'
-                reconstruction.
+            indices: Key of each scene; the noise depends on it (default: 0, 1, ...).
+            repaint: Options of RePaint; None: the options of the paper.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+            generator: See `generate`.
+            callback_on_step_end: See `generate`.
+            composite: If True, copy everything outside the regions from the input. If False, everything outside is the
+                decoders' reconstruction.
 
         Returns:
             The regenerated scenes.
@@ -650,18 +652,19 @@ class PrITTIPipeline:
 
         Args:
             scene: Scene on the model's grid. With `side`, the scene may have any size of at least one block.
-            label: Label of all blocks, or label by block index (steps ahead, steps left).
+            label: Label of all blocks, or label by block index (steps ahead, steps to the left).
             seed: Seed of the run.
             index: Index of the scene within the run.
-            overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
+            overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent
+                cells.
             mode: "copy" copies the shifted latent of the neighbours, as in the paper. "reencode" decodes the known
                 part, transforms it into the block's frame and height, and encodes it again. Object latents contain
                 absolute centres, which a copy does not change.
-            num_blocks: Number of blocks ahead, behind, left and right. One block on every side is the paper's
-                outpainting.
-            repaint: Options of RePaint (default: the paper's).
-            guidance_scale: Scale of classifier-free guidance; 1 is none.
-            callback_on_step_end: As for `generate`.
+            num_blocks: Number of blocks to add ahead, behind, to the left and to the right. One block on every side is
+                the paper's outpainting.
+            repaint: Options of RePaint; None: the options of the paper.
+            guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
+            callback_on_step_end: See `generate`.
             side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"). With
                 `side`, `num_blocks` is ignored.
 

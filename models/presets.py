@@ -28,9 +28,9 @@ class LVAEPreset:
         learning_rate: Initial learning rate.
         final_learning_rate: Learning rate of the last step.
         weight_decay: Weight decay of AdamW.
-        warmup_steps: Number of steps in which the learning rate rises linearly.
-        grad_clip: Largest gradient norm (None: no clipping).
-        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        warmup_steps: Number of initial steps during which the learning rate rises linearly.
+        grad_clip: Largest gradient norm; None: gradients are not clipped.
+        ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
         kl_weight: Weight of the KL term, which is summed over the latent.
         latent_noise: Standard deviation of noise on the training latents. The noise makes decoders tolerate errors in
             sampled latents. The paper adds no noise.
@@ -115,8 +115,8 @@ class DiTPreset:
             not normalise latents.
         learning_rate: Learning rate.
         weight_decay: Weight decay of AdamW.
-        grad_clip: Largest gradient norm (None: no clipping).
-        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        grad_clip: Largest gradient norm; None: gradients are not clipped.
+        ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
         label_dropout: Probability of training a sample with the null label. The paper does not specify this
             probability; DiT uses 0.1.
     """

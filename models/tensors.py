@@ -28,7 +28,7 @@ def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: G
         Height (G, H, W) in metres and mask (G, H, W) of these classes.
 
     Raises:
-        ValueError: The grids cover different areas, or the ratio of their resolutions is not a whole number.
+        ValueError: The grids cover different areas, or neither resolution is a whole multiple of the other.
     """
     return resample_ground(*select_ground_classes(scene, ground_classes), scene.grid, grid)
 
@@ -70,7 +70,7 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
         Heights and masks on `grid`, with the data types of the inputs.
 
     Raises:
-        ValueError: The grids cover different areas, or the ratio of their resolutions is not a whole number.
+        ValueError: The grids cover different areas, or neither resolution is a whole multiple of the other.
     """
     covered, wanted = ((g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid))
     if not np.allclose(covered, wanted):
@@ -111,7 +111,7 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
     Args:
         category: (n,) categories.
         center_m: (n, 3) centres (metres, scene frame).
-        spec: Defines the slots.
+        spec: LayoutSpec that defines the slots.
 
     Returns:
         Slots (m,) and the indices (m,) of the primitives in them.
@@ -135,14 +135,15 @@ def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
     Args:
         scene: Scene of any resolution over the area of `spec.grid`.
-        spec: Defines the encoding.
+        spec: LayoutSpec that defines the encoding.
 
     Returns:
         height (G, H, W) uint16, where 65535 is the upper bound; occupied (G, H, W) bool; features (N, 9) float32; real
         (N,) bool.
 
     Raises:
-        ValueError: The scene covers another area, or the ratio of the resolutions is not a whole number.
+        ValueError: The scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
+            other.
     """
     parameters = compute_cholesky_parameters(scene.rotation, scene.size_m)
     return encode_ground(scene, spec) | encode_primitives(scene.category, scene.center_m, parameters, spec)
@@ -153,13 +154,14 @@ def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
 
     Args:
         scene: Scene of any resolution over the area of `spec.grid`.
-        spec: Defines the encoding.
+        spec: LayoutSpec that defines the encoding.
 
     Returns:
         The entries `height` and `occupied` of `encode_layout`.
 
     Raises:
-        ValueError: The scene covers another area, or the ratio of the resolutions is not a whole number.
+        ValueError: The scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
+            other.
     """
     height_m, occupied = select_ground_classes(scene, spec.ground_classes)
     height = np.zeros(height_m.shape, np.uint16)
@@ -192,7 +194,7 @@ def encode_primitives(
         category: (n,) categories.
         center_m: (n, 3) centres (metres, scene frame).
         parameters: (n, 6) Cholesky parameters (sqrt(metres)).
-        spec: Defines the slots and the bounds.
+        spec: LayoutSpec that defines the slots and the bounds.
 
     Returns:
         The entries `features` and `real` of `encode_layout`.
@@ -211,13 +213,14 @@ def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
 
     Args:
         scenes: Scenes over the area of `spec.grid`.
-        spec: Defines the encoding.
+        spec: LayoutSpec that defines the encoding.
 
     Returns:
         The batch.
 
     Raises:
-        ValueError: A scene covers another area, or the ratio of the resolutions is not a whole number.
+        ValueError: A scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
+            other.
     """
     layouts = [encode_layout(scene, spec) for scene in scenes]
     stacked = {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
@@ -252,7 +255,7 @@ def decode_layout(
 
     Args:
         layout: Output of a decoder.
-        spec: Defines the encoding.
+        spec: LayoutSpec that defines the encoding.
         identity: Scene that provides ids, pose and labels.
         threshold: Primitives with a higher existence probability are kept.
 

@@ -39,12 +39,12 @@ class OptimizerConfig:
         steps: Number of training steps.
         learning_rate: Initial learning rate.
         weight_decay: Weight decay.
-        final_learning_rate: Learning rate of the last step (None: constant learning rate).
-        warmup_steps: Number of steps in which the learning rate rises linearly.
+        final_learning_rate: Learning rate of the last step; None: the learning rate is constant.
+        warmup_steps: Number of initial steps during which the learning rate rises linearly.
         betas: beta1 and beta2 of AdamW.
         cycle_momentum: beta1 of the first and of the last step; it follows the cosine (None: constant beta1).
-        grad_clip: Largest gradient norm (None: no clipping).
-        ema_decay: Decay of the exponential moving average of the weights (None: no average).
+        grad_clip: Largest gradient norm; None: gradients are not clipped.
+        ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
         seed: Seed of all random numbers.
     """
 
@@ -176,7 +176,7 @@ def make_layout_loss(
         spec: Layout of the scenes.
         latent_shape: Shape (c, h, w) of a latent.
         kl_weight: Weight of the KL loss.
-        latent_noise: Scale of the noise on the training latents (`sample_corruption`); 0 is none.
+        latent_noise: Scale of the noise that is added to training latents (`sample_corruption`); 0: no noise.
 
     Returns:
         A function that maps compact layouts (`tensors.encode_layout`) to the parts of the objective.
@@ -274,7 +274,7 @@ class Trainer:
         device: Device of the training.
         wrapped: Module that is called instead of `model`, such as `model` under DistributedDataParallel (default:
             `model`).
-        execution: Options of the execution (default: those of `ExecutionConfig`).
+        execution: Options of the execution; None: the defaults of `ExecutionConfig`.
     """
 
     def __init__(
@@ -470,9 +470,9 @@ def make_lvae_trainer(
         settings: Options of the optimizer.
         kl_weight: Weight of the KL loss.
         device: Device of the training.
-        wrap: Function that wraps the model, for instance with DistributedDataParallel (default: none).
-        execution: Options of the execution (default: those of `ExecutionConfig`).
-        latent_noise: Scale of the noise on the training latents (`sample_corruption`); 0 is none.
+        wrap: Function that wraps the model, for example with DistributedDataParallel; None: no wrapper.
+        execution: Options of the execution; None: the defaults of `ExecutionConfig`.
+        latent_noise: Scale of the noise that is added to training latents (`sample_corruption`); 0: no noise.
 
     Returns:
         The trainer.
@@ -499,8 +499,8 @@ def make_dit_trainer(
         settings: Options of the optimizer.
         label_dropout: Probability of training a sample with the null label.
         device: Device of the training.
-        wrap: Function that wraps the model, for instance with DistributedDataParallel (default: none).
-        execution: Options of the execution (default: those of `ExecutionConfig`).
+        wrap: Function that wraps the model, for example with DistributedDataParallel; None: no wrapper.
+        execution: Options of the execution; None: the defaults of `ExecutionConfig`.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
 
     Returns:

@@ -11,28 +11,29 @@ from scipy.optimize import linear_sum_assignment
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 
-# NMS threshold: two objects of one category with a higher IoU3D are duplicates. In the town's 1,000 held-out scenes,
-# the IoU3D of two vehicles is at most 0.04 and that of two buildings at most 0.1. In these scenes, the
-# thresholds would remove 4.6 % of fences, 3.4 % of signs, 2.2 % of poles and 0.8 % of other objects.
+# NMS threshold per category: two objects of the same category are duplicates if their IoU3D is higher. In the town's
+# 1,000 held-out scenes, the IoU3D of two vehicles is at most 0.04 and that of two buildings at most 0.1. The thresholds
+# would remove 4.6 % of the fences in these scenes, 3.4 % of the signs, 2.2 % of the poles and 0.8 % of the other
+# objects.
 DUPLICATE_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
-DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # tree crowns overlap; used at borders of known regions
+DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # Tree crowns overlap. Used only at borders of known regions.
 DUPLICATE_IOU3D[list(VEHICLES)] = 0.05
-REGENERATED_IOU3D = 0.05  # a known object and its slightly displaced copy exceed this IoU3D
+REGENERATED_IOU3D = 0.05  # A known object and its displaced copy exceed this IoU3D.
 
 
 def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
     """Find generated objects that are copies of known objects.
 
-    Each known object is matched to at most one generated object of its category. The matching maximises the sum of the
-    IoU3D over pairs above REGENERATED_IOU3D. In addition, every object that exceeds DUPLICATE_IOU3D with a known object
-    of its category is a copy.
+    Each known object is matched to at most one generated object of its category. The matching maximises the sum of
+    IoU3D over all pairs with an IoU3D above REGENERATED_IOU3D. In addition, an object is a copy if its IoU3D with a
+    known object of the same category exceeds DUPLICATE_IOU3D.
 
     Args:
-        generated: All decoded objects, on both sides of the border.
-        known: Objects of the known region.
+        generated: Scene with all decoded objects, on both sides of the border.
+        known: Scene with the objects of the known region.
 
     Returns:
-        (n,) bool per generated object.
+        (n,) bool; True for each generated object that is a copy.
     """
     if not len(generated) or not len(known):
         return np.zeros(len(generated), bool)
@@ -48,14 +49,14 @@ def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:
 def find_lower_confidence_duplicates(scene: Scene) -> np.ndarray:
     """Find the solid objects that non-maximum suppression removes.
 
-    Of two duplicates (DUPLICATE_IOU3D per category), the object with the higher existence probability is kept.
-    Vegetation is never a duplicate, because tree crowns overlap in reality.
+    Two objects are duplicates if their IoU3D exceeds DUPLICATE_IOU3D of their category. The object with the higher
+    existence probability is kept. Vegetation is never a duplicate, because tree crowns overlap in reality.
 
     Args:
         scene: Decoded scene.
 
     Returns:
-        (n,) bool per object.
+        (n,) bool; True for each object to remove.
     """
     solid = np.flatnonzero(~np.isin(scene.category, VEGETATION))
     order = solid[np.argsort(-scene.existence[solid], kind="stable")]  # highest confidence first

@@ -1,4 +1,4 @@
-"""Scenes larger than one block: extend them to one side, or regenerate a region of them (paper, Sec. 3.3)."""
+"""Extend scenes that are larger than one block to one side, or regenerate a region of them (paper, Sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
 
 
 def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterator[Grid]:
-    """Yield the windows of block size along one side of a grid.
+    """Yield windows of the size of one block along one side of a grid.
 
     Args:
         grid: Grid of the scene.
         side: "ahead", "behind", "left" or "right".
         block: Grid of one block.
-        step_px: Distance of neighbouring windows in pixels. The last window ends at the border of the grid.
+        step_px: Distance between neighbouring windows in pixels; the last window ends at the border of the grid.
 
     Yields:
-        Grids of block size.
+        Grids of the size of one block.
     """
     along = grid.cols if side in ("ahead", "behind") else grid.rows
     size = block.cols if side in ("ahead", "behind") else block.rows
@@ -65,18 +65,19 @@ def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterat
 
 
 def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> list[Grid]:
-    """Return windows of block size that together cover all pixels of a region.
+    """Return windows of the size of one block that together cover a region.
 
-    If the region fits into one block, there is one centred window. Otherwise, windows overlap by half a block.
+    If the region fits into one block, the only window is centred on the region. Otherwise, windows overlap by half a
+    block.
 
     Args:
         grid: Grid of the scene.
-        region: (rows, cols) bool, not empty.
+        region: (rows, cols) bool with at least one True pixel.
         block: Grid of one block.
-        cell_px: Side of a latent cell in pixels; windows are aligned to whole cells.
+        cell_px: Side of a latent cell in pixels. Windows are aligned to whole cells.
 
     Returns:
-        Grids of block size.
+        Grids of the size of one block.
     """
 
     def starts(found: np.ndarray, along: int, size: int) -> list[int]:
@@ -98,15 +99,15 @@ def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> li
 def to_block_frame(
     canvas: Scene, window: Grid, block: Grid, level_m: float
 ) -> tuple[Scene, tuple[float, float, float]]:
-    """Crop a window of a scene and transform it into the model's frame.
+    """Crop a window of a scene and transform the crop into the frame of the model.
 
-    The z translation moves the ground under the origin to height `level_m`.
+    The translation along z moves the ground at the origin to height `level_m`.
 
     Args:
         canvas: Scene.
         window: Grid of the window in the frame of `canvas`.
         block: Grid of one block in the model's frame.
-        level_m: Ground height under the origin of the model's frame (metres).
+        level_m: Ground height at the origin of the model's frame (metres).
 
     Returns:
         The cropped scene and the translation (x, y, z) back to the frame of `canvas`, in metres.
@@ -125,7 +126,8 @@ def require_blocks(model: SceneGenerator, scene: Scene) -> None:
         scene: Scene.
 
     Raises:
-        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from the model's.
+        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from those of the
+            model.
     """
     spec, block = model.spec, model.spec.grid
     if scene.grid.resolution_m != block.resolution_m or scene.ground_classes != spec.ground_classes:
@@ -137,19 +139,20 @@ def require_blocks(model: SceneGenerator, scene: Scene) -> None:
 
 
 def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> list[tuple[Grid, np.ndarray]]:
-    """Split a region into blocks that are regenerated one after the other.
+    """Split a region into blocks, which are then regenerated one after another.
 
     Args:
         model: Model.
         scene: Scene.
-        region: (rows, cols) bool, True = regenerate.
+        region: (rows, cols) bool; True marks the pixels to regenerate.
 
     Returns:
-        Window of each block and the mask (rows, cols) of the pixels that it regenerates. The masks consist of whole
-        cells and are disjoint.
+        One pair per block: its window, and the mask (rows, cols) of the pixels to regenerate. The masks are disjoint
+        and consist of whole cells.
 
     Raises:
-        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from the model's.
+        ValueError: The scene is smaller than a block, or its resolution or ground classes differ from those of the
+            model.
     """
     require_blocks(model, scene)
     block, size = model.spec.grid, model.latent_shape[-1]
@@ -164,13 +167,13 @@ def split_region(model: SceneGenerator, scene: Scene, region: np.ndarray) -> lis
 
 @dataclass(frozen=True)
 class InpaintStep:
-    """One regenerated block of a scene in several variants.
+    """Several variants of one regenerated block of a scene.
 
     Attributes:
-        known: Input scene of the block per variant.
-        generated: Decoded scene of the block per variant, before compositing.
-        region: (rows, cols) bool, the regenerated pixels of the block, in whole cells.
-        canvases: The whole scene per variant, composited with the block.
+        known: Input of the block, one scene per variant.
+        generated: Decoded block before compositing, one scene per variant.
+        region: (rows, cols) bool; True marks the regenerated pixels of the block. The region consists of whole cells.
+        canvases: The whole scene after compositing the block, one scene per variant.
     """
 
     known: list[Scene]
@@ -191,25 +194,25 @@ def inpaint_blocks(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Iterator[InpaintStep]:
-    """Regenerate a region of a scene of any size, block by block, in one variant per index.
+    """Regenerate a region of a large scene block by block, with one variant per index.
 
-    The result equals `PrITTIPipeline.inpaint` for a scene on the model's grid. The region grows to whole cells. All
-    other pixels and objects are kept bit for bit.
+    For a scene on the model's grid, the result equals that of `PrITTIPipeline.inpaint`. The region is enlarged to whole
+    cells. All other pixels and objects remain unchanged.
 
     Args:
         model: Model.
         scene: Scene, at least as large as one block.
-        region: (rows, cols) bool, True = regenerate.
+        region: (rows, cols) bool; True marks the pixels to regenerate.
         label: Label of the scene.
-        contents: What to regenerate, see `PrITTIPipeline.inpaint`.
+        contents: Part of the scene to regenerate; see `PrITTIPipeline.inpaint`.
         seed: Seed of the noise.
-        indices: Index of each variant; it keys the noise.
-        repaint: Options of RePaint (default: the paper's).
-        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        indices: Index of each variant; the noise depends on the seed and this index.
+        repaint: Options of RePaint; None: the options of the paper.
+        guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
     Yields:
-        One step per block. The canvases of the last step are the result.
+        One step per block. The last step contains the finished scenes in `canvases`.
 
     Raises:
         ValueError: The region is empty, or the scene does not fit the model (`require_blocks`).
@@ -252,10 +255,10 @@ def extend_scene(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> Scene:
-    """Extend a scene by (1 - overlap) of a block to one side (see `PrITTIPipeline.outpaint`).
+    """Extend a scene on one side by (1 - overlap) of a block (see `PrITTIPipeline.outpaint`).
 
-    Each new block is conditioned on the known content inside it. This content is encoded in the block's frame and at
-    the block's ground height.
+    Each new block is conditioned on the part of the scene that it overlaps. This part is transformed to the frame and
+    the ground height of the block before it is encoded.
 
     Args:
         model: Model.
@@ -263,9 +266,9 @@ def extend_scene(
         side: "ahead", "behind", "left" or "right".
         label: Label of all blocks.
         seed: Seed of the noise.
-        overlap: Fraction of a block that overlaps the scene, a whole number of latent cells.
-        repaint: Options of RePaint (default: the paper's).
-        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        overlap: Fraction of a block that overlaps the scene; it must correspond to a whole number of latent cells.
+        repaint: Options of RePaint; None: the options of the paper.
+        guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
     Returns:

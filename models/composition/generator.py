@@ -1,4 +1,4 @@
-"""Interface of a pipeline that composition uses; `models.pipeline.PrITTIPipeline` implements it."""
+"""Interface between the composition functions and a pipeline, implemented by `models.pipeline.PrITTIPipeline`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ StepCallback = Callable[[Any, int, int, dict], dict]
 
 @runtime_checkable
 class SceneGenerator(Protocol):
-    """Encode, decode and inpaint scenes of one size."""
+    """Encode, decode and inpaint scenes of a fixed size."""
 
     @property
     def spec(self) -> LayoutSpec:
@@ -56,7 +56,7 @@ class SceneGenerator(Protocol):
         ...
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
-        """Return an empty Scene with the id of a generated scene.
+        """Return an empty Scene that has the id of the generated scene.
 
         Args:
             run: Run name.
@@ -91,7 +91,7 @@ class SceneGenerator(Protocol):
         callback_on_step_end: StepCallback | None = None,
         purpose: int = ...,
     ) -> Tensor:
-        """Sample latents that equal the condition where its mask is 0.
+        """Sample latents that equal the condition wherever its mask is 0.
 
         Args:
             condition: Known latents and masks.

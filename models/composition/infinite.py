@@ -21,19 +21,19 @@ from models.scene import Grid, Scene
 
 
 class InfiniteScene:
-    """An unbounded scene of blocks in four ranks (`outpaint.rank_four_colors`).
+    """An unbounded scene of blocks with four ranks (`outpaint.rank_four_colors`).
 
     Each block depends on at most eight neighbours and on block (0, 0). Block (0, 0) sets the ground height. Generated
     blocks are kept in memory until `drop_block` is called.
 
     Args:
         model: A PrITTIPipeline.
-        label: Label of all blocks, or a function that returns the label of a block from its index.
+        label: One label for all blocks, or a function that returns the label for a block index.
         seed: Seed of the scene.
-        overlap: Fraction of a block that overlaps its neighbour, below 0.5.
-        mode: "copy" or "reencode", see `PrITTIPipeline.outpaint`.
-        repaint: Options of RePaint (default: the paper's).
-        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5.
+        mode: "copy" or "reencode"; see `PrITTIPipeline.outpaint`.
+        repaint: Options of RePaint; None: the options of the paper.
+        guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
 
     Raises:
         ValueError: The label is unknown to the model, or the overlap is 0.5 or more.
@@ -60,7 +60,7 @@ class InfiniteScene:
         """Return the label of a block.
 
         Args:
-            index: Index of the block (steps ahead, steps left).
+            index: Index of the block (steps ahead, steps to the left).
 
         Returns:
             The label.
@@ -68,10 +68,10 @@ class InfiniteScene:
         return self.label if isinstance(self.label, str) else self.label(index)
 
     def get_block(self, index: BlockIndex) -> SceneBlock:
-        """Return a block; generate it and its predecessors if they do not exist.
+        """Return a block. Generate the block and its predecessors first if they do not exist.
 
         Args:
-            index: Index of the block (steps ahead, steps left).
+            index: Index of the block (steps ahead, steps to the left).
 
         Returns:
             The block.
@@ -82,7 +82,8 @@ class InfiniteScene:
                 self.composer.level_m = find_ground_height(self.get_block((0, 0)).scene, 0.0, 0.0)
             label = self.label_of(index)
             like = self.model.new_identity("city", self.seed, 0, label)
-            # Generate one block at a time: a batch rounds differently, so the scene would depend on the requests.
+            # Generate one block at a time. Rounding differs between batch sizes, so batches would make the scene depend
+            # on the requests.
             self.blocks |= generate_blocks(
                 self.model, self.composer, [index], known, like, {index: label}, self.seed, **self.options
             )
@@ -92,14 +93,14 @@ class InfiniteScene:
         """Free the memory of a block. A later request regenerates the same block.
 
         Args:
-            index: Index of the block (steps ahead, steps left).
+            index: Index of the block (steps ahead, steps to the left).
         """
         self.blocks.pop(index, None)
 
     def get_scene(self, ahead_m: float, behind_m: float, left_m: float, right_m: float) -> Scene:
         """Return one Scene that covers a rectangle around the origin.
 
-        The rectangle grows to whole pixels.
+        The rectangle is enlarged to whole pixels.
 
         Args:
             ahead_m: Extent ahead of the origin (metres).
@@ -134,7 +135,7 @@ class InfiniteScene:
             Indices of the blocks.
         """
         block, step_m = self.model.spec.grid, self.composer.step_m
-        # Block i covers x from block.back_m + i step_m to block.front_m + i step_m.
+        # Along x, block i extends from block.back_m + i step_m to block.front_m + i step_m.
         ahead = range(int((grid.back_m - block.front_m) // step_m), int((grid.front_m - block.back_m) // step_m) + 2)
         left = range(int((grid.right_m - block.left_m) // step_m), int((grid.left_m - block.right_m) // step_m) + 2)
         return [

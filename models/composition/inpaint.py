@@ -1,7 +1,7 @@
 """Inpainting: select regions, and combine known and generated parts of scenes (paper, Sec. 3.3).
 
-A region is a mask (rows, cols) over the pixels of a scene, where True means regenerate. The operators |, & and ~
-combine regions.
+A region is a boolean mask (rows, cols) over the pixels of a scene; True marks the pixels to regenerate. The operators
+|, & and ~ combine regions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from models.composition.deduplicate import find_regenerated_objects
 from models.composition.seam_blending import blend_ground
 from models.scene import Grid, Scene, concatenate_primitives, make_yaw_rotation, merge_scenes
 
-Contents = Literal["both", "ground", "objects"]  # what to regenerate inside a region
+Contents = Literal["both", "ground", "objects"]  # Part of the scene to regenerate inside a region.
 
 
 def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -27,7 +27,7 @@ def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m:
     Args:
         corners_m: Corners (x, y) of the polygon (metres).
         x_m: x coordinates of the points (metres).
-        y_m: y coordinates of the points (metres); they are broadcast with `x_m`.
+        y_m: y coordinates of the points (metres), broadcastable with `x_m`.
 
     Returns:
         Boolean per point.
@@ -40,7 +40,7 @@ def contains_points(corners_m: Sequence[Any] | np.ndarray, x_m: np.ndarray, y_m:
         raise ValueError(f"polygon {np.asarray(corners_m).tolist()}: expected three or more corners (x, y) in metres")
     inside = np.zeros(np.broadcast_shapes(np.shape(x_m), np.shape(y_m)), bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if x0 != x1:  # test whether the edge crosses the ray from the point towards +y
+        if x0 != x1:  # Test whether the edge crosses the ray that starts at the point and runs towards +y.
             crosses = (x0 > x_m) != (x1 > x_m)
             inside ^= crosses & (y_m < y0 + (x_m - x0) / (x1 - x0) * (y1 - y0))
     return inside
@@ -63,13 +63,13 @@ def select_polygon(grid: Grid, corners_m: Sequence[Any] | np.ndarray) -> np.ndar
 
 
 def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> np.ndarray:
-    """Select the pixels at a distance of at least `offset_m` from the origin along a direction.
+    """Select the pixels that lie at least `offset_m` from the origin along a direction.
 
     For example, normal (1, 0) and offset 40 select all pixels at least 40 m ahead.
 
     Args:
         grid: Grid of the scene.
-        normal: Direction (x, y) of any length above 0.
+        normal: Direction (x, y); its length must exceed 0 but has no effect.
         offset_m: Distance from the origin along the direction (metres).
 
     Returns:
@@ -86,7 +86,7 @@ def select_half_plane(grid: Grid, normal: Sequence[float], offset_m: float) -> n
 
 
 def select_around_objects(scene: Scene, primitives: Sequence[int] | np.ndarray, margin_m: float = 1.0) -> np.ndarray:
-    """Select the pixels inside the upright bounding boxes of primitives, enlarged by a margin.
+    """Select the pixels inside the bounding boxes of primitives; the boxes are first enlarged by a margin.
 
     Args:
         scene: Scene.
@@ -129,7 +129,7 @@ def find_region_cells(region: np.ndarray, size: int) -> np.ndarray:
 
 
 def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
-    """Grow a region to whole latent cells, because the model regenerates whole cells.
+    """Enlarge a region to whole latent cells, because the model can regenerate only whole cells.
 
     Args:
         region: (rows, cols) bool.
@@ -146,17 +146,17 @@ def grow_to_cells(region: np.ndarray, grid: Grid, size: int) -> np.ndarray:
 
 
 def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int], contents: Contents | str) -> Tensor:
-    """Make the latent mask of regions.
+    """Convert regions to a mask of the latents.
 
     The first half of the channels of a split latent belongs to the ground, the second half to the objects.
 
     Args:
-        regions: (rows, cols) bool per scene.
+        regions: One mask (rows, cols) per scene.
         shape: Shape (c, h, w) of a latent.
-        contents: "both", "ground" or "objects": the channels to regenerate.
+        contents: Channels to regenerate: "both", "ground" or "objects".
 
     Returns:
-        (b, c, h, w) float32, 1 = regenerate, 0 = keep.
+        (b, c, h, w) float32; 1 marks values to regenerate, 0 marks values to keep.
 
     Raises:
         ValueError: `contents` is unknown.
@@ -173,10 +173,10 @@ def make_latent_mask(regions: Sequence[np.ndarray], shape: tuple[int, int, int],
 
 
 def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, contents: Contents) -> Scene:
-    """Combine a scene with its regenerated part; everything outside the region equals the input bit for bit.
+    """Combine a scene with its regenerated part; everything outside the region is bit-identical to the input.
 
     Pixels inside the region come from the generated scene. A primitive lies in the region if the pixel under its centre
-    does. New ground is blended into the known ground at the border (seam_blending.py).
+    lies in the region. Generated ground is blended into the known ground at the border (seam_blending.py).
 
     Decoders read the whole latent. Outside the region, the decoded scene therefore differs slightly from the input,
     although the latent there is the same. A known object near the border may be decoded slightly inside the region.
@@ -186,7 +186,7 @@ def composite_scenes(scene: Scene, generated: Scene, region: np.ndarray, content
         scene: Input scene.
         generated: Decoded scene on the same grid.
         region: (rows, cols) bool, in whole latent cells.
-        contents: What was regenerated.
+        contents: Part of the scene that was regenerated.
 
     Returns:
         The combined scene.

@@ -1,12 +1,12 @@
 """Outpainting on a grid of overlapping blocks (paper, supplement B.3).
 
-The paper extends a scene to three by three blocks around it. This module also supports any rectangle of blocks and an
-unbounded grid, which differ only in the order of the blocks.
+The paper extends a scene to three by three blocks around it. This module also supports rectangles of any size and
+unbounded grids. Only the order of the blocks differs.
 
-Block (i, j) lies i steps ahead and j steps left of block (0, 0). A step is (1 - overlap) of a block. The rank of a
-block is a function of (i, j) alone. Where blocks overlap, the block of lowest rank owns the cell. Blocks of equal rank
-never overlap in cells that they own. Each block is conditioned on the cells that blocks of lower rank own. The result
-therefore does not depend on the time, the machine or the order of generation.
+Block (i, j) lies i steps ahead of block (0, 0) and j steps to its left. A step is (1 - overlap) of a block. The rank of
+a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. Blocks of
+the same rank never own the same cell. Each block is conditioned on its cells that are owned by blocks of lower rank.
+The result therefore does not depend on the time, the machine or the order of generation.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from models.sampling.repaint import RePaintConfig
 from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
 from models.tensors import make_empty_scene
 
-BlockIndex = tuple[int, int]  # (i, j) of a block: steps ahead, steps left.
-EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Scenes on the model's grid -> latents (b, c, h, w).
+BlockIndex = tuple[int, int]  # (i, j): steps ahead of block (0, 0), and steps to its left.
+EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
 def rank_outward(index: BlockIndex) -> int:
-    """Rank a block by its distance from block (0, 0): first the paper's four sides, then its four corners.
+    """Return the distance |i| + |j| of a block from block (0, 0): sides come first, then corners, as in the paper.
 
     Args:
         index: Index of the block.
@@ -46,13 +46,13 @@ def rank_outward(index: BlockIndex) -> int:
 
 
 def rank_four_colors(index: BlockIndex) -> int:
-    """Rank the blocks of an unbounded grid by the parity of i and j, which gives four ranks.
+    """Return the rank of a block of an unbounded grid: one of four ranks, given by the parities of i and j.
 
     Args:
         index: Index of the block.
 
     Returns:
-        Rank from 0 to 3. Blocks of equal rank are two steps apart.
+        Rank from 0 to 3. Blocks of the same rank are at least two steps apart.
     """
     return index[0] % 2 + 2 * (index[1] % 2)
 
@@ -63,9 +63,9 @@ class BlockGrid:
 
     Attributes:
         size: Side of a block in latent cells.
-        step: Distance of neighbouring blocks in cells.
+        step: Distance between neighbouring blocks in cells.
         rank: Function that returns the rank of a block; lower ranks are generated first.
-        num_blocks: Number of blocks ahead, behind, left and right of block (0, 0); None for an unbounded grid.
+        num_blocks: Number of blocks ahead of, behind, to the left of and to the right of block (0, 0). None: unbounded.
     """
 
     size: int
@@ -79,22 +79,24 @@ class BlockGrid:
 
         Args:
             size: Side of a block in latent cells.
-            overlap: Overlap as a fraction of a block.
-            **options: Further fields of `BlockGrid`.
+            overlap: Fraction of a block that overlaps its neighbour.
+            **options: Other fields of `BlockGrid`.
 
         Returns:
             The block grid.
 
         Raises:
-            ValueError: The overlap is not a whole number of cells, or blocks of equal rank would overlap.
+            ValueError: The overlap is not a whole number of cells, or blocks of the same rank would overlap.
         """
         step = round(size * (1 - overlap))
         if not 0 < step < size or abs(step - size * (1 - overlap)) > 1e-6:
-            raise ValueError(f"overlap {overlap} is not a whole number of the {size} latent cells between 0 and 1")
+            raise ValueError(
+                f"overlap {overlap} must lie between 0 and 1 and be a multiple of 1 / {size} (one latent cell)"
+            )
         grid = cls(size, step, **options)
         if grid.rank is rank_four_colors and 2 * step <= size:
             raise ValueError(
-                f"overlap {overlap}: four ranks need an overlap below 0.5, otherwise blocks of equal rank overlap"
+                f"overlap is {overlap}, expected less than 0.5: otherwise, blocks of the same rank overlap"
             )
         return grid
 
@@ -119,30 +121,30 @@ class BlockGrid:
             ValueError: The grid is unbounded.
         """
         if self.num_blocks is None:
-            raise ValueError("an unbounded grid has no list of blocks")
+            raise ValueError("cannot list the blocks of an unbounded grid")
         ahead, behind, left, right = self.num_blocks
         return list(product(range(-behind, ahead + 1), range(-right, left + 1)))
 
     def group_by_rank(self, indices: Iterable[BlockIndex]) -> list[list[BlockIndex]]:
-        """Group blocks by rank, lowest rank first.
+        """Group blocks by rank, starting with the lowest rank.
 
         Args:
             indices: Indices of blocks.
 
         Returns:
-            Groups of blocks; the blocks of a group can be generated concurrently.
+            Groups of blocks. The blocks of one group can be generated concurrently.
         """
         ordered = sorted(indices, key=lambda index: (self.rank(index), index))
         return [list(group) for _, group in groupby(ordered, key=self.rank)]
 
     def list_predecessors(self, index: BlockIndex) -> list[BlockIndex]:
-        """List the overlapping blocks of lower rank, which must be generated before this block.
+        """List the blocks that must be generated first: those that overlap this block and have a lower rank.
 
         Args:
             index: Index of the block.
 
         Returns:
-            Indices of the predecessors, lowest rank first.
+            Indices of the predecessors in ascending order of rank.
         """
         reach = range(-((self.size - 1) // self.step), (self.size - 1) // self.step + 1)
         near = [(index[0] + i, index[1] + j) for i in reach for j in reach]
@@ -150,11 +152,11 @@ class BlockGrid:
         return sorted((p for p in near if self.contains(p) and self.rank(p) < rank), key=lambda p: (self.rank(p), p))
 
     def overlap_cells(self, index: BlockIndex, of: BlockIndex) -> tuple[slice, slice]:
-        """Return the cells of one block that another block covers.
+        """Return the cells of a block that another block also covers.
 
         Args:
             index: Index of the block.
-            of: Index of the other block.
+            of: Index of the block that covers the cells.
 
         Returns:
             Row slice and column slice of block `index`.
@@ -204,9 +206,9 @@ class SceneBlock:
     Attributes:
         scene: Content of the cells that the block owns, in the block's frame.
         latent: (c, h, w) latent of the whole block.
-        datum_m: Height of the block's frame above the frame of block (0, 0).
-        known_ground: Fraction of the known pixels that have ground, or 1 if nothing was known. The paper's outpainting
-            fails if this fraction is near 0.
+        datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
+        known_ground: Fraction of the known pixels that have ground; 1 if the block had no known pixels. The paper's
+            outpainting fails if this fraction is near 0.
     """
 
     scene: Scene
@@ -217,13 +219,13 @@ class SceneBlock:
 
 @dataclass(frozen=True, eq=False)
 class BlockCondition:
-    """The known part of a block before the block is generated.
+    """Known part of a block that is not yet generated.
 
     Attributes:
         known: Known part as a Scene.
         latent: Latent (c, h, w) of the known part.
-        mask: (c, h, w), 1 = generate, 0 = keep.
-        datum_m: Height of the block's frame above the frame of block (0, 0).
+        mask: (c, h, w); 1 marks values to generate, 0 marks values to keep.
+        datum_m: Height of the block's frame above the frame of block (0, 0) (metres).
     """
 
     known: Scene
@@ -233,17 +235,17 @@ class BlockCondition:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the block has no known part."""
+        """True if the block has no known part."""
         return bool(self.mask.all())
 
     @cached_property
     def new_pixels(self) -> np.ndarray:
-        """(rows, cols) bool: pixels to generate."""
+        """(rows, cols) bool mask of the pixels to generate."""
         return self.known.grid.upsample_cells(self.mask[0].cpu().numpy() > 0)
 
 
 def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
-    """Return the height of the fused surface at the occupied pixel nearest to a point.
+    """Return the ground height at the occupied pixel that is nearest to a point.
 
     Args:
         scene: Scene.
@@ -263,13 +265,13 @@ def find_ground_height(scene: Scene, x_m: float, y_m: float) -> float:
 
 
 class BlockComposer:
-    """Condition blocks on their predecessors and stitch blocks together. The composer stores no blocks.
+    """Condition blocks on their predecessors, and combine blocks into one scene. The composer stores no blocks.
 
     Args:
         block_grid: Block grid.
         spec: Layout of one block.
         encode: Function that encodes scenes to latents.
-        level_m: Ground height under the origin of a block's frame, as in the model's training data (metres).
+        level_m: Ground height at the origin of a block's frame in the training data (metres).
     """
 
     def __init__(self, block_grid: BlockGrid, spec: LayoutSpec, encode: EncodeScenes, level_m: float = 0.0) -> None:
@@ -277,24 +279,24 @@ class BlockComposer:
 
     @property
     def step_px(self) -> int:
-        """Distance of neighbouring blocks in pixels."""
+        """Distance between neighbouring blocks in pixels."""
         return self.block_grid.step * (self.spec.grid.rows // self.block_grid.size)
 
     @property
     def step_m(self) -> float:
-        """Distance of neighbouring blocks in metres."""
+        """Distance between neighbouring blocks in metres."""
         return self.step_px * self.spec.grid.resolution_m
 
     def to_block_frame(self, index: BlockIndex, other: BlockIndex, block: SceneBlock) -> Scene:
-        """Return the part of one block that lies inside another block.
+        """Crop a block to the area of another block.
 
         Args:
-            index: Index of the block that defines the result's x, y frame.
+            index: Index of the block whose area and x, y frame the result has.
             other: Index of the block to crop.
             block: Content of block `other`.
 
         Returns:
-            The cropped scene in the x, y frame of block `index`, with z in the frame of block (0, 0).
+            The cropped scene. Its x and y are in the frame of block `index`; its z is in the frame of block (0, 0).
         """
         x, y = ((a - b) * self.step_m for a, b in zip(other, index, strict=True))
         return block.scene.translate(x, y, block.datum_m).crop(self.spec.grid)
@@ -306,10 +308,11 @@ class BlockComposer:
 
         Args:
             index: Index of the block.
-            blocks: Generated blocks, with all predecessors of the block.
-            empty: Empty Scene that provides the ids of the result.
-            mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms their decoded
-                content into the block's frame and encodes it again, because object latents contain absolute centres.
+            blocks: Generated blocks; they must include all predecessors of the block.
+            empty: Empty Scene whose ids are copied to the result.
+            mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms the decoded
+                content of the neighbours into the block's frame and encodes it again. Object latents contain absolute
+                centres, which a copy does not change.
 
         Returns:
             The known part.
@@ -343,19 +346,20 @@ class BlockComposer:
             generated: Decoded block.
 
         Returns:
-            The block with the content of the cells that it owns.
+
+            The block, which contains only the cells that it owns.
         """
         own = extract_new_part(generated, condition.known, condition.new_pixels)
         seen = np.any(condition.known.occupied, axis=0)[~condition.new_pixels]
         return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
 
     def stitch(self, blocks: Mapping[BlockIndex, SceneBlock], like: Scene, grid: Grid | None = None) -> Scene:
-        """Combine blocks to one Scene; each block contributes the cells that it owns.
+        """Combine blocks into one Scene; each block contributes the cells that it owns.
 
         Args:
             blocks: Generated blocks.
-            like: Scene that provides ids and labels.
-            grid: Grid of the result, aligned to whole pixels with block (0, 0) (default: all blocks).
+            like: Scene whose ids and labels are copied to the result.
+            grid: Grid of the result, aligned with block (0, 0) to whole pixels. None: the grid covers all blocks.
 
         Returns:
             The combined scene.
@@ -400,36 +404,36 @@ def generate_blocks(
     guidance_scale: float = 1.0,
     callback_on_step_end: StepCallback | None = None,
 ) -> dict[BlockIndex, SceneBlock]:
-    """Generate blocks in one batch, conditioned on blocks that exist.
+    """Generate blocks in one batch, conditioned on existing blocks.
 
     Args:
         model: Model that generates one block.
         composer: Block grid and the functions that combine blocks.
         indices: Blocks to generate.
-        blocks: Existing blocks, with all predecessors of `indices`.
-        like: Scene that provides the ids of the result.
-        label: Label of all blocks, or label by index of the block.
+        blocks: Existing blocks; they must include all predecessors of `indices`.
+        like: Scene whose ids are copied to the result.
+        label: One label for all blocks, or a mapping from block index to label.
         seed: Seed of the noise.
-        scene_index: Index of the scene; together with the block's index it keys the noise.
-        mode: "copy" or "reencode", see `BlockComposer.condition_block`.
-        repaint: Options of RePaint (default: the paper's).
-        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        scene_index: Index of the scene. The noise depends on the seed, this index and the block index.
+        mode: "copy" or "reencode"; see `BlockComposer.condition_block`.
+        repaint: Options of RePaint; None: the options of the paper.
+        guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
     Returns:
         The new blocks by index.
 
     Raises:
-        KeyError: A block has no label or a predecessor is missing.
+        KeyError: A block has no label, or a predecessor is missing.
         ValueError: `mode` is unknown.
     """
     if mode not in ("copy", "reencode"):
-        raise ValueError(f"outpainting mode {mode!r}, expected 'copy' or 'reencode'")
+        raise ValueError(f"outpainting mode is {mode!r}, expected 'copy' or 'reencode'")
     empty = make_empty_scene(like.scene_id, like.source, like.sequence, like.frame, model.spec)
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
     stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
     repaint = repaint or RePaintConfig()
-    if all(condition.is_empty for condition in conditions):  # without a known part, resampling has no effect
+    if all(condition.is_empty for condition in conditions):  # Without a known part, resampling has no effect.
         repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
     latents = model.inpaint_latents(
         stacked,
@@ -459,19 +463,19 @@ def outpaint_scene(
     guidance_scale: float,
     callback_on_step_end: StepCallback | None,
 ) -> Scene:
-    """Extend a scene on the model's grid by blocks ahead, behind, left and right.
+    """Extend a scene on the model's grid by generated blocks on its four sides.
 
     Args:
         model: Model.
         scene: Scene on the model's grid.
-        label: Label of all blocks, or label by index of the block.
+        label: One label for all blocks, or a mapping from block index to label.
         seed: Seed of the noise.
-        scene_index: Index of the scene; it keys the noise.
-        overlap: Fraction of a block that overlaps its neighbour, a whole number of latent cells.
-        mode: "copy" or "reencode", see `BlockComposer.condition_block`.
-        num_blocks: Number of blocks ahead, behind, left and right.
-        repaint: Options of RePaint, or None for the paper's.
-        guidance_scale: Scale of classifier-free guidance; 1 is none.
+        scene_index: Index of the scene. The noise depends on the seed and this index.
+        overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent cells.
+        mode: "copy" or "reencode"; see `BlockComposer.condition_block`.
+        num_blocks: Number of blocks to add ahead, behind, to the left and to the right.
+        repaint: Options of RePaint; None: the options of the paper.
+        guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
 
     Returns:

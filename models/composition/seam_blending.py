@@ -1,14 +1,14 @@
 """Blend generated ground into known ground at seams.
 
-The decoder decodes the new part together with the known part, so both parts are consistent. The result keeps the
-original known part instead of the decoded one. If the two differ by a pixel at a kerb or by a centimetre of height, the
-seam is visible. The difference at the seam is therefore added to the new side, with a weight that falls off with
+The decoder reconstructs the known part together with the generated part. The final scene, however, contains the
+original known part instead of its reconstruction. Differences between the original and its reconstruction would make
+the seam visible. The difference at the seam is therefore added to the generated side, with a weight that decreases with
 distance.
 
-A decoder may also draw a height step at the seam between known and new latent cells. A slope at the seam that exceeds
-both MAX_SLOPE and the slope of the known ground is removed in the same way.
+The decoder may also produce a height step at the seam between known and generated latent cells. A slope at the seam is
+reduced in the same way if it exceeds both MAX_SLOPE and the slope of the known ground.
 
-Differs from the paper, which pastes the new part without blending.
+The paper pastes the generated part without blending.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from scipy.ndimage import distance_transform_edt
 from models.composition.deduplicate import find_regenerated_objects
 from models.scene import Scene, merge_scenes
 
-BLEND_M = 8.0  # Largest distance from the seam at which new ground is changed.
-MAX_EDGE_SHIFT_M = 2.0  # Largest shift of a class's edge.
-MAX_SLOPE = 0.08  # Rise per metre across the seam; a steeper rise is a decoder's step unless known ground is as steep.
+BLEND_M = 8.0  # Largest distance from the seam at which generated ground is changed.
+MAX_EDGE_SHIFT_M = 2.0  # Largest shift of the edge of a ground class.
+MAX_SLOPE = 0.08  # Largest slope across the seam, unless the known ground is steeper.
 
 
 def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     """Blend generated ground into the known ground at seams; objects keep their height above the ground.
 
-    Near the known pixels of a class, its height and its signed distance from the edge are corrected. The correction is
-    the difference at the nearest known pixel. Elsewhere, the height is corrected by the difference of the fused
-    surfaces of both scenes. This difference is taken at the nearest known pixel where both surfaces have the same
-    class.
+    Near known pixels of a ground class, the height of the class and the signed distance from its edge are corrected.
+    The correction is the difference at the nearest known pixel. Elsewhere, the height is corrected by the difference
+    between the fused surfaces of both scenes. This difference is taken at the nearest known pixel where both surfaces
+    have the same class.
 
     Args:
         generated: Scene on the grid of `known`.
-        known: Scene; its pixels outside `new` are kept.
-        new: (rows, cols) bool, generated pixels. All other pixels of `generated` are unchanged.
+        known: Scene with the original content outside `new`.
+        new: (rows, cols) bool mask of the generated pixels. All other pixels of `generated` remain unchanged.
 
     Returns:
         `generated` with blended ground in `new`.
@@ -66,8 +66,8 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
             new_mask, given, limit_px
         )
         inside = _compute_edge_distance(new_mask, np.ones_like(new), limit_px) + weight * shift_px[nearest] > 0
-        # Height of the class at every pixel: that of the nearest generated pixel of the class. If the class has no
-        # generated pixel, the height is that of the nearest known pixel.
+        # Set the height of the class at every pixel to the height of the nearest generated pixel of the class. If the
+        # class has no generated pixel, use the nearest known pixel.
         away, place = _find_nearest(known_mask) if known_mask.any() else (np.full(new.shape, np.inf), nearest)
         level_m = new_m[_find_nearest(new_mask)[1]] if new_mask.any() else known_m[place]
         own = _compute_falloff(away * resolution_m)
@@ -84,15 +84,16 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
 
 
 def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
-    """Return the new part of a generated scene, blended into the known ground and without copies of known objects.
+    """Return the generated part of a scene, blended into the known ground and without copies of known objects.
 
     Args:
         generated: Decoded scene on the grid of `known`.
         known: Known part.
-        new: (rows, cols) bool, generated pixels.
+        new: (rows, cols) bool mask of the generated pixels.
 
     Returns:
-        The scene with the content of `new` only.
+
+        The scene, which contains only the content of `new`.
     """
     fresh = generated.select(~find_regenerated_objects(generated, known))
     return merge_scenes([blend_ground(fresh, known, new)], [new], generated)
@@ -101,11 +102,11 @@ def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
 def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
     """Fill unknown pixels with the ground of the nearest known pixel before the scene is encoded.
 
-    The receptive field of an encoder extends beyond a cell. Empty unknown pixels would look like an edge of the ground.
+    The receptive field of the encoder extends beyond a cell, so empty pixels would look like an edge of the ground.
 
     Args:
         known: Known part of a scene.
-        unknown: (rows, cols) bool, pixels to fill.
+        unknown: (rows, cols) bool mask of the pixels to fill.
 
     Returns:
         The scene with filled ground.
@@ -136,7 +137,8 @@ def _compute_surface_difference(
 ) -> np.ndarray:
     """Return the height of the known surface above the generated surface in metres.
 
-    Where the classes of the surfaces differ, the value is that of the nearest pixel with equal classes, with a falloff.
+    If the two surfaces have different classes at a pixel, the value comes from the nearest pixel where the classes
+    agree. This value decreases with the distance to that pixel.
     """
     known_m, known_class = (part[window] for part in known.surface())
     new_m, new_class = (part[window] for part in generated.surface())
@@ -148,7 +150,7 @@ def _compute_surface_difference(
 
 
 def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the largest height step from each pixel of a mask to its four neighbours in the mask.
+    """Return the largest height step between each pixel of a mask and its four neighbours inside the mask.
 
     The step is 0 for pixels outside the mask and for pixels without such neighbours.
     """
@@ -163,7 +165,7 @@ def _compute_largest_steps(height_m: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 
 def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_step_m: np.ndarray) -> np.ndarray:
-    """Return the expected height of a class at known pixels, extrapolated from the nearest new pixel.
+    """Return the expected height of a class at known pixels, extrapolated from the nearest generated pixel.
 
     The height changes by at most `max_step_m` per pixel.
     """
@@ -175,13 +177,13 @@ def _limit_step(height_m: np.ndarray, level_m: np.ndarray, new: np.ndarray, max_
 
 
 def _compute_falloff(distance_m: np.ndarray) -> np.ndarray:
-    """Return a smooth weight: 1 at the seam, 0 at distances of BLEND_M and more."""
+    """Return a smooth weight that is 1 at the seam and 0 at distances of at least BLEND_M."""
     left = np.clip(1 - distance_m / BLEND_M, 0, 1)
     return left * left * (3 - 2 * left)
 
 
 def _compute_edge_distance(mask: np.ndarray, domain: np.ndarray, limit: float) -> np.ndarray:
-    """Return the signed distance in pixels from the edge of a mask, positive inside, clipped to +-limit."""
+    """Return the signed distance to the edge of a mask in pixels, positive inside, clipped to [-limit, limit]."""
     inside, outside = (
         np.minimum(_find_nearest(side)[0] - 0.5, limit) if side.any() else np.full(mask.shape, limit)
         for side in (mask & domain, ~mask & domain)

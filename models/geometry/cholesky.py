@@ -1,13 +1,13 @@
-"""Convert rotation and size of a box to six Cholesky parameters and back (paper, Sec. 3.1 and supplement B.1).
+"""Convert the rotation and size of a box to six Cholesky parameters and back (paper, Sec. 3.1, supplement B.1).
 
-The scatter matrix is S = R diag(l, w, h) R^T with full extents (not squared). The Cholesky factor L of S fulfils S = L
-L^T. The six parameters c are the lower-triangular entries of L. Entries of L have the unit sqrt(metres); off-diagonal
-entries may be negative.
+The scatter matrix is S = R diag(l, w, h) R^T. The full extents l, w and h are not squared. The Cholesky factor L of S
+fulfils S = L L^T. The six parameters c are the lower-triangular entries of L. Entries of L have the unit sqrt(metres);
+off-diagonal entries may be negative.
 
 The paper does not specify the order and the bounds of the entries. This module uses the row-major order (L00, L10, L11,
 L20, L21, L22). Bounds come from the training split.
 
-The functions use numpy, because none of them needs a gradient. The functions accept any leading batch shape.
+The functions use numpy, because no gradients are needed. The functions accept any leading batch shape.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def compute_scatter_matrix(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarr
     """Compute the scatter matrices of boxes (supplement Eq. 1).
 
     Args:
-        rotation: (..., 3, 3) axes of the boxes as columns.
+        rotation: (..., 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (..., 3) full extents along these axes (metres).
 
     Returns:
@@ -35,7 +35,7 @@ def compute_cholesky_parameters(rotation: np.ndarray, size_m: np.ndarray) -> np.
     """Compute the Cholesky parameters of boxes (supplement Eq. 2).
 
     Args:
-        rotation: (..., 3, 3) axes of the boxes as columns.
+        rotation: (..., 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (..., 3) full extents along these axes (metres). Extents below 1 cm count as 1 cm.
 
     Returns:

@@ -1,25 +1,26 @@
-"""Encodings of the shape of a box (rotation and size) as numbers that a network can regress.
+"""Encodings of the rotation and size of a box as numbers that a network can regress.
 
-`cholesky` is the paper's encoding (Sec. 3.1), `quaternion` is the paper's baseline, and `octahedral` is new here. The
-same box has 24 descriptions, which differ in the order and the signs of the axes. An ideal encoding is continuous, has
-one code per box and has one box per code.
+`cholesky` is the paper's encoding (Sec. 3.1), and `quaternion` is the paper's baseline. The paper does not have
+`octahedral`. Each box can be described in 24 ways, which differ in the order and the signs of the axes. An ideal
+encoding is continuous, and each box has exactly one code and each code exactly one box.
 
-* quaternion and size: This encoding has none of these properties. The quaternions q and -q are the same rotation. A
-  rotation of the box by 180 degrees about an axis gives the same box but another q. A convention such as w >= 0 makes
-  the code jump.
-* Cholesky factor of the scatter matrix: This encoding is continuous and has one code per box, but not one box per code.
-  If two extents are equal, the scatter matrix does not determine the angle in their plane. If two extents l and w are
-  similar, noise d in S rotates the box by atan(2 d / |l - w|) / 2.
+* quaternion and size: This encoding has none of these properties. The quaternions q and -q describe the same rotation.
+  Rotating the box by 180 degrees about one of its axes gives the same box but a different quaternion. A convention such
+  as w >= 0 makes the code discontinuous.
+* Cholesky factor of the scatter matrix: This encoding is continuous, and each box has one code. However, some codes
+  describe several boxes. If two extents are equal, the scatter matrix does not determine the rotation in the plane of
+  these two axes. If two extents l and w are similar, an error d in S rotates the decoded box by atan(2 d / |l - w|) /
+  2.
 * octahedral: The code consists of the scatter matrix S and the frame tensor T of the box. S is sum_j s_j v_j v_j^T, and
-  T is sum_j v_j (x) v_j (x) v_j (x) v_j. S and T are polynomials that do not depend on the order and the signs of the
-  axes. Equal boxes therefore have equal codes, and the code is smooth. T is invariant under exactly the 24 symmetries
-  of a cube. T therefore determines the three axes for all extents, also for cubes. S then gives the extent along each
-  axis. The octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
+  T is sum_j v_j (x) v_j (x) v_j (x) v_j. S and T do not depend on the order and the signs of the axes. They are
+  polynomials. Each box therefore has one code, and the encoding is smooth. T is invariant only under the 24 symmetries
+  of a cube. It therefore determines the three axes, even if the box is a cube. S then gives the extent along each axis.
+  The octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
 
 T is symmetric and has 15 distinct entries. The trace part of T is constant, because the v_j are orthonormal. The
-remaining traceless part has nine entries, the spherical harmonics of degree four. These harmonics represent cross
-frames in hexahedral meshing (Huang et al., Boundary aligned smooth 3D cross-frame field, 2011). For an upright box, two
-harmonics vary as cos 4 yaw and sin 4 yaw, and seven are constant.
+traceless part of T is described by nine numbers: its coefficients in the spherical harmonics of degree four. These
+harmonics represent cross frames in hexahedral meshing (Huang et al., Boundary aligned smooth 3D cross-frame field,
+2011). For an upright box, two harmonics vary as cos 4 yaw and sin 4 yaw, and seven are constant.
 
 The functions use numpy in float64 and accept any leading batch shape.
 """
@@ -42,15 +43,15 @@ from models.geometry.cholesky import (
     decode_cholesky_boxes,
 )
 
-TRACE_PART = 3 / 5  # The mean over the unit sphere of sum_j (v_j . x)^4.
-STARTS, ROUNDS = 4, 12  # Starts and iterations of the frame search; tests/unit/test_ablation.py checks them.
+TRACE_PART = 3 / 5  # Mean of sum_j (v_j . x)^4 over the unit sphere.
+STARTS, ROUNDS = 4, 12  # Number of starts and of iterations of the axis search (checked by a test).
 
 
 class Encoding(NamedTuple):
     """An encoding of boxes.
 
     Attributes:
-        entries: Numbers per box.
+        entries: Number of entries of the code of a box.
         encode: Maps rotation (..., 3, 3) and size_m (..., 3) to codes (..., entries).
         decode: Maps any finite codes to rotation (..., 3, 3), right-handed, and size_m (..., 3). Extents below 1 cm
             count as 1 cm in both directions.
@@ -67,10 +68,10 @@ class Encoding(NamedTuple):
 def encode_quaternions(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
     """Encode boxes as unit quaternions and extents.
 
-    The axes are not reordered. The same box with the opposite heading therefore has another code.
+    The axes are not reordered. A box with the opposite heading therefore has a different code.
 
     Args:
-        rotation: (..., 3, 3) axes of the boxes as columns.
+        rotation: (..., 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (..., 3) full extents along these axes (metres).
 
     Returns:
@@ -106,8 +107,9 @@ def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 def compute_harmonics() -> np.ndarray:
     """Compute an orthonormal basis (9, 3, 3, 3, 3) of the traceless symmetric tensors of rank four.
 
-    The tensors are ordered as cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The tensors are the coefficients of t^k
-    in n(t)^4, where n(t) . n(t) = 0. The powers n(t)^4 are traceless, and k = 0 gives (x + iy)^4.
+    Their order is cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The basis is formed by the coefficients of t^k in
+    n(t)^4, where n(t) . n(t) = 0. Because of this condition, n(t)^4 is traceless. For k = 0, the coefficient is (x +
+    iy)^4.
     """
     parts = np.array([[1, 1j, 0], [0, 0, -2], [-1, 1j, 0]])  # n(t) = parts[0] + parts[1] t + parts[2] t^2
     tensors = np.zeros((9, 3, 3, 3, 3), complex)
@@ -126,10 +128,10 @@ def compute_isotropic_part() -> np.ndarray:
 
 
 def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
-    """Encode boxes as scatter matrix and frame tensor.
+    """Encode boxes as a scatter matrix and a frame tensor.
 
     Args:
-        rotation: (..., 3, 3) axes of the boxes as columns.
+        rotation: (..., 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (..., 3) full extents along these axes (metres).
 
     Returns:
@@ -144,13 +146,13 @@ def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 
 
 def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Decode scatter matrix and frame tensor to boxes.
+    """Decode scatter matrices and frame tensors to boxes.
 
-    The axes are those of the nearest frame tensor. The extents are s_j = v_j^T S v_j. This expression is linear in S,
-    so similar extents do not amplify errors.
+    The decoded axes are those whose frame tensor is nearest to the code. The extents are s_j = v_j^T S v_j. They are
+    linear in S, so errors are not amplified if extents are similar.
 
     Args:
-        parameters: (..., 15) codes of `encode_octahedral`.
+        parameters: (..., 15) codes in the format of `encode_octahedral`.
 
     Returns:
         rotation (..., 3, 3), right-handed, and size_m (..., 3) in metres.
@@ -163,23 +165,23 @@ def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def find_nearest_frame(harmonic: np.ndarray) -> np.ndarray:
-    """Find the axes whose frame tensor is nearest to the given harmonics.
+    """Find the axes whose frame tensor is nearest to a set of harmonics.
 
     These axes maximise sum_j T(v_j, v_j, v_j, v_j). Each iteration replaces the axes by the orthogonal polar factor of
-    the gradient, which never decreases the sum. The method is that of Zhai et al. (Complete dictionary learning via
-    l4-norm maximization, 2020). Near the maximum, an iteration triples the number of correct digits. The search starts
-    from STARTS fixed frames and keeps the best result.
+    the gradient. The sum never decreases. The method follows Zhai et al., Complete dictionary learning via l4-norm
+    maximization, 2020. Near the maximum, each iteration triples the number of correct digits. The search starts from
+    STARTS fixed frames and keeps the best result.
 
     Args:
-        harmonic: (..., 9) harmonics; their length has no effect.
+        harmonic: (..., 9) coefficients of the harmonics; a common factor has no effect.
 
     Returns:
-        Right-handed axes (..., 3, 3) as columns.
+        (..., 3, 3) right-handed rotation matrices, whose columns are the axes.
     """
     harmonic = np.asarray(harmonic, np.float64)
     flat = harmonic.reshape(-1, 9)
     unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-    length = np.sqrt(3 - 5 * TRACE_PART**2)  # norm of the harmonics of any frame: |T|^2 is 3 minus the trace part
+    length = np.sqrt(3 - 5 * TRACE_PART**2)  # Norm of the traceless part of T.
     tensor = np.einsum("nk,kabcd->nabcd", unit * length, compute_harmonics()) + TRACE_PART * compute_isotropic_part()
     best, best_value = np.zeros((len(flat), 3, 3)), np.full(len(flat), -np.inf)
     for start in Rotation.random(STARTS, rng=np.random.default_rng(0)).as_matrix():

@@ -1,17 +1,18 @@
-"""Exact IoU3D of arbitrarily rotated boxes, vectorised over pairs, and sampled IoU3D of ellipsoids.
+"""Exact IoU3D of arbitrarily rotated boxes (vectorised over pairs), and estimated IoU3D of ellipsoids.
 
-Two applications of the divergence theorem give the volume of a convex polytope from its edges. Let d be the distance of
-a face's plane from the origin. Let r be the distance of an edge from the foot point of the origin on that face. Then
+The volume of a convex polytope follows from its edges by two applications of the divergence theorem. Let d be the
+distance of a face's plane from the origin. Let r be the distance of an edge from the projection of the origin onto that
+face. Then
 
     V = 1/3 sum_faces d A_face = 1/6 sum_faces d sum_edges r |edge|.
 
-The edges of A ∩ B are the edges of A inside B, the edges of B inside A, and the intersection lines of their faces. The
-intersection thus has up to 12 + 12 + 36 edges, and each edge is a line clipped by slabs. No polygon is built, so the
-code needs no branch per pair.
+The edges of A ∩ B come from three sets: edges of A inside B, edges of B inside A, and intersections of a face of A with
+a face of B. The three sets have 12, 12 and 36 candidates. Each edge is a line that is clipped by slabs. The method
+builds no polygons, so it needs no branches that depend on the pair.
 
-Without a correction, coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the pair's largest
-extent, which is far above rounding errors and far below any tolerance. A face of B that coincides with a face of A then
-lies outside A, and only the face of A counts.
+Without a correction, coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the largest extent of
+the pair. This is far above rounding errors and far below any tolerance. A face of B that coincides with a face of A
+then lies outside A, and only the face of A counts.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ import numpy as np
 
 from models.scene import Scene
 
-GROWTH = 1e-9  # Enlargement of B as a share of the largest extent of a pair.
-PARALLEL = 1e-12  # Sine of the angle below which two faces have no common line.
-PAIRS_PER_CHUNK = 4096  # Fastest of 256 to 16384 on two AVX2 cores.
+GROWTH = 1e-9  # Enlargement of B as a fraction of the largest extent of the pair.
+PARALLEL = 1e-12  # Two faces count as parallel if the sine of their angle is smaller.
+PAIRS_PER_CHUNK = 4096  # The fastest of the tested values (256 to 16384) on two AVX2 cores.
 BALL_POINTS = 4096
 CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 
 
 class Boxes(NamedTuple):
-    """n boxes in float64.
+    """A set of n boxes in float64.
 
     Attributes:
         center_m: (n, 3) centres.
-        rotation: (n, 3, 3) axes as columns.
+        rotation: (n, 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (n, 3) full extents along the axes.
     """
 
@@ -66,7 +67,7 @@ def make_boxes(center_m: np.ndarray, rotation: np.ndarray, size_m: np.ndarray) -
 
     Args:
         center_m: (n, 3) centres.
-        rotation: (n, 3, 3) axes as columns.
+        rotation: (n, 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (n, 3) full extents along the axes.
 
     Returns:
@@ -142,15 +143,15 @@ def compute_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
 def compute_iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -> np.ndarray:
     """Compute the IoU3D of every box of `a` with every box of `b`.
 
-    Only pairs with overlapping axis-aligned bounds are computed; all others have IoU3D 0.
+    IoU3D is computed only for pairs whose axis-aligned bounds overlap; it is 0 for all other pairs.
 
     Args:
         a: n boxes.
         b: m boxes.
-        wanted: (n, m) mask of the pairs to compute (default: all pairs).
+        wanted: (n, m) mask of the pairs to compute; None: all pairs.
 
     Returns:
-        (n, m) IoU3D in [0, 1]; 0 for pairs that are not wanted.
+        (n, m) IoU3D in [0, 1]; 0 where `wanted` is False.
     """
     matrix = np.zeros((len(a.center_m), len(b.center_m)))
     i, j = find_overlapping_bounds(a, b)
@@ -162,14 +163,14 @@ def compute_iou3d_matrix(a: Boxes, b: Boxes, wanted: np.ndarray | None = None) -
 
 
 def find_overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pairs whose axis-aligned bounds overlap; they include every pair with IoU3D > 0.
+    """Find the pairs whose axis-aligned bounds overlap. All other pairs have IoU3D 0.
 
     Args:
         a: n boxes.
         b: m boxes.
 
     Returns:
-        Indices (p,) into `a` and (p,) into `b`.
+        Indices (p,) of boxes in `a`, and indices (p,) of boxes in `b`.
     """
     reach_a, reach_b = (0.5 * np.einsum("nij,nj->ni", np.abs(box.rotation), box.size_m) for box in (a, b))
     overlap = np.ones((len(a.center_m), len(b.center_m)), bool)
@@ -188,18 +189,19 @@ def _compute_iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.nd
 
 
 def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
-    """Return intersection volumes (n,), computed in the frame of A with the origin at A's centre.
+    """Return intersection volumes (n,). The computation uses the axes of A and the centre of A as the origin.
 
-    Arrays have shape (..., n): the last axis is the pair.
+    The last axis of all arrays is the index of the pair.
     """
     rotation_a, rotation_b = np.moveaxis(a.rotation, 0, -1), np.moveaxis(b.rotation, 0, -1)
-    axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n): a_i . b_j.
-    offset = np.einsum("kjn,nk->jn", rotation_b, b.center_m - a.center_m)  # (3, n): B's centre along B's axes.
+    axes = np.einsum("kin,kjn->ijn", rotation_a, rotation_b)  # (3, 3, n) dot products a_i . b_j.
+    offset = np.einsum("kjn,nk->jn", rotation_b, b.center_m - a.center_m)  # (3, n) centre of B along the axes of B.
     half_a, half_b = a.size_m.T / 2, b.size_m.T / 2
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
-    center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n): B's centre along A's axes
+    center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n) centre of B along the axes of A.
 
-    # Skip pairs that a face plane separates: a fifth of the town's pairs whose bounds overlap.
+    # Skip pairs that are separated by the plane of a face. In the town, these are a fifth of the pairs whose bounds
+    # overlap.
     reach = np.abs(axes)
     near_a = np.abs(center_b) < half_a + np.einsum("ijn,jn->in", reach, half_b)
     near_b = np.abs(offset) < half_b + np.einsum("ijn,in->jn", reach, half_a)
@@ -207,7 +209,8 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     volume = np.zeros(len(a.center_m))
     axes, offset, center_b, half_a, half_b = (part[..., near] for part in (axes, offset, center_b, half_a, half_b))
 
-    # (3, 2, n) distances of the planes of both boxes from A's centre; index 0 is the face on the negative side.
+    # (3, 2, n) distances of the face planes of both boxes from the centre of A. Index 0 is the face on the negative
+    # side.
     distance_a = np.stack([half_a, half_a], axis=1)
     distance_b = np.stack([half_b - offset, half_b + offset], axis=1)
     edges = _clip_own_edges(half_a, half_b, axes, offset, distance_a)
@@ -219,10 +222,10 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
 def _clip_own_edges(
     half: np.ndarray, other_half: np.ndarray, axes: np.ndarray, other_center: np.ndarray, distance: np.ndarray
 ) -> np.ndarray:
-    """Return the sum (n,) over one box's 12 edges of d d' |edge inside the other box|.
+    """Return the sum (n,) of d d' |edge inside the other box| over the 12 edges of one box.
 
-    `other_center` (3, n) is the centre of the other box relative to this box, along the axes of the other box. The two
-    faces of an edge are perpendicular, so r of one face equals d of the other face.
+    `other_center` (3, n) is the vector from this box to the other box along the axes of the other box. The two faces at
+    an edge are perpendicular, so r on one face equals d of the other face.
     """
     total = np.zeros(half.shape[1])
     for along, second, third in CYCLIC:
@@ -238,7 +241,7 @@ def _clip_own_edges(
 def _clip_crossing_edges(
     half_a: np.ndarray, half_b: np.ndarray, axes: np.ndarray, offset: np.ndarray, distance_b: np.ndarray
 ) -> np.ndarray:
-    """Return the sum (n,) over the 36 face pairs of (d_a r_a + d_b r_b) |common line inside both boxes|."""
+    """Return the sum (n,) of (d_a r_a + d_b r_b) |common line inside both boxes| over the 36 pairs of faces."""
     total = np.zeros(half_a.shape[1])
     sign_b = np.array([-1.0, 1.0])[None, :, None]
     for i, k, l in CYCLIC:  # noqa: E741
@@ -247,8 +250,9 @@ def _clip_crossing_edges(
             sine = np.hypot(axes[k, j], axes[l, j])
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
-            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # Normal of the line within A's face.
-            # rho (2, 2, n): signed distance of the line from the foot of A's centre; x = rho normal + tau tangent.
+            normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # Normal of the line within the face of A.
+            # rho (2, 2, n) is the signed distance of the line from the centre of A, projected onto the face. Points of
+            # the line are x = rho normal + tau tangent.
             rho = (offset[j] + _list_signs(half_b[j])[None] - axes[i, j] * plane_a) * inverse
             clip = _Clip(-np.inf, np.inf)
             clip.slab(rho * normal_k, -normal_l, half_a[k])
@@ -265,13 +269,13 @@ def _clip_crossing_edges(
 
 
 class _Clip:
-    """The interval of a line's parameter that remains after clipping by slabs."""
+    """Interval of the line parameter tau after clipping the line by slabs."""
 
     def __init__(self, low: np.ndarray | float, high: np.ndarray | float) -> None:
         self.low, self.high = low, high
 
     def slab(self, at: np.ndarray, slope: np.ndarray, half: np.ndarray) -> None:
-        """Keep |at + slope tau| <= half. If slope is 0, the line is kept completely or removed."""
+        """Clip the line to |at + slope tau| <= half. If slope is 0, the line is kept or removed as a whole."""
         inverse = 1 / np.where(np.abs(slope) < 1e-30, 1e-30, slope)
         middle, reach = at * -inverse, half * np.abs(inverse)
         self.low = np.maximum(self.low, middle - reach)
@@ -282,7 +286,7 @@ class _Clip:
 
 
 def _list_signs(half: np.ndarray) -> np.ndarray:
-    """Return the positions (2, n) of the two faces, negative side first."""
+    """Return the positions (2, n) of two opposite faces: [-half, half]."""
     return np.stack([-half, half])
 
 
@@ -290,15 +294,15 @@ def _list_signs(half: np.ndarray) -> np.ndarray:
 
 
 def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
-    """Estimate the IoU3D of the ellipsoids inscribed in each pair a[i], b[i].
+    """Estimate the IoU3D of each pair of ellipsoids that are inscribed in the boxes a[i] and b[i].
 
-    The estimate counts how many of BALL_POINTS fixed points of the smaller ellipsoid lie in the larger one. The result
-    is deterministic. The largest error is 0.01 and the root mean square error is 0.002, as a test checks on closed
-    forms. The paper's AP3D does not include ellipsoids.
+    The estimate counts how many of BALL_POINTS fixed points in the smaller ellipsoid also lie in the larger ellipsoid.
+    The result is deterministic. A test with closed-form solutions checks that the largest error is 0.01 and the root
+    mean square error is 0.002. The paper's AP3D does not include ellipsoids.
 
     Args:
-        a: n bounding boxes of ellipsoids.
-        b: n bounding boxes of ellipsoids.
+        a: Bounding boxes of n ellipsoids.
+        b: Bounding boxes of n ellipsoids.
 
     Returns:
         (n,) IoU3D in [0, 1].
@@ -306,7 +310,8 @@ def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     swap = a.volume_m3 > b.volume_m3
     small = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), q, p) for p, q in zip(a, b, strict=True)))
     large = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), p, q) for p, q in zip(a, b, strict=True)))
-    # large_from_small maps the unit ball of the small ellipsoid to the frame in which the large one is the unit ball.
+    # In unit-ball coordinates of an ellipsoid, the ellipsoid is the unit ball. large_from_small maps unit-ball
+    # coordinates of the small ellipsoid to those of the large ellipsoid.
     large_from_world = np.swapaxes(large.rotation, 1, 2) / np.maximum(large.size_m / 2, 1e-12)[:, :, None]
     large_from_small = large_from_world @ (small.rotation * (small.size_m / 2)[:, None, :])
     shift = np.einsum("nij,nj->ni", large_from_world, small.center_m - large.center_m)
@@ -325,8 +330,8 @@ def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
     See `compute_ellipsoid_iou3d_pairs` for the method.
 
     Args:
-        a: n bounding boxes of ellipsoids.
-        b: m bounding boxes of ellipsoids.
+        a: Bounding boxes of n ellipsoids.
+        b: Bounding boxes of m ellipsoids.
 
     Returns:
         (n, m) IoU3D in [0, 1].
@@ -338,15 +343,15 @@ def compute_ellipsoid_iou3d_matrix(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def sample_ball_points(count: int) -> np.ndarray:
-    """Return evenly spread points in the unit ball: Roberts' R3 low-discrepancy sequence, mapped by volume.
+    """Return evenly distributed points in the unit ball from Roberts' low-discrepancy sequence R3.
 
     Args:
         count: Number of points.
 
     Returns:
-        (count, 3) points; the same for every call.
+        (count, 3) points; every call returns the same points.
     """
-    root = 1.2207440846057596  # the real root of x^4 = x + 1
+    root = 1.2207440846057596  # Real root of x^4 = x + 1.
     unit = (0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1
     radius, up, turn = np.cbrt(unit[:, 0]), 2 * unit[:, 1] - 1, 2 * np.pi * unit[:, 2]
     flat = np.sqrt(1 - up**2)

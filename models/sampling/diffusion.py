@@ -111,7 +111,7 @@ class SamplingSchedule:
         Args:
             clean: Clean latent z_0.
             noise: Standard normal noise.
-            state: Target state; state -1 returns `clean` bit for bit.
+            state: Target state; state -1 returns `clean` exactly.
 
         Returns:
             Latent at this state.
@@ -254,7 +254,7 @@ class InpaintCondition:
 
     Attributes:
         latent: Clean latents of the known part.
-        mask: 1 = generate, 0 = keep.
+        mask: 1 marks values to generate, 0 marks values to keep.
     """
 
     latent: Float[Tensor, "b c h w"]
@@ -275,8 +275,8 @@ def sample(
     """Sample clean latents by ancestral sampling along `transitions`.
 
     Downward transitions denoise; upward transitions add noise back (RePaint). With a condition, each downward step
-    replaces the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0 bit
-    for bit.
+    replaces the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0
+    exactly.
 
     Differs from the paper, which uses the noise level of the state just left (Eq. "z_known"). With the paper's level,
     the known part and the generated part would have different noise levels.

@@ -46,7 +46,7 @@ class CenteredBoxes(NamedTuple):
     """n boxes centred at zero.
 
     Attributes:
-        rotation: (n, 3, 3) axes as columns.
+        rotation: (n, 3, 3) matrices; their columns are the axes of the boxes.
         size_m: (n, 3) full extents along the axes (metres).
     """
 

@@ -80,7 +80,7 @@ class CellDecoder(nn.Module):
 
         Args:
             feature_logit: Logit of the mean normalised features per category.
-            count: Mean number of primitives per scene and category.
+            count: Mean number of primitives of each category in a scene.
         """
         existence = (count / count.new_tensor(self.proposals)).clamp(0.001, 0.99).logit()
         bias = torch.cat([existence[:, None], torch.zeros_like(feature_logit[:, :2]), feature_logit[:, 2:]], dim=1)

@@ -1,7 +1,7 @@
 """Convolutional encoder and decoder of image autoencoders (Rombach et al., 2022), for the ground branch.
 
 Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`. Outputs equal those
-of diffusers bit for bit (tests/unit/test_convolutional.py). This module replaces the networks of diffusers, because the
+of diffusers exactly (tests/unit/test_convolutional.py). This module replaces the networks of diffusers, because the
 import of diffusers costs each process two to three seconds.
 """
 

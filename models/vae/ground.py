@@ -18,7 +18,7 @@ HEIGHT_WEIGHT = 10.0  # weight of normalised heights relative to signed distance
 
 
 class GroundEncoder(nn.Module):
-    """Encode rasters [H; B] to mean and log-variance of the ground latent, stacked along the channels.
+    """Encode rasters [H; B] to mean and log-variance of the ground latent, concatenated along the channel axis.
 
     With `shortcut`, the mean is the sum of the network's output and a linear map of each cell's `compute_smooth_maps`.
     `init_from_data` computes this map in closed form. The paper has no shortcut.
@@ -41,10 +41,10 @@ class GroundEncoder(nn.Module):
         """Encode rasters.
 
         Args:
-            maps: Normalised heights and masks, stacked along the channels, in [0, 1].
+            maps: Normalised heights and masks, concatenated along the channel axis, in [0, 1].
 
         Returns:
-            Mean and log-variance, stacked along the channels.
+            Mean and log-variance, concatenated along the channel axis.
         """
         moments = self.net(self.unshuffle(maps * 2 - 1))
         if self.shortcut is None:
@@ -56,7 +56,7 @@ class GroundEncoder(nn.Module):
 
 
 class GroundDecoder(nn.Module):
-    """Decode a ground latent to normalised heights and occupancy logits, stacked along the channels."""
+    """Decode a ground latent to normalised heights and occupancy logits, concatenated along the channel axis."""
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class GroundDecoder(nn.Module):
             latent: Ground latents.
 
         Returns:
-            Normalised heights and occupancy logits, stacked along the channels.
+            Normalised heights and occupancy logits, concatenated along the channel axis.
         """
         maps = self.shuffle(self.net(latent))
         return maps if self.shortcut is None else maps + self.shortcut(latent)
@@ -156,7 +156,7 @@ def compute_smooth_maps(
         cell: Side of a latent cell in pixels.
 
     Returns:
-        Filled heights and signed distances in [-1, 1], stacked along the channels. A distance of 1 is
+        Filled heights and signed distances in [-1, 1], concatenated along the channel axis. A distance of 1 is
         `compute_edge_reach_px` pixels.
     """
     distance = compute_signed_distance_px(occupied > 0.5, compute_edge_reach_px(cell)) / compute_edge_reach_px(cell)

@@ -112,9 +112,9 @@ def compute_object_losses(
         features: Features of the proposals.
         existence_logit: Existence logits of the proposals.
         truth: Features of the true primitives.
-        real: True where a slot holds a primitive.
+        real: True for each slot that holds a primitive.
         assignment: Slot of each proposal, -1 for padding (`match_primitives`).
-        spec: Gives categories and slots.
+        spec: LayoutSpec with the categories and slots.
         proposals: Number of proposals per category.
 
     Returns:
@@ -159,7 +159,7 @@ def compute_lvae_loss(
         output: Output of the decoders.
         posterior: Posterior of the encoders.
         batch: True layouts.
-        spec: Gives categories and slots.
+        spec: LayoutSpec with the categories and slots.
         kl_weight: Weight of the KL loss.
 
     Returns:

@@ -86,7 +86,7 @@ def match_primitives(
         features: Features of the proposals.
         existence_logit: Existence logits of the proposals.
         truth: Features of the slots.
-        real: True where a slot holds a primitive.
+        real: True for each slot that holds a primitive.
         slots: Number of slots per category.
         proposals: Number of proposals per category.
         weights: Weights of the cost.

@@ -188,10 +188,10 @@ class ObjectEncoder(nn.Module):
 
         Args:
             features: Normalised features of the slots.
-            real: True where a slot holds a primitive.
+            real: True for each slot that holds a primitive.
 
         Returns:
-            Mean and log-variance, stacked along the channels.
+            Mean and log-variance, concatenated along the channel axis.
         """
         features, real, category = self.drop_padding(features, real)
         batch = len(features)
@@ -240,7 +240,7 @@ class ObjectEncoder(nn.Module):
 
         Args:
             features: (b, N, 9) normalised features.
-            real: (b, N) True where a slot holds a primitive.
+            real: (b, N) True for each slot that holds a primitive.
 
         Returns:
             Features, `real` and categories (b, n), where n is the largest number of primitives of a scene in the batch.
@@ -329,7 +329,7 @@ class ObjectDecoder(nn.Module):
 
         Args:
             feature_logit: Logit of the mean normalised features per category.
-            count: Mean number of primitives per scene and category.
+            count: Mean number of primitives of each category in a scene.
         """
         for head, mean, expected, offered in zip(self._list_heads(), feature_logit, count, self.proposals, strict=True):
             cast(Tensor, head.features[-1].bias).copy_(mean)

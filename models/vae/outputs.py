@@ -28,7 +28,7 @@ class Posterior:
     logvar: Float[Tensor, "batch c2 h w"]
 
     def float(self) -> Posterior:
-        """Convert to single precision, because losses need more precision than bf16."""
+        """Convert to float32, because losses need more precision than bfloat16."""
         return Posterior(self.mean.float(), self.logvar.float())
 
     def sample(self, noise: Float[Tensor, "batch c2 h w"]) -> Float[Tensor, "batch c2 h w"]:
@@ -68,7 +68,7 @@ class LayoutOutput:
     branches: str = "both"
 
     def float(self) -> LayoutOutput:
-        """Convert to single precision, because losses need more precision than bf16."""
+        """Convert to float32, because losses need more precision than bfloat16."""
         names = ("height", "occupancy_logit", "features", "existence_logit")
         return replace(self, **{name: getattr(self, name).float() for name in names})
 
