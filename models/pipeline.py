@@ -1,4 +1,4 @@
-"""PrITTIPipeline: layout VAE and DiT as one object that follows diffusers' conventions and generates Scenes."""
+"""PrITTIPipeline combines the layout VAE and the DiT and generates Scenes, in the style of diffusers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def draw_seeds(
     """Return one seed per scene.
 
     Args:
-        generator: One generator that draws a seed for all scenes, or one generator per scene. If None, `seed` is used.
+        generator: One generator, which draws one seed for all scenes, or one generator per scene. None: `seed` is used.
         seed: One seed for all scenes, or one per scene.
         count: Number of scenes.
 
@@ -78,7 +78,7 @@ def draw_seeds(
 
 
 def check_noise_scaling(noise_scaling: float) -> float:
-    """Check that a noise scaling is between 0.9 and 1.1 and return it.
+    """Return a noise scaling after checking that it is between 0.9 and 1.1.
 
     Args:
         noise_scaling: Divisor of the predicted noise.
@@ -95,19 +95,19 @@ def check_noise_scaling(noise_scaling: float) -> float:
 
 
 class PrITTIPipeline:
-    """Generate, inpaint and outpaint Scenes. Methods and files follow diffusers' pipelines.
+    """Generate, inpaint and outpaint Scenes. Methods and file formats are similar to those of diffusers pipelines.
 
     Args:
         lvae: Layout VAE.
         dit: Diffusion transformer that was trained on the latents of `lvae`.
-        scheduler: Noise schedule and sampler, as a SchedulerConfig or a scheduler of diffusers (default: the paper's
-            DDPM).
-        noise_scaling: Divisor of the predicted noise for all samplers but the paper's (`diffusion.scale_noise`). The
-            paper does not scale the noise.
+        scheduler: Noise schedule and sampler, given as a SchedulerConfig or a diffusers scheduler. None: DDPM, as in
+            the paper.
+        noise_scaling: Divisor of the predicted noise (`diffusion.scale_noise`) for all samplers except DDPM. The paper
+            does not scale the noise.
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
 
     Raises:
-        ValueError: The DiT was trained on layouts of another LayoutSpec.
+        ValueError: The LayoutSpec of the DiT differs from that of `lvae`.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class PrITTIPipeline:
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
-        """Load a pipeline from a local directory or by the name of included weights; nothing is downloaded.
+        """Load a pipeline from a local directory, or load included weights by name. Nothing is downloaded.
 
         Args:
-            directory: Directory that `save_pretrained` or jobs/train_dit.py wrote, or a name such as "town"
+            directory: Directory written by `save_pretrained` or jobs/train_dit.py, or a name such as "town"
                 (models/pretrained.py).
             torch_dtype: Data type of the parameters; None: the stored data type.
 
@@ -140,7 +140,7 @@ class PrITTIPipeline:
             The pipeline in evaluation mode on the CPU.
 
         Raises:
-            ValueError: There is no complete pipeline, or a file is damaged.
+            ValueError: The directory does not contain a complete pipeline, or a file is damaged.
         """
         path = Path(find_pipeline_path(directory))
         index = read_config(path / INDEX_NAME)
@@ -178,7 +178,7 @@ class PrITTIPipeline:
 
     @property
     def scheduler(self) -> Any:
-        """Scheduler of diffusers, which is imported on first use."""
+        """The diffusers scheduler; diffusers is imported on first use."""
         if self._scheduler is None:
             self._scheduler = self.scheduler_config.build()
         return self._scheduler
@@ -200,7 +200,7 @@ class PrITTIPipeline:
     def use_sampler(self, name: str) -> None:
         """Select a sampler by name.
 
-        Any other scheduler of diffusers may be assigned to `scheduler`.
+        To use any other diffusers scheduler, assign it to `scheduler`.
 
         Args:
             name: Key of `models.sampling.schedulers.SAMPLERS`; "ddpm" is the paper's sampler.
@@ -212,7 +212,7 @@ class PrITTIPipeline:
 
     @property
     def uses_ddpm(self) -> bool:
-        """Whether the sampler is the paper's."""
+        """True if the sampler is that of the paper (DDPM)."""
         return self.scheduler_config.class_name == "DDPMScheduler"
 
     def register_modules(self, **components: Any) -> None:
@@ -286,7 +286,7 @@ class PrITTIPipeline:
         return Diffusion(config["num_train_timesteps"], config["beta_start"], config["beta_end"])
 
     def _moments(self) -> tuple[Tensor, Tensor]:
-        """Return shift and scale (c, 1, 1) of the latents."""
+        """Return the shift and the scale of the latents, each of shape (c, 1, 1)."""
         channels = self.dit.config.channels
         shift, scale = self.dit.config.shift or [0.0] * channels, self.dit.config.scale or [1.0] * channels
         shift, scale = (torch.tensor(values, device=self.device)[:, None, None] for values in (shift, scale))
@@ -294,10 +294,10 @@ class PrITTIPipeline:
 
     @torch.no_grad()
     def encode(self, scenes: Sequence[Scene]) -> Float[Tensor, "b c h w"]:
-        """Encode scenes to the posterior means, normalised as the diffusion model expects.
+        """Encode scenes to posterior means, and normalise these means for the diffusion model.
 
         Args:
-            scenes: Scenes over the area of the model's grid.
+            scenes: Scenes that cover the area of the model's grid.
 
         Returns:
             Latents.
@@ -311,8 +311,8 @@ class PrITTIPipeline:
     ) -> list[Scene]:
         """Decode latents to scenes.
 
-        Latents are decoded one at a time, so that each scene is bit-identical in any batch. A cell decoder may propose
-        the same object in two cells; the proposal with the higher existence probability is kept.
+        Latents are decoded one at a time. Each scene is therefore bit-identical for any batch size. A cell decoder may
+        propose the same object in two cells; the proposal with the higher existence probability is kept.
 
         Args:
             latents: Latents.
@@ -338,7 +338,7 @@ class PrITTIPipeline:
         return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
 
     def new_identity(self, run: str, seed: int, index: int, label: str) -> Scene:
-        """Return an empty Scene with the id of a generated scene and the requested labels.
+        """Return an empty Scene that has the id and the labels of the generated scene.
 
         Args:
             run: Run name.
@@ -381,13 +381,13 @@ class PrITTIPipeline:
         return with_guidance(self.dit.precompute_conditioning(timesteps.tolist(), labels), null, guidance_scale)
 
     def resolve_noise_scaling(self, noise_scaling: float | None) -> float:
-        """Return the given noise scaling, or the default for the current sampler.
+        """Return a noise scaling, or the default of the current sampler if the argument is None.
 
         Args:
-            noise_scaling: Divisor of the predicted noise, or None for the default.
+            noise_scaling: Divisor of the predicted noise; None: the default.
 
         Returns:
-            The divisor; its default is 1 for DDPM.
+            The divisor. For DDPM, the default is 1.
 
         Raises:
             ValueError: The number is not between 0.9 and 1.1.
@@ -397,10 +397,10 @@ class PrITTIPipeline:
         return check_noise_scaling(noise_scaling)
 
     def resolve_existence_threshold(self, existence_threshold: float | None) -> float:
-        """Return the given existence threshold, or the pipeline's default.
+        """Return an existence threshold, or the default of the pipeline if the argument is None.
 
         Args:
-            existence_threshold: Threshold, or None for the default.
+            existence_threshold: Threshold; None: the default.
 
         Returns:
             The threshold.
@@ -416,7 +416,7 @@ class PrITTIPipeline:
 
     @contextmanager
     def _step_callback(self, num_evaluations: int, callback: StepCallback | None) -> Iterator[OnStep]:
-        """Yield the function that a sampler calls after each step.
+        """Yield a function for the sampler to call after each step.
 
         The function advances the progress bar and calls the user's callback.
         """
@@ -438,7 +438,7 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         noise_scaling: float | None = None,
     ) -> Float[Tensor, "b c h w"]:
-        """Sample latents; each one depends only on (seed, its index, its label).
+        """Sample latents. Each latent depends only on the seed, its index and its label.
 
         Args:
             labels: Label of each scene.
@@ -462,7 +462,7 @@ class PrITTIPipeline:
                 schedule = SamplingSchedule(self.diffusion, num_inference_steps)
                 model = scale_noise(self._denoiser(schedule.timesteps, label, guidance_scale), noise_scaling)
                 return sample(model, schedule, noise, label, on_step=on_step)
-            # Raise an error for an invalid number, which diffusers would accept.
+            # Raise an error for an invalid number of steps; diffusers would accept it.
             self.diffusion.select_timesteps(num_inference_steps)
             self.scheduler.set_timesteps(num_inference_steps, device=self.device)
             timesteps = self.scheduler.timesteps
@@ -489,7 +489,7 @@ class PrITTIPipeline:
     ) -> list[Scene]:
         """Generate one Scene per label.
 
-        Scene i depends only on (seed, indices[i], its label), not on its batch.
+        Scene i depends only on the seed, indices[i] and labels[i], but not on the other scenes of the batch.
 
         Args:
             labels: Label of each scene, such as "low".
@@ -497,10 +497,11 @@ class PrITTIPipeline:
             indices: Index of each scene within the run (default: 0, 1, ...).
             num_inference_steps: Number of denoising steps; the paper uses 250.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
-            run: Run name, which is part of the scene ids.
-            generator: Generator that draws the seed, or one generator per scene. A generator replaces `seed`.
-            callback_on_step_end: Function that is called as f(pipeline, step, timestep, {"latents": ...}) after each
-                step. The function returns such a dict with the latents for the next step.
+            run: Run name; it is part of the scene ids.
+            generator: One generator for all scenes, or one per scene. None: `seed` is used; otherwise, `seed` is
+                ignored.
+            callback_on_step_end: Function f(pipeline, step, timestep, {"latents": ...}), called after each step. It
+                returns a dictionary {"latents": ...} for the next step.
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
             existence_threshold: Only primitives with a higher existence probability are kept; None: the threshold of
                 the pipeline.
@@ -534,7 +535,7 @@ class PrITTIPipeline:
     ) -> Float[Tensor, "b c h w"]:
         """Sample latents with RePaint (paper, Sec. 3.3).
 
-        The latents equal the condition exactly where its mask is 0.
+        Where the mask of the condition is 0, the latents are bit-identical to the condition.
 
         Args:
             condition: Known latents and masks.
@@ -583,29 +584,29 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         composite: bool = True,
     ) -> list[Scene]:
-        """Regenerate scenes inside their regions, which grow to whole latent cells (paper, Sec. 3.3).
+        """Regenerate a region of each scene; regions are enlarged to whole latent cells (paper, Sec. 3.3).
 
         Args:
             scenes: Scenes on the model's grid.
             regions: Mask (rows, cols) per scene, True = regenerate (models/composition/inpaint.py).
             labels: Label of each scene.
-            contents: "objects" regenerates objects on the known ground, "ground" regenerates the ground under the known
-                objects, and "both" regenerates both.
+            contents: "objects": regenerate objects on the known ground. "ground": regenerate the ground under the known
+                objects. "both": regenerate ground and objects.
             seed: Seed of the run.
             indices: Key of each scene; the noise depends on it (default: 0, 1, ...).
             repaint: Options of RePaint; None: the options of the paper.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             generator: See `generate`.
             callback_on_step_end: See `generate`.
-            composite: If True, copy everything outside the regions from the input. If False, everything outside is the
-                decoders' reconstruction.
+            composite: If True, copy everything outside the regions from the input. If False, the area outside the
+                regions is the reconstruction by the decoders.
 
         Returns:
             The regenerated scenes.
 
         Raises:
-            ValueError: A scene is not on the model's grid, or the model's latent is not split and `contents` is not
-                "both".
+            ValueError: A scene is not on the model's grid, or `contents` is not "both" although the latent is not
+                split.
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
@@ -648,25 +649,25 @@ class PrITTIPipeline:
         callback_on_step_end: StepCallback | None = None,
         side: Side | None = None,
     ) -> Scene:
-        """Extend a scene by generated blocks; the content of the input is kept (paper, supplement B.3).
+        """Extend a scene by generated blocks; the input content is unchanged (paper, supplement B.3).
 
         Args:
-            scene: Scene on the model's grid. With `side`, the scene may have any size of at least one block.
-            label: Label of all blocks, or label by block index (steps ahead, steps to the left).
+            scene: Scene on the model's grid. If `side` is set, the scene may be larger than one block.
+            label: One label for all blocks, or a mapping from block index (steps ahead, steps to the left) to label.
             seed: Seed of the run.
             index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent
                 cells.
-            mode: "copy" copies the shifted latent of the neighbours, as in the paper. "reencode" decodes the known
-                part, transforms it into the block's frame and height, and encodes it again. Object latents contain
-                absolute centres, which a copy does not change.
-            num_blocks: Number of blocks to add ahead, behind, to the left and to the right. One block on every side is
-                the paper's outpainting.
+            mode: "copy" copies the shifted latents of the neighbours, as in the paper. "reencode" transforms the
+                decoded content of the neighbours into the frame of the block and encodes it again. Object latents
+                contain absolute centres, which a copy does not change.
+            num_blocks: Number of blocks to add ahead, behind, to the left and to the right. The paper adds one block on
+                every side.
             repaint: Options of RePaint; None: the options of the paper.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
-            side: Extend by (1 - overlap) of a block to this side only ("ahead", "behind", "left", "right"). With
-                `side`, `num_blocks` is ignored.
+            side: Extend the scene on this side only, by (1 - overlap) of a block: "ahead", "behind", "left" or "right".
+                If `side` is set, `num_blocks` is ignored.
 
         Returns:
             One scene that covers all blocks.
@@ -676,7 +677,7 @@ class PrITTIPipeline:
         """
         if side is not None:
             if not isinstance(label, str):
-                raise ValueError("outpainting to one side takes one label for all blocks")
+                raise ValueError("to extend a scene on one side, pass one label for all blocks")
             return extend_scene(self, scene, side, label, seed, overlap, repaint, guidance_scale, callback_on_step_end)
         self.require_grid(scene)
         return outpaint_scene(
@@ -694,7 +695,7 @@ class PrITTIPipeline:
         )
 
     def require_grid(self, scene: Scene) -> None:
-        """Raise an error if a scene does not have the model's grid and ground classes.
+        """Raise an error if the grid or the ground classes of a scene differ from those of the model.
 
         Args:
             scene: Scene.

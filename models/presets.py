@@ -1,7 +1,7 @@
-"""Presets: one table row of options per model size. All presets use the same code.
+"""Presets: options of each model size, as one row of a table. All presets use the same code.
 
 * `smoke` trains within seconds, for tests.
-* `demo` and `town` train on two CPU cores: the layout VAE in half an hour and the transformer in three hours.
+* `demo` and `town` train on two CPU cores; the layout VAE takes half an hour and the transformer three hours.
 * `kitti360` and `av2` are the paper's models (supplement B.2 and B.3).
 """
 
@@ -20,7 +20,7 @@ class LVAEPreset:
     """Architecture and training options of a layout VAE.
 
     Attributes:
-        source: Source of the scenes that the preset is designed for.
+        source: Name of the source for which the preset is designed.
         raster_px: Number of rows and of columns of the rasters.
         model: Architecture.
         batch_size: Samples per step.
@@ -31,8 +31,8 @@ class LVAEPreset:
         warmup_steps: Number of initial steps during which the learning rate rises linearly.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
-        kl_weight: Weight of the KL term, which is summed over the latent.
-        latent_noise: Standard deviation of noise on the training latents. The noise makes decoders tolerate errors in
+        kl_weight: Weight of the KL loss, which is summed over the latent.
+        latent_noise: Scale of the noise that is added to training latents. The noise makes decoders tolerate errors in
             sampled latents. The paper adds no noise.
     """
 
@@ -51,14 +51,15 @@ class LVAEPreset:
     latent_noise: float = 0.0
 
     def architecture(self) -> dict:
-        """Return the keyword arguments of `LayoutVAE` except the layout."""
+        """Return all keyword arguments of `LayoutVAE` except the layout."""
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
 LOWER_RATE: dict[str, Any] = {"learning_rate": 1e-3}
 QUICK: dict[str, Any] = {"learning_rate": 4e-3, "final_learning_rate": 1e-5, "warmup_steps": 50, "grad_clip": 1.0}
 
-# PAPER has the paper's networks (supplement B.2). SMALL_CELLS and PAPER_CELLS use the cell decoder for objects.
+# PAPER describes the networks of the paper (supplement B.2). SMALL_CELLS and PAPER_CELLS use the cell decoder for
+# objects.
 PAPER = LayoutVAEConfig(32, GroundConfig((64, 128, 256, 512), 32), ObjectConfig(512, 6, 8, 1024, 1024))
 SMOKE = LayoutVAEConfig(4, GroundConfig((8, 16, 16), 4), ObjectConfig(32, 1, 2, 64, 32))
 SMALL_CELLS = ObjectConfig(128, 2, 4, 256, 256, decoder="cells", min_proposals_per_cell=3)
@@ -72,11 +73,11 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "smoke":    LVAEPreset("town",      32,  SMOKE, 4,     8,       learning_rate=1e-3, final_learning_rate=1e-4),
     "demo":     LVAEPreset("town",      128, DEMO,  8,     5_000,   latent_noise=0.3, **QUICK),
     "town":     LVAEPreset("town",      256, TOWN,  8,     2_000,   kl_weight=1e-7, **QUICK),
-    # The paper states three days of training on one A100 but no number of steps.
+    # The paper reports three days of training on one A100 but not the number of steps.
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000),
     # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
-    # The latent has the shape of the paper's, and training costs less.
+    # Its latent has the same shape as in the paper, but training costs less.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,
                                  **(QUICK | LOWER_RATE)),
 }
@@ -85,7 +86,7 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
 
 @dataclass(frozen=True)
 class DiTConfig:
-    """Architecture of a `DiT`, except the shape and the statistics of its latents.
+    """Architecture of a `DiT` without the shape and the statistics of its latents.
 
     Attributes:
         patch: Side of a patch in latent cells.
@@ -107,18 +108,18 @@ class DiTPreset:
     """Architecture and training options of a diffusion transformer.
 
     Attributes:
-        lvae: LVAE preset whose latents the transformer is trained on.
+        lvae: Name of the preset of the layout VAE.
         model: Architecture.
         batch_size: Samples per step.
         steps: Number of training steps.
-        normalise_latents: Shift and scale each latent channel to zero mean and unit variance. The paper and SLEDGE do
-            not normalise latents.
+        normalise_latents: If True, shift and scale each latent channel to zero mean and unit variance. The paper and
+            SLEDGE do not normalise latents.
         learning_rate: Learning rate.
         weight_decay: Weight decay of AdamW.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
-        label_dropout: Probability of training a sample with the null label. The paper does not specify this
-            probability; DiT uses 0.1.
+        label_dropout: Probability that a training sample gets the null label. The paper does not specify it; DiT uses
+            0.1.
     """
 
     lvae: str
@@ -133,7 +134,7 @@ class DiTPreset:
     label_dropout: float = 0.1
 
     def architecture(self) -> dict:
-        """Return the keyword arguments of `DiT` except those that depend on the latents."""
+        """Return all keyword arguments of `DiT` except those that depend on the latents."""
         return {field.name: getattr(self.model, field.name) for field in fields(self.model)}
 
 
@@ -146,7 +147,7 @@ DIT_PRESETS: dict[str, DiTPreset] = {
     "smoke":       DiTPreset("smoke",    DiTConfig(2, 1, 32, 2),     8,   8, True, 1e-3),
     "demo":        DiTPreset("demo",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
     "town":        DiTPreset("town",     SMALL_DIT,                  16,  30_000, **TOWN_TRAINING),
-    # The paper states three days of training on four A100s but no number of steps.
+    # The paper reports three days of training on four A100s but not the number of steps.
     "kitti360":    DiTPreset("kitti360", DiTConfig(2, 12, 768, 12),  256, 400_000),
     "kitti360-l":  DiTPreset("kitti360", DiTConfig(2, 24, 1024, 16), 256, 400_000),
     "kitti360-xl": DiTPreset("kitti360", DiTConfig(2, 28, 1152, 16), 256, 400_000),
@@ -166,7 +167,7 @@ def find_preset(table: dict[str, Preset], name: str) -> Preset:
         The preset.
 
     Raises:
-        ValueError: The name is unknown; the message lists the known names.
+        ValueError: The name is unknown. The message lists the valid names.
     """
     if name not in table:
         raise ValueError(f"unknown preset {name!r}, expected one of: {', '.join(table)}")

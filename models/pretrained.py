@@ -1,4 +1,4 @@
-"""Weights that the package includes: one pipeline directory per model, models/weights/<name>, with a model card."""
+"""Weights included in the package. Each model has a pipeline directory models/weights/<name> with a model card."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import os
 from pathlib import Path
 
 WEIGHTS = Path(__file__).parent / "weights"
-INDEX_NAME = "model_index.json"  # every pipeline directory holds this file
+INDEX_NAME = "model_index.json"  # Every pipeline directory contains this file.
 CHECKSUMS_NAME = "checksums.json"
-TRAINING_NAME = "training.json"  # training facts of the model card, for runs that start from these weights
+TRAINING_NAME = "training.json"  # Facts about the training. Runs that start from these weights read this file.
 
 
 def list_released() -> list[str]:
@@ -18,16 +18,16 @@ def list_released() -> list[str]:
 
 
 def find_pipeline_path(model: str | os.PathLike) -> str:
-    """Find the directory of a pipeline on this machine; nothing is downloaded.
+    """Find the local directory of a pipeline; nothing is downloaded.
 
     Args:
-        model: Path of a pipeline directory or name of included weights. An existing path has precedence.
+        model: Path of a pipeline directory or name of included weights. If both exist, the path is used.
 
     Returns:
         Path of the directory.
 
     Raises:
-        ValueError: There is neither such a directory nor such a name.
+        ValueError: `model` is neither an existing directory nor the name of included weights.
     """
     model = os.fspath(model)
     if os.path.exists(os.path.join(model, INDEX_NAME)):
@@ -46,7 +46,7 @@ def compute_checksums(directory: str | os.PathLike) -> dict[str, str]:
         directory: Pipeline directory.
 
     Returns:
-        Hexadecimal digests by path relative to `directory`.
+        Mapping from path (relative to `directory`) to hexadecimal digest.
     """
     root = Path(directory)
     files = [root / INDEX_NAME, *sorted(path for path in root.glob("*/*") if path.suffix in (".safetensors", ".json"))]

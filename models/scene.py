@@ -1,10 +1,10 @@
-"""Scene: one semantic layout of 64 m x 64 m as arrays in metres (paper, Sec. 3.1).
+"""Scene: one semantic layout of 64 m x 64 m, stored as arrays in metres (paper, Sec. 3.1).
 
-Real and generated scenes use the same class and the same scene frame. The origin of the scene frame is the ego vehicle,
-and the axes are **x forward, y left, z up**, aligned with gravity.
+Real and generated scenes use the same class and the same scene frame. The origin of the scene frame is the ego vehicle.
+**x points forward, y to the left, and z up** (against gravity).
 
-Differs from the paper, whose frame keeps the pitch and roll of the IMU. With pitch and roll, the ground of neighbouring
-blocks would not meet.
+The frame of the paper also has the pitch and roll of the IMU. Without them, the ground of neighbouring blocks fits
+together.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-# Paper, supplement Tab. "object categories". The slots of a layout have the same order.
+# Categories of the paper (supplement Tab. "object categories"). Slots of a layout have the same order.
 CATEGORIES = (
     "vegetation_cuboid",
     "vegetation_ellipsoid",
@@ -42,18 +42,18 @@ DRIVABLE_CLASSES = (*ROAD_CLASSES, "parking")
 
 DENSITIES = ("low", "medium", "high")
 
-# Fields of a Scene that hold one row per primitive.
+# Fields of a Scene with one row per primitive.
 PER_PRIMITIVE = ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A pixel grid in top view in the scene frame; row 0 is farthest ahead and column 0 is leftmost.
+    """Pixel grid in top view in the scene frame. Row 0 is farthest ahead; column 0 is leftmost.
 
     The centre of pixel (row, col) is x = front_m - (row + .5) resolution_m, y = left_m - (col + .5) resolution_m.
 
     Attributes:
-        front_m: x of the far border (metres, scene frame).
+        front_m: x of the front border (metres, scene frame).
         left_m: y of the left border (metres, scene frame).
         resolution_m: Side of a pixel (metres).
         rows: Number of rows.
@@ -87,25 +87,25 @@ class Grid:
     def contains(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> Any:
         """Test whether points lie inside the rectangle of the grid.
 
-        The far and the left border belong to the rectangle; the other two borders do not.
+        The front border and the left border belong to the rectangle; the other two borders do not.
 
         Args:
             x_m: x coordinates (metres, scene frame).
             y_m: y coordinates (metres, scene frame).
 
         Returns:
-            Boolean, or array of booleans with the broadcast shape of the inputs.
+            Booleans with the broadcast shape of the inputs.
         """
         return (x_m > self.back_m) & (x_m <= self.front_m) & (y_m > self.right_m) & (y_m <= self.left_m)
 
     def intersect(self, other: Grid) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Find the pixels of this grid and of another one that cover the same area.
+        """Find the pixels in which this grid overlaps another grid.
 
         Args:
             other: Grid of the same resolution in the same frame.
 
         Returns:
-            Row and column slices of this grid, then those of `other`.
+            Row and column slices into this grid, then row and column slices into `other`.
 
         Raises:
             ValueError: The grids are not aligned to whole pixels.
@@ -114,17 +114,17 @@ class Grid:
         col0 = (other.left_m - self.left_m) / self.resolution_m
         aligned = np.allclose([row0, col0], np.round([row0, col0]), atol=1e-6)
         if other.resolution_m != self.resolution_m or not aligned:
-            raise ValueError(f"grid {self} is not aligned with {other} to whole pixels")
+            raise ValueError(f"{self} and {other} must have the same resolution and differ by whole pixels")
         here, there = [], []
         for ahead, count, others in ((round(row0), self.rows, other.rows), (round(col0), self.cols, other.cols)):
-            start = max(0, -ahead)  # `ahead` is the index in the other grid of pixel 0 of this grid
+            start = max(0, -ahead)  # `ahead`: index of this grid's first pixel in the other grid.
             stop = max(start, min(count, others - ahead))
             here.append(slice(start, stop))
             there.append(slice(start + ahead, stop + ahead))
         return (here[0], here[1]), (there[0], there[1])
 
     def upsample_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Repeat each coarse cell over its block of pixels.
+        """Upsample values of cells to pixels by repeating them.
 
         Args:
             cells: (h, w) values; h must divide `rows` and w must divide `cols`.
@@ -151,13 +151,13 @@ class Grid:
 
 
 def canonicalize_boxes(rotation: np.ndarray, size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rewrite boxes so that the height axis is nearest to the vertical, length >= width and yaw in [-pi/2, pi/2).
+    """Order the axes of boxes: the most vertical axis is the height, length >= width, and yaw is in [-pi/2, pi/2).
 
-    The point sets of the boxes do not change. A mirrored input (determinant < 0) becomes right-handed, because a box
-    equals its mirror image.
+    The boxes themselves do not change. Left-handed axes (determinant < 0) become right-handed, because a box equals its
+    mirror image.
 
     Args:
-        rotation: (n, 3, 3) axes of the boxes in the scene frame, as columns.
+        rotation: (n, 3, 3) matrices; their columns are the axes of the boxes in the scene frame.
         size_m: (n, 3) full extents along these axes (metres).
 
     Returns:
@@ -186,7 +186,7 @@ def compute_yaw(rotation: np.ndarray) -> np.ndarray:
     """Compute the yaw of the length axis.
 
     Args:
-        rotation: (n, 3, 3) axes of the boxes as columns; column 0 is the length axis.
+        rotation: (n, 3, 3) matrices; their columns are the axes of the boxes, and column 0 is the length axis.
 
     Returns:
         (n,) yaw in radians, in [-pi/2, pi/2) for canonical boxes.
@@ -198,7 +198,7 @@ def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     """Return rotation matrices about the z axis.
 
     Args:
-        yaw_rad: Angle to the left (radians), any shape.
+        yaw_rad: Rotation angles, positive to the left (radians, any shape).
 
     Returns:
         (..., 3, 3) rotation matrices.
@@ -209,7 +209,7 @@ def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     return np.stack(rows, -2)
 
 
-UNSET = np.zeros(0)  # placeholder; `Scene` replaces it by an array with one default per primitive
+UNSET = np.zeros(0)  # Placeholder. `Scene` replaces it by an array of defaults.
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,27 +219,28 @@ class Scene:
     Attributes:
         scene_id: Unique id of the scene.
         source: Name of the source.
-        sequence: Name of the drive; for a generated scene, its seed.
-        frame: Index of the frame within the drive; for a generated scene, its index within the run.
+        sequence: Name of the drive; for generated scenes, the seed.
+        frame: Index of the frame within the drive; for generated scenes, the index of the scene within the run.
         split: Name of the split.
         category: Category of each primitive.
         center_m: Centres.
-        rotation: Axes of the primitives as columns, canonical (`canonicalize_boxes`).
-        size_m: Full extents along the columns of `rotation`, canonical (`canonicalize_boxes`).
-        ground_classes: Ground classes of the rasters.
+        rotation: Rotation matrices, whose columns are the axes of the primitives in canonical order
+            (`canonicalize_boxes`).
+        size_m: Length, width and height: full extents along the columns of `rotation`.
+        ground_classes: Names of the ground classes of the rasters.
         height_m: Ground height per ground class; 0 where `occupied` is False.
         occupied: Ground mask per ground class.
         grid: Pixel grid of the rasters.
         existence: Existence probability; 1 for annotated primitives.
-        heading_rad: Direction of travel; NaN where it is unknown. The scatter matrix does not distinguish the front of
-            an object from its back.
-        instance_id: Id of the object in the source's annotation; -1 if there is none.
-        label: Class name of the object in the source's annotation (default: the name of the category).
+        heading_rad: Direction of travel; NaN where it is unknown. Decoded primitives have no heading, because Cholesky
+            parameters do not distinguish front and back.
+        instance_id: Id of the object in the annotation of the source; -1: no id.
+        label: Class name of the object in the annotation of the source; default: the name of the category.
         world_xyz_m: Position of the scene frame's origin in the world frame.
         world_yaw_rad: Yaw of the scene frame in the world frame.
-        world_from_imu: (3, 4) full pose from the source, or None.
-        vegetation_density: Density label of the vegetation, or None if it is unknown.
-        vehicle_density: Density label of the vehicles, or None if it is unknown.
+        world_from_imu: (3, 4) full pose from the source; None: unknown.
+        vegetation_density: Density label of the vegetation; None: unknown.
+        vehicle_density: Density label of the vehicles; None: unknown.
     """
 
     scene_id: str
@@ -303,16 +304,16 @@ class Scene:
 
     @property
     def bottom_m(self) -> np.ndarray:
-        """(n,) z of the lowest point of each primitive (metres, scene frame)."""
+        """(n,) z coordinate of the lowest point of each primitive (metres, scene frame)."""
         half_m = 0.5 * np.abs(self.rotation[:, 2, :]) * self.size_m
         down_m = np.where(self.category == ELLIPSOID, np.sqrt((half_m**2).sum(axis=1)), half_m.sum(axis=1))
         return self.center_m[:, 2] - down_m
 
     def ground_under(self) -> tuple[np.ndarray, np.ndarray]:
-        """Look up the fused ground (`surface`) under the centre of each primitive.
+        """Return height and class of the ground under the centre of each primitive, from the fused ground (`surface`).
 
         Returns:
-            Height (n,) in metres, NaN without ground, and class (n,), -1 without ground.
+            Height (n,) in metres and class (n,). If there is no ground, the height is NaN and the class is -1.
         """
         height_m, winner = self.surface()
         x_m, y_m = self.center_m[:, 0], self.center_m[:, 1]
@@ -332,11 +333,11 @@ class Scene:
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Fuse the ground classes into one surface (paper, supplement B.2, Layout Reconstruction).
 
-        The highest class is kept at each pixel. If two classes have the same height, the class with the higher index is
-        kept, because a crossing lies on its road.
+        At each pixel, the class with the greatest height is kept. If two classes have the same height, the class with
+        the higher index is kept. A crossing therefore replaces the road under it.
 
         Returns:
-            Height (H, W) in metres, and class (H, W) int8 as index into `ground_classes`, -1 without ground.
+            Height (H, W) in metres, and class (H, W) int8 as an index into `ground_classes`; -1: no ground.
         """
         top = np.full(self.height_m.shape[1:], -np.inf, np.float32)
         winner = np.full(top.shape, -1, np.int8)
@@ -351,7 +352,7 @@ class Scene:
         """Return the scene with a subset of its primitives.
 
         Args:
-            keep: Mask or indices of the primitives to keep; indices also set the order.
+            keep: Mask or indices of the primitives to keep. Indices also define the order of the result.
 
         Returns:
             The scene with these primitives and the same ground.
@@ -359,7 +360,7 @@ class Scene:
         return replace(self, **{name: getattr(self, name)[keep] for name in PER_PRIMITIVE})
 
     def translate(self, dx_m: float, dy_m: float, dz_m: float = 0.0) -> Scene:
-        """Return the scene with all primitives, the ground and the grid moved by (dx, dy, dz).
+        """Return the scene moved by (dx, dy, dz), including primitives, ground and grid.
 
         Args:
             dx_m: Translation along x (metres).
@@ -375,13 +376,13 @@ class Scene:
         return replace(self, center_m=center, height_m=height, grid=grid)
 
     def crop(self, grid: Grid) -> Scene:
-        """Return the part of the scene inside another grid; pixels outside this scene are empty.
+        """Crop the scene to another grid. Pixels outside the scene are empty.
 
         Args:
             grid: Grid of the same resolution, aligned to whole pixels.
 
         Returns:
-            The scene on `grid`, with the primitives whose centre lies inside it.
+            The scene on `grid`, with all primitives whose centre lies inside `grid`.
 
         Raises:
             ValueError: The grids are not aligned.
@@ -395,17 +396,17 @@ class Scene:
 
 
 def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
-    """Merge scenes on one grid: each pixel comes from the scene that owns it.
+    """Merge scenes on the same grid. Each pixel comes from the scene that owns it.
 
     A primitive is kept if its scene owns the pixel under its centre.
 
     Args:
         scenes: Scenes on `like.grid`.
-        owned: (H, W) bool mask per scene; the masks are disjoint.
-        like: Scene that provides ids, labels, pose and grid.
+        owned: One mask (H, W) bool per scene; True marks owned pixels. The masks are disjoint.
+        like: Scene whose ids, labels, pose and grid are copied to the result.
 
     Returns:
-        One scene with the fields of `like` and the merged content.
+        The merged scene; all fields except the content come from `like`.
     """
     height, occupied = np.zeros_like(like.height_m), np.zeros_like(like.occupied)
     parts = []
@@ -424,6 +425,6 @@ def concatenate_primitives(scenes: Sequence[Scene]) -> dict[str, Any]:
         scenes: Scenes in order.
 
     Returns:
-        The per-primitive fields of a Scene by name.
+        Mapping from the name of each per-primitive field to its concatenated values.
     """
     return {name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in PER_PRIMITIVE}

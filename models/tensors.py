@@ -1,4 +1,4 @@
-"""Convert scenes to layout tensors of a LayoutSpec, and decoded layouts back to scenes."""
+"""Convert scenes to layout tensors as defined by a LayoutSpec, and convert decoded layouts back to scenes."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ EXISTENCE_THRESHOLD = 0.3  # paper, supplement B.2, Implementation Details
 
 
 def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Resample ground classes of a scene onto another grid over the same area (`resample_ground`).
+    """Resample the ground of a scene to another grid that covers the same area (see `resample_ground`).
 
     Args:
         scene: Scene.
-        ground_classes: Names of the classes of the result.
+        ground_classes: Names of the ground classes of the result.
         grid: Grid of the result.
 
     Returns:
@@ -34,11 +34,11 @@ def resample_scene_ground(scene: Scene, ground_classes: tuple[str, ...], grid: G
 
 
 def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rasters of the given ground classes; classes that the scene lacks are empty.
+    """Return the rasters of some ground classes. Rasters of classes that the scene does not have are empty.
 
     Args:
         scene: Scene.
-        ground_classes: Names of the classes of the result, in order.
+        ground_classes: Names of the ground classes of the result, in this order.
 
     Returns:
         Height (G, H, W) in metres and mask (G, H, W) of these classes.
@@ -55,26 +55,26 @@ def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tupl
 
 
 def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Resample rasters onto another grid over the same area.
+    """Resample rasters to another grid that covers the same area.
 
     On a coarser grid, a pixel is occupied if at least half of its area is occupied. The height of such a pixel is the
-    mean over its occupied part. On a finer grid, values are those of the nearest pixel.
+    mean height of its occupied part. On a finer grid, each pixel has the value of the nearest input pixel.
 
     Args:
         height: (G, H, W) heights, in metres or as unsigned integers.
         occupied: (G, H, W) masks.
-        own: Grid of the rasters.
+        own: Grid of the input rasters.
         grid: Grid of the result.
 
     Returns:
-        Heights and masks on `grid`, with the data types of the inputs.
+        Heights and masks on `grid`; the data types are those of the inputs.
 
     Raises:
         ValueError: The grids cover different areas, or neither resolution is a whole multiple of the other.
     """
     covered, wanted = ((g.front_m, g.left_m, g.back_m, g.right_m) for g in (own, grid))
     if not np.allclose(covered, wanted):
-        raise ValueError(f"the scene covers {own}, expected the area of {grid}")
+        raise ValueError(f"the scene must cover the same area as {grid}, got {own}")
     if grid.rows == own.rows:
         return height, occupied
     if own.rows % grid.rows == 0:
@@ -89,13 +89,13 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
         f = grid.rows // own.rows
         height, occupied = (a.repeat(f, axis=1).repeat(f, axis=2) for a in (height, occupied))
         return height, occupied
-    raise ValueError(f"cannot resample {own.rows} rows to {grid.rows}: the ratio must be a whole number")
+    raise ValueError(f"cannot resample {own.rows} rows to {grid.rows} rows: one number must be a multiple of the other")
 
 
 def _sum_blocks(values: np.ndarray, f: int, dtype: np.typing.DTypeLike) -> np.ndarray:
     """Return sums (G, H / f, W / f) over blocks of f x f pixels.
 
-    Rows are added first, because they are contiguous in memory; the strided columns are then fewer.
+    Rows are added first, because rows are contiguous in memory and columns are not.
     """
     rows = sum(
         (values[:, i::f].astype(dtype, copy=False) for i in range(1, f)), values[:, ::f].astype(dtype, copy=False)
@@ -120,7 +120,7 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
     position[[CATEGORY_INDEX[name] for name in spec.categories]] = np.arange(len(spec.categories))
     position = position[category]
     order = np.lexsort((np.linalg.norm(center_m, axis=1), position))
-    order = order[np.searchsorted(position[order], 0) :]  # drop categories that the spec lacks
+    order = order[np.searchsorted(position[order], 0) :]  # Drop categories that the spec does not have.
     group = position[order]
     rank = np.arange(len(order)) - np.searchsorted(group, group)
     slots = np.array(spec.slots)
@@ -129,17 +129,17 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
 
 
 def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
-    """Encode a scene as compact arrays, which are cheap to send between processes.
+    """Encode a scene as compact arrays, which are small enough to send between processes.
 
-    `LayoutBatch.from_compact` converts them to tensors.
+    `LayoutBatch.from_compact` converts these arrays to a batch.
 
     Args:
-        scene: Scene of any resolution over the area of `spec.grid`.
+        scene: Scene that covers the area of `spec.grid`, with any resolution.
         spec: LayoutSpec that defines the encoding.
 
     Returns:
-        height (G, H, W) uint16, where 65535 is the upper bound; occupied (G, H, W) bool; features (N, 9) float32; real
-        (N,) bool.
+        Dictionary with height (G, H, W) uint16, occupied (G, H, W) bool, features (N, 9) float32 and real (N,) bool. A
+        height of 65535 stands for the upper bound.
 
     Raises:
         ValueError: The scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
@@ -153,7 +153,7 @@ def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     """Encode the rasters of a scene.
 
     Args:
-        scene: Scene of any resolution over the area of `spec.grid`.
+        scene: Scene that covers the area of `spec.grid`, with any resolution.
         spec: LayoutSpec that defines the encoding.
 
     Returns:
@@ -175,7 +175,7 @@ def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
 
     Args:
         height_m: Heights (metres, scene frame), any shape.
-        spec: Gives the bounds, which map to 0 and 65535.
+        spec: LayoutSpec with the height bounds, which are mapped to 0 and 65535.
 
     Returns:
         uint16 array of the same shape; heights outside the bounds are clipped.
@@ -212,7 +212,7 @@ def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
     """Encode scenes as one batch on the CPU.
 
     Args:
-        scenes: Scenes over the area of `spec.grid`.
+        scenes: Scenes that cover the area of `spec.grid`.
         spec: LayoutSpec that defines the encoding.
 
     Returns:
@@ -229,14 +229,14 @@ def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
 
 @dataclass(frozen=True, eq=False)
 class DecodedLayout:
-    """One decoded layout as numpy arrays, before any threshold.
+    """One decoded layout as numpy arrays, before thresholds are applied.
 
     Attributes:
         occupancy: (G, H, W) probability that a pixel is occupied.
         height: (G, H, W) normalised heights.
         features: (n, 9) normalised features of the proposals.
         existence: (n,) existence probabilities.
-        category: (n,) index of each proposal's category in `LayoutSpec.categories`.
+        category: (n,) category of each proposal, as an index into `LayoutSpec.categories`.
     """
 
     occupancy: np.ndarray
@@ -256,8 +256,8 @@ def decode_layout(
     Args:
         layout: Output of a decoder.
         spec: LayoutSpec that defines the encoding.
-        identity: Scene that provides ids, pose and labels.
-        threshold: Primitives with a higher existence probability are kept.
+        identity: Scene whose ids, pose and labels are copied to the result.
+        threshold: Only primitives with a higher existence probability are kept.
 
     Returns:
         The scene on `spec.grid`.
@@ -293,11 +293,11 @@ def make_empty_scene(scene_id: str, source: str, sequence: str, frame: int, spec
         source: Name of the source.
         sequence: Name of the sequence.
         frame: Index within the sequence.
-        spec: Gives the grid and the ground classes.
-        **fields: Further fields of `Scene`.
+        spec: LayoutSpec with the grid and the ground classes.
+        **fields: Other fields of `Scene`.
 
     Returns:
-        A scene without primitives and ground.
+        A scene that has neither primitives nor ground.
     """
     shape = (len(spec.ground_classes), spec.grid.rows, spec.grid.cols)
     return Scene(

@@ -1,7 +1,8 @@
 """Denoising diffusion on layout latents (paper, supplement B.3): noise schedule and samplers.
 
-States number the visited timesteps: state i has the noise of timestep `timesteps[i]`, and state -1 is clean. Sampling
-visits the states n-1, n-2, ..., 0, -1. RePaint adds jumps back to noisier states (repaint.py).
+Sampling uses a subset of the timesteps. A latent in state i has the noise level of timestep `timesteps[i]`; a latent in
+state -1 has no noise. Sampling proceeds through the states n-1, n-2, ..., 0, -1. RePaint adds jumps back to noisier
+states (repaint.py).
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # Latent, timestep (b,), label (b,) -> noise.
-SceneKey = int | tuple[int, ...]  # A scene's index, or several numbers that identify it.
-OnStep = Callable[[int, int, Tensor], Tensor]  # Step, timestep, latent -> latent for the next step.
+Denoiser = Callable[[Tensor, Tensor, Tensor], Tensor]  # Maps latent, timestep (b,) and label (b,) to noise.
+SceneKey = int | tuple[int, ...]  # Index of a scene, or several integers that identify the scene.
+OnStep = Callable[[int, int, Tensor], Tensor]  # Maps step, timestep and latent to the next latent.
 
 
 @dataclass(frozen=True)
 class Diffusion:
-    """DDPM with a linear variance schedule; the defaults are the paper's (supplement B.3, Implementation Details).
+    """DDPM with a linear variance schedule; the defaults are those of the paper (supplement B.3).
 
     Attributes:
         num_timesteps: Number T of training timesteps.
@@ -37,15 +38,15 @@ class Diffusion:
 
     @cached_property
     def alpha_bar(self) -> np.ndarray:
-        """(T,) float64: cumulative product of 1 - beta_t."""
+        """(T,) float64 cumulative product of 1 - beta_t."""
         return np.cumprod(1 - np.linspace(self.beta_start, self.beta_end, self.num_timesteps, dtype=np.float64))
 
     def select_timesteps(self, num_inference_steps: int) -> np.ndarray:
         """Select ascending timesteps with "leading" spacing, for example 0, 4, ..., 996 for 250 of 1000.
 
-        Numbers that leave out a large part of the schedule are rejected. For example, 600 timesteps have a spacing of
-        1, so sampling starts at timestep 599. The network expects a signal share of 20 % at this timestep, but its
-        input is pure noise.
+        A number of timesteps is rejected if the selected timesteps do not cover most of the schedule. For example, 600
+        timesteps would have a spacing of 1, so sampling would start at timestep 599. At this timestep, the network
+        expects an input with 20 % signal, but the input would be pure noise.
 
         Args:
             num_inference_steps: Number n of timesteps.
@@ -86,17 +87,18 @@ class Diffusion:
 
 
 class SamplingSchedule:
-    """Visited timesteps of a sampling run and the transitions between their states.
+    """Timesteps of a sampling run, and the transitions between its states.
 
     Args:
         diffusion: Noise schedule.
-        num_inference_steps: Number of visited timesteps.
-        eta: Share of DDPM's noise that each step adds (DDIM; Song et al., 2021): 1 in the paper, 0 for none.
+        num_inference_steps: Number of timesteps that sampling uses.
+        eta: Fraction of the noise of DDPM that each step adds (DDIM; Song et al., 2021). The paper uses 1; 0 adds no
+            noise.
     """
 
     def __init__(self, diffusion: Diffusion, num_inference_steps: int, eta: float = 1.0) -> None:
         self.timesteps, self.eta = diffusion.select_timesteps(num_inference_steps), eta
-        self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # [-1] is the clean state
+        self.alpha_bar = np.append(diffusion.alpha_bar[self.timesteps], 1.0)  # The last entry is the clean state.
 
     def __len__(self) -> int:
         return len(self.timesteps)
@@ -111,7 +113,7 @@ class SamplingSchedule:
         Args:
             clean: Clean latent z_0.
             noise: Standard normal noise.
-            state: Target state; state -1 returns `clean` exactly.
+            state: Target state; for state -1, `clean` is returned unchanged.
 
         Returns:
             Latent at this state.
@@ -122,13 +124,13 @@ class SamplingSchedule:
         return a**0.5 * clean + (1 - a) ** 0.5 * noise
 
     def step_up(self, latent: Tensor, noise: Tensor, state: int, to: int) -> Tensor:
-        """Sample q(z_to | z_state): add the noise between two states.
+        """Add noise to move a latent to a higher state: sample q(z_to | z_state).
 
         Args:
             latent: Latent at `state`.
             noise: Standard normal noise.
             state: Current state.
-            to: Target state, above `state`.
+            to: Target state; it must be greater than `state`.
 
         Returns:
             Latent at state `to`.
@@ -137,10 +139,12 @@ class SamplingSchedule:
         return ratio**0.5 * latent + (1 - ratio) ** 0.5 * noise
 
     def step_down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
-        """Sample p(z_{state-1} | z_state). With eta 1, mean and variance are those of DDPM's posterior.
+        """Perform one denoising step: sample p(z_{state-1} | z_state).
 
-        The formula is written in terms of z_0, so it also holds for spaced timesteps (beta = 1 - alpha_bar_i /
-        alpha_bar_{i-1}).
+        If eta is 1, mean and variance are those of the posterior of DDPM.
+
+        The formula contains z_0 and therefore also holds for spaced timesteps, with beta = 1 - alpha_bar_i /
+        alpha_bar_{i-1}.
 
         Args:
             latent: Latent at `state`.
@@ -149,7 +153,7 @@ class SamplingSchedule:
             state: Current state.
 
         Returns:
-            Latent at the state below.
+            Latent at state `state` - 1.
         """
         a, a_prev = self.alpha_bar[state], self.alpha_bar[state - 1]
         variance = self.eta**2 * (1 - a_prev) / (1 - a) * (1 - a / a_prev)
@@ -163,9 +167,9 @@ GENERATE, OUTPAINT, INPAINT = 1, 2, 3
 
 
 class SceneNoise:
-    """Standard normal noise keyed by (seed, scene index, purpose); each scene has its own sequence.
+    """Standard normal noise. Each scene has a separate sequence, determined by seed, scene key and purpose.
 
-    A scene therefore does not depend on the batch size, the number of workers or the other scenes of its batch.
+    The noise of a scene does not depend on the batch size, the number of workers or the other scenes of the batch.
 
     Args:
         seed: One seed for all scenes, or one per scene.
@@ -189,13 +193,13 @@ class SceneNoise:
         self.shape, self.device = shape, device
 
     def draw(self) -> Float[Tensor, "b ..."]:
-        """Return the next noise (b, *shape) of the scenes."""
+        """Return the next noise of all scenes, of shape (b, *shape)."""
         noise = torch.stack([torch.randn(self.shape, generator=generator) for generator in self.generators])
         return noise.to(self.device)
 
 
 def make_keyed_generator(*key: int) -> torch.Generator:
-    """Make a CPU generator that depends on the numbers of a key only.
+    """Return a CPU generator that depends only on the integers of a key.
 
     Args:
         *key: Integers.
@@ -203,7 +207,7 @@ def make_keyed_generator(*key: int) -> torch.Generator:
     Returns:
         A new generator.
     """
-    # SeedSequence treats [a] and [a, 0] as equal, so the key starts with its length.
+    # SeedSequence returns the same state for [a] and [a, 0]. The length of the key makes them differ.
     state = np.random.SeedSequence([len(key), *(k & 0xFFFFFFFF for k in key)]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
@@ -214,7 +218,8 @@ def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
     Args:
         model: Model that predicts the noise.
         null_label: Index of the null label.
-        scale: Guidance scale. If the scale is 1, the model is returned unchanged and evaluated once per step.
+        scale: Guidance scale. If the scale is 1, the model is returned unchanged, so each step needs only one
+            evaluation.
 
     Returns:
         A model that predicts the guided noise.
@@ -233,8 +238,8 @@ def with_guidance(model: Denoiser, null_label: int, scale: float) -> Denoiser:
 def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
     """Divide the predicted noise of a model by a number near 1.
 
-    This is epsilon scaling (Ning et al., ICLR 2024). During sampling, a network interprets its own earlier errors as
-    noise. The division compensates for this error, so samples keep the standard deviation of the data.
+    This is epsilon scaling (Ning et al., ICLR 2024). During sampling, a network interprets errors of earlier steps as
+    noise. The division compensates for this effect, so samples have the standard deviation of the data.
 
     Args:
         model: Model that predicts the noise.
@@ -274,22 +279,23 @@ def sample(
 ) -> Float[Tensor, "b c h w"]:
     """Sample clean latents by ancestral sampling along `transitions`.
 
-    Downward transitions denoise; upward transitions add noise back (RePaint). With a condition, each downward step
-    replaces the known part by its clean latent, noised to the state just reached. At the end, the known part is z_0
-    exactly.
+    A transition to a lower state removes noise; a transition to a higher state adds noise (RePaint). With a condition,
+    each denoising step then replaces the known part by its clean latent plus noise of the new state. In the result, the
+    known part is bit-identical to the clean latent.
 
-    Differs from the paper, which uses the noise level of the state just left (Eq. "z_known"). With the paper's level,
-    the known part and the generated part would have different noise levels.
+    The paper instead uses the noise level of the previous state (Eq. "z_known"). The known part and the generated part
+    would then have different noise levels.
 
     Args:
         model: Model that predicts the noise in a latent.
-        schedule: Visited timesteps and the noise of each step.
-        noise: Random numbers of the scenes.
+        schedule: Timesteps and the noise of each step.
+        noise: Source of the random numbers of each scene.
         label: Class index of each scene.
-        transitions: Pairs (from, to) of states (default: descending, without jumps).
-        condition: Known part of the latents (default: none).
+        transitions: Pairs (from, to) of states; None: all states in descending order, without jumps.
+        condition: Known part of the latents; None: no known part.
         on_step: Function that is called after every evaluation of the model and returns the latent for the next step.
-        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part. The paper uses no such guidance.
+        guidance_weight: Weight of `pseudoinverse_guidance` towards the known part. The paper does not use this
+            guidance.
 
     Returns:
         Clean latents.
@@ -326,19 +332,19 @@ def pseudoinverse_guidance(
     alpha_bar: float,
     condition: InpaintCondition,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b c h w"]]:
-    """Predict the noise, and the direction that moves the clean estimate towards the known part.
+    """Predict the noise and a direction that moves the clean estimate towards the known part.
 
-    This is pseudo-inverse guidance (Song et al., ICLR 2023) with a mask as the measurement. The direction is the
-    transposed Jacobian of the clean estimate, times its difference from the known part, times sqrt(alpha_bar). Pasting
-    the known part is not enough for a network that has not learned to continue a known part. One call costs about two
-    evaluations of the model.
+    This is pseudo-inverse guidance (Song et al., ICLR 2023), where the measurement is the known part. The direction is
+    sqrt(alpha_bar) J^T d. J is the Jacobian of the clean estimate, and d is the difference between the known part and
+    the clean estimate. A network that was not trained for inpainting needs such guidance, because pasting the known
+    part is not enough. One call costs about two evaluations of the model.
 
     Args:
         model: Model that predicts the noise.
         latent: Noisy latents.
         timestep: Timestep of all latents.
         label: Class index of each scene.
-        alpha_bar: Squared signal share at this timestep.
+        alpha_bar: Value of alpha_bar at this timestep.
         condition: Known part of the latents.
 
     Returns:
@@ -365,9 +371,9 @@ def sample_with_scheduler(
 
     Args:
         model: Model that predicts the noise.
-        scheduler: A SchedulerMixin after its `set_timesteps`. A scheduler that adds noise must accept the noise as an
-            argument, so that the noise is keyed per scene.
-        noise: Random numbers of the scenes.
+        scheduler: A SchedulerMixin whose `set_timesteps` was called. A scheduler that adds noise must accept the noise
+            as an argument, because each scene has separate noise.
+        noise: Source of the random numbers of each scene.
         label: Class index of each scene.
         on_step: Function that is called after every evaluation of the model and returns the latent for the next step.
 

@@ -1,4 +1,4 @@
-"""RePaint (Lugmayr et al., 2022): options and order of the sampling steps (paper, supplement B.3, Applications)."""
+"""Options of RePaint (Lugmayr et al., 2022) and the order of its steps (paper, supplement B.3, Applications)."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import math
 from dataclasses import dataclass
 
 NUM_INFERENCE_STEPS = 250  # Paper, supplement B.3.
-JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper, supplement B.3.
+JUMP_LENGTH, RESAMPLINGS = 10, 10  # J and R of the paper (supplement B.3).
 
 
 def repaint_transitions(
     num_inference_steps: int, jump_length: int = JUMP_LENGTH, resamplings: int = RESAMPLINGS
 ) -> list[tuple[int, int]]:
-    """List the transitions (from, to) between states for RePaint.
+    """List the transitions (from, to) between the states of RePaint.
 
-    After every `jump_length` states, RePaint adds noise back and denoises again. With 250 steps and J = R = 10, RePaint
-    jumps back at states 0, 10, ..., 230, nine times each. RePaint then has 2,410 denoising steps.
+    After every `jump_length` states, RePaint adds the noise of these states again and repeats the denoising. For
+    example, with 250 steps and J = R = 10, RePaint jumps back nine times from each of the states 0, 10, ..., 230. This
+    gives 2,410 denoising steps.
 
     Args:
-        num_inference_steps: Number of visited timesteps.
-        jump_length: Number of states that a jump goes back (J of the paper).
-        resamplings: Number of passes over the same states (R of the paper).
+        num_inference_steps: Number of timesteps that sampling uses.
+        jump_length: Number of states of a jump back to more noise (J in the paper).
+        resamplings: Number of passes over the same states (R in the paper).
 
     Returns:
-        Transitions in order.
+        List of transitions in the order of sampling.
 
     Raises:
         ValueError: `jump_length` or `resamplings` is below 1.
@@ -44,14 +45,15 @@ def repaint_transitions(
 
 @dataclass(frozen=True)
 class RePaintConfig:
-    """Options of inpainting and outpainting; the defaults are the paper's.
+    """Options of inpainting and outpainting. The defaults are those of the paper.
 
     Attributes:
-        num_inference_steps: Number of visited timesteps.
-        jump_length: Number of states that a jump goes back (J of the paper).
-        resamplings: Number of passes over the same states (R of the paper).
-        pseudoinverse_guidance: Weight of pseudo-inverse guidance towards the known region; 0 is none.
-        eta: Share of DDPM's noise that each step adds, from 0 (none) to 1. With few steps, noise removes small objects.
+        num_inference_steps: Number of timesteps that sampling uses.
+        jump_length: Number of states of a jump back to more noise (J in the paper).
+        resamplings: Number of passes over the same states (R in the paper).
+        pseudoinverse_guidance: Weight of pseudo-inverse guidance towards the known region; 0 switches it off.
+        eta: Fraction of the noise of DDPM that each step adds, in [0, 1]. If the number of steps is small, this noise
+            removes small objects.
 
     Raises:
         ValueError: A value is out of range.
@@ -67,10 +69,11 @@ class RePaintConfig:
     def guided(cls, num_inference_steps: int = 50) -> RePaintConfig:
         """Return options with pseudo-inverse guidance instead of resampling.
 
-        These options give fewer visible seams and more objects, and they are 24 times as fast as the paper's.
+        Compared with the options of the paper, they give fewer visible seams and more objects, and sampling is 24 times
+        as fast.
 
         Args:
-            num_inference_steps: Number of visited timesteps.
+            num_inference_steps: Number of timesteps that sampling uses.
 
         Returns:
             The options.
@@ -79,7 +82,7 @@ class RePaintConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.eta <= 1:
-            raise ValueError(f"eta is {self.eta}, expected 0 (steps add no noise) to 1 (as in the paper)")
+            raise ValueError(f"eta is {self.eta}, expected a number from 0 (no noise) to 1 (as in the paper)")
         if not 0 <= self.pseudoinverse_guidance < math.inf:
             raise ValueError(
                 f"pseudoinverse_guidance is {self.pseudoinverse_guidance}, expected 0 (none) or more; 1 is usual"
@@ -91,5 +94,5 @@ class RePaintConfig:
 
     @property
     def num_evaluations(self) -> int:
-        """Number of denoising steps; each one evaluates the network once."""
+        """Number of denoising steps."""
         return sum(to < state for state, to in self.transitions())

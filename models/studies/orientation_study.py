@@ -1,15 +1,15 @@
-"""The paper's study "Cholesky vs. quaternion" (supplement): how well a small autoencoder reconstructs one box.
+"""Measure how well a small autoencoder reconstructs one box (paper, supplement, "Cholesky vs. quaternion").
 
 The study compares encodings of the box (models/geometry/encodings.py). The autoencoder is a small object branch of the
-layout VAE with one slot and one query. The autoencoder is trained to reconstruct the code of a box with an L1 loss. The
-networks of different encodings differ only in their first and last linear layers. Boxes are centred at zero, and the
-centre is not predicted.
+layout VAE with one slot and one query. It is trained with an L1 loss to reconstruct the code of a box. The networks of
+different encodings differ only in their first and last linear layers. Boxes are centred at the origin, and the centre
+is not predicted.
 
-For boxes that differ only by yaw, some entries of each code are constant: 2 of 6, 2 of 7 and 9 of 15. The L1 gradient
-of an entry does not shrink with its error, so constant entries disturb the training. The study therefore regresses
-either all entries, as the paper does, or only the varying ones.
+If boxes are upright, some entries of their codes are constant: 2 of 6 (Cholesky), 2 of 7 (quaternion) and 9 of 15
+(octahedral). The L1 gradient of an entry does not shrink with its error, so constant entries disturb the training. The
+study therefore has two variants. The networks regress either all entries, as in the paper, or only entries that vary.
 
-The paper does not specify the ranges of the sizes, the network, the batch size and the learning rate.
+The paper does not specify the box sizes, the network, the batch size or the learning rate.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
 NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
-MARGIN = 0.05  # Share of an entry's range added on both sides, because a sigmoid does not reach 0 and 1.
-STILL, LEAST_RANGE = 1e-6, 1.0  # An entry with a smaller range than STILL is constant and gets LEAST_RANGE.
+MARGIN = 0.05  # Margin at both ends of an entry's range, because a sigmoid does not reach 0 and 1.
+STILL, LEAST_RANGE = 1e-6, 1.0  # If the range of an entry is below STILL, LEAST_RANGE replaces it.
 
 
 # ------------------------------------------------------------------------------------------------------- boxes
 
 
 class CenteredBoxes(NamedTuple):
-    """n boxes centred at zero.
+    """A set of n boxes centred at the origin.
 
     Attributes:
         rotation: (n, 3, 3) matrices; their columns are the axes of the boxes.
@@ -56,11 +56,11 @@ class CenteredBoxes(NamedTuple):
 
 @dataclass(frozen=True)
 class BoxDistribution:
-    """Ranges of uniform distributions of box sizes.
+    """Uniform distributions of box sizes.
 
     Attributes:
         length_m: Range of the length (metres).
-        width_share: Range of the width as a share of the length.
+        width_share: Range of the ratio of width to length.
         height_m: Range of the height (metres).
     """
 
@@ -71,7 +71,7 @@ class BoxDistribution:
 
 BOX_DISTRIBUTIONS = {
     "vehicle": BoxDistribution((3.3, 5.6), (0.35, 0.6), (1.2, 2.2)),  # The paper's study.
-    # For square footprints, the scatter matrix does not determine the yaw.
+    # This distribution includes square footprints, for which the scatter matrix does not determine the yaw.
     "any": BoxDistribution((1.0, 6.0), (0.4, 1.0), (0.5, 4.0)),
 }
 
@@ -79,12 +79,12 @@ BOX_DISTRIBUTIONS = {
 def draw_boxes(distribution: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
     """Draw upright boxes with yaw in [-pi, pi).
 
-    With the same key, the first n boxes of a larger draw equal the draw of n boxes.
+    With the same key, a call with a larger `count` returns the same first boxes.
 
     Args:
         distribution: Distribution of the box sizes.
         count: Number of boxes.
-        *key: Integers that key the random numbers.
+        *key: Integers that determine the random numbers.
 
     Returns:
         The boxes.
@@ -96,7 +96,7 @@ def draw_boxes(distribution: BoxDistribution, count: int, *key: int) -> Centered
 
 
 def compute_code_bounds(code: np.ndarray) -> Bounds:
-    """Compute the bounds of each entry of training codes, with a margin.
+    """Compute lower and upper bounds of each entry of training codes, including a margin.
 
     Args:
         code: (n, entries) codes.
@@ -114,7 +114,7 @@ def compute_code_bounds(code: np.ndarray) -> Bounds:
 
 
 class OneObjectAutoencoder(nn.Module):
-    """Autoencode the normalised code of one box through a latent like that of the layout VAE.
+    """Autoencoder of the normalised code of one box, with a latent similar to that of the layout VAE.
 
     Args:
         entries: Number of entries of the code.
@@ -158,11 +158,11 @@ class OneObjectAutoencoder(nn.Module):
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """Training options of the autoencoders, equal for all encodings.
+    """Training options of the autoencoders; all encodings use the same options.
 
-    The batch size is that of the paper's layout VAE. The learning rate was selected on 1,200 vehicles of a seed that
-    the study does not use. Mean IoU3D at learning rates 5e-4 / 1e-3: Cholesky 0.968 / 0.964, quaternion 0.871 / 0.876,
-    octahedral 0.938 / 0.849.
+    The batch size is the same as for the layout VAE of the paper. The learning rate was selected on 1,200 vehicles from
+    a seed that the study does not use. The mean IoU3D at learning rates 5e-4 / 1e-3 is 0.968 / 0.964 (Cholesky), 0.871
+    / 0.876 (quaternion) and 0.938 / 0.849 (octahedral).
 
     Attributes:
         epochs: Passes over the training boxes.
@@ -177,7 +177,7 @@ class StudyConfig:
     weight_decay: float = 5e-4
 
     def make_optimizer_config(self, count: int) -> OptimizerConfig:
-        """Return the learning-rate schedule of the layout VAE, a cosine that ends at a tenth of the initial rate.
+        """Return the learning-rate schedule of the layout VAE: a cosine that ends at a tenth of the initial rate.
 
         Args:
             count: Number of training boxes.
@@ -195,14 +195,14 @@ class StudyConfig:
 
 
 class TrainedStudy(NamedTuple):
-    """A trained autoencoder and the encoding of its boxes.
+    """A trained autoencoder and its box encoding.
 
     Attributes:
         model: Autoencoder.
         bounds: Bounds of all entries of the code.
         encoding: Encoding of the boxes.
-        kept: (entries,) bool: entries that the autoencoder processes. All other entries keep their constant training
-            value.
+        kept: (entries,) bool; True marks entries that the autoencoder reconstructs. All other entries have the constant
+            value of the training boxes.
     """
 
     model: OneObjectAutoencoder
@@ -218,7 +218,7 @@ class TrainedStudy(NamedTuple):
             boxes: Boxes.
 
         Returns:
-            Reconstructed boxes, and the mean absolute error of a normalised entry.
+            Reconstructed boxes, and the mean absolute error of the normalised entries.
         """
         code = self.bounds.normalise(self.encoding.encode(*boxes))
         given = torch.from_numpy(code[:, self.kept]).float()
@@ -232,14 +232,15 @@ def train_autoencoder(
 ) -> TrainedStudy:
     """Train an autoencoder on boxes.
 
-    The same seed gives the same initial weights of the shared layers, the same order of samples and the same noise.
+    For the same seed, all encodings have the same initial weights of the shared layers, the same order of samples and
+    the same noise.
 
     Args:
         encoding: Encoding of the boxes.
         boxes: Training boxes.
         settings: Training options.
         seed: Seed of weights, order and noise.
-        moving_only: Process only the entries that vary over the training boxes.
+        moving_only: If True, process only entries that vary over the training boxes.
 
     Returns:
         The trained autoencoder.
