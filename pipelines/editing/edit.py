@@ -1,7 +1,7 @@
 """Edit the primitives of a scene: select primitives, change their parameters exactly, and record the changes.
 
-A list of edits is data. The same list applied to the same scene gives a bit-identical result. The list can also be
-applied to other scenes. In JSON, it is a list of objects such as
+A list of edits is plain data. Applying the same list to the same scene gives a bit-identical result. The list can also
+be applied to other scenes. In JSON, each edit is an object such as
 
     {"edit": "translate", "select": {"category": ["vehicle_small"], "where": "length_m > 4"}, "by_m": [5, 0, 0]}
 """
@@ -37,7 +37,7 @@ SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit.
 
 @dataclass(frozen=True)
 class Select:
-    """Selection of primitives that satisfy all given conditions."""
+    """Selection of the primitives that satisfy all conditions."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -48,7 +48,7 @@ class Select:
     instances: tuple[int, ...] = ()
     """Values of instance_id."""
     polygon_m: tuple[float, ...] = ()
-    """Polygon that contains the centre: x y of each corner in the scene frame (m), x forward, y left."""
+    """Polygon that contains the centre of the primitive: x and y of each corner in the scene frame (m)."""
     where: str = ""
     """SQL condition on columns of the primitives table, such as "length_m > 4 and y_m < 0"; "true" selects all."""
 
@@ -68,7 +68,7 @@ class Select:
         for name in self.category:
             _parse_category(name)
         if len(self.polygon_m) % 2:
-            raise ValueError(f"the polygon has {len(self.polygon_m)} numbers, expected pairs x y x y ... in metres")
+            raise ValueError(f"the polygon has {len(self.polygon_m)} numbers, expected pairs x y of coordinates (m)")
 
     def select_primitives(self, scene: Scene) -> np.ndarray:
         """Select primitives of a scene.
@@ -80,7 +80,7 @@ class Select:
             (n,) bool.
 
         Raises:
-            ValueError: The conditions are invalid, or a number names no primitive of the scene.
+            ValueError: The conditions are invalid, or a number is not the number of a primitive in the scene.
         """
         self._check_names()
         fits = np.ones(len(scene), bool)
@@ -103,7 +103,7 @@ class Select:
 
 
 def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
-    """Return (n,) bool: the rows of a primitives table that satisfy an SQL condition."""
+    """Return a mask (n,) of the rows of a primitives table that satisfy an SQL condition."""
     table = table.append_column("row", pa.array(np.arange(len(table))))
     with duckdb.connect(config={"enable_external_access": False}) as connection:
         try:
@@ -147,7 +147,7 @@ class Edit(ABC):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the number (m,) that each of its primitives has in `scene`.
+            The edited scene, and the index (m,) in `scene` of each primitive of the edited scene.
 
         Raises:
             ValueError: A primitive of the result has an invalid position or size.
@@ -162,7 +162,7 @@ class ObjectEdit(Edit):
         """Change primitives.
 
         Args:
-            part: Scene with only the selected primitives; its ground is that of the whole scene.
+            part: Scene with only the selected primitives and the ground of the whole scene.
 
         Returns:
             The same primitives after the edit, in the same order.
@@ -176,7 +176,7 @@ class ObjectEdit(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the numbers 0 .. n - 1.
+            The edited scene, and the indices 0 .. n - 1.
         """
         part = require_valid_objects(self.transform(scene.select(chosen)))
         place = np.arange(len(scene))
@@ -199,7 +199,7 @@ def require_valid_objects(part: Scene) -> Scene:
     size_m = part.size_m
     if not (np.isfinite(part.center_m).all() and ((size_m >= SIZES_M[0]) & (size_m <= SIZES_M[1])).all()):
         raise ValueError(
-            f"a primitive of scene {part.scene_id} would be thinner than 1 mm, longer than 1 km or not finite"
+            f"a primitive of scene {part.scene_id} would have a size outside 1 mm to 1 km or a value that is not finite"
         )
     return part
 
@@ -216,14 +216,14 @@ class Remove(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The scene without these primitives, and the previous number of each remaining primitive.
+            The scene without these primitives, and the previous index of each remaining primitive.
         """
         return scene.select(~chosen), np.flatnonzero(~chosen)
 
 
 @dataclass(frozen=True)
 class Duplicate(Edit):
-    """Append copies of the selected primitives, displaced along the scene axes; a copy has no instance_id."""
+    """Append displaced copies of the selected primitives. A copy has no instance_id."""
 
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Displacement of the copies in the scene frame: x (forward), y (left), z (up), in metres."""
@@ -245,7 +245,7 @@ class Duplicate(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the number of each primitive or of its original in `scene`.
+            The edited scene, and the index in `scene` of each primitive. A copy has the index of its original.
         """
         copies = require_valid_objects(Translate(by_m=self.by_m).transform(scene.select(chosen)))
         copies = replace(copies, instance_id=np.full(len(copies), -1, np.int64))
@@ -259,10 +259,11 @@ class Translate(ObjectEdit):
     """Move the selected primitives."""
 
     by_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Displacement along the three axes that `along` names, in metres."""
+    """Displacement along the three axes of the frame `along`, in metres."""
     along: Literal["scene", "own"] = "scene"
     """Axes of the displacement. "scene" means x (forward), y (left) and z (up) of the scene frame. "own" means the
-    length, width and height axes of each primitive; a known heading sets the sign of the length axis."""
+    length, width and height axes of each primitive; a known heading sets the sign of the length axis.
+    """
 
     def check(self) -> None:
         """Check the edit without a scene.
@@ -285,7 +286,8 @@ class Translate(ObjectEdit):
         way_m = np.broadcast_to(np.array(self.by_m, float), (len(part), 3))
         if self.along == "own":
             ahead = np.stack([np.cos(part.heading_rad), np.sin(part.heading_rad), np.zeros(len(part))], axis=1)
-            backward = (part.rotation[:, :, 0] * ahead).sum(axis=1) < 0  # An unknown heading (NaN) is not backward.
+            # An unknown heading (NaN) does not count as backward.
+            backward = (part.rotation[:, :, 0] * ahead).sum(axis=1) < 0
             turned = part.rotation * np.where(backward[:, None], [-1, -1, 1], 1)[:, None, :]
             way_m = (turned @ way_m[:, :, None])[:, :, 0]
         return replace(part, center_m=(part.center_m + way_m).astype(np.float32))
@@ -293,18 +295,18 @@ class Translate(ObjectEdit):
 
 @dataclass(frozen=True)
 class Rotate(ObjectEdit):
-    """Rotate the selected primitives about the vertical axis, counter-clockwise seen from above."""
+    """Rotate the selected primitives about a vertical axis. Positive angles are counter-clockwise seen from above."""
 
     by_deg: float = 0.0
     """Angle in degrees."""
     about_m: tuple[float, float] | None = None
-    """Position x y of the vertical axis in the scene frame, in metres (default: the centre of each primitive)."""
+    """Position (x, y) of the vertical axis in the scene frame, in metres (default: the centre of each primitive)."""
 
     def check(self) -> None:
         """Check the edit without a scene.
 
         Raises:
-            ValueError: The selection is invalid, or the angle is not finite or a multiple of 360 degrees.
+            ValueError: The selection is invalid, the angle is not finite, or the angle is a multiple of 360 degrees.
         """
         super().check()
         if not np.isfinite(self.by_deg) or self.by_deg % 360 == 0:
@@ -343,17 +345,17 @@ class Scale(ObjectEdit):
     by: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Scale factors of length, width and height."""
     hold: Literal["bottom", "centre"] = "bottom"
-    """Point of each primitive that keeps its position."""
+    """Point of each primitive that remains fixed."""
 
     def check(self) -> None:
         """Check the edit without a scene.
 
         Raises:
-            ValueError: The selection is invalid, a factor is not above 0, or all factors are 1.
+            ValueError: The selection is invalid, a factor is 0 or negative, or all factors are 1.
         """
         super().check()
         if not all(np.isfinite(self.by)) or min(self.by) <= 0 or set(self.by) == {1}:
-            raise ValueError(f"the scale factors are {list(self.by)}, expected values above 0 that are not all 1")
+            raise ValueError(f"the scale factors are {list(self.by)}, expected values > 0 that are not all 1")
 
     def transform(self, part: Scene) -> Scene:
         """Scale primitives.
@@ -374,7 +376,10 @@ class Scale(ObjectEdit):
 
 @dataclass(frozen=True)
 class Relabel(ObjectEdit):
-    """Change the category; the category vegetation_ellipsoid makes ellipsoids, and all others make cuboids."""
+    """Change the category.
+
+    The primitive becomes an ellipsoid for vegetation_ellipsoid, and a cuboid for all other categories.
+    """
 
     category: str = "object"
     """New category."""
@@ -405,7 +410,10 @@ class Relabel(ObjectEdit):
 
 @dataclass(frozen=True)
 class Snap(ObjectEdit):
-    """Move the lowest point to the ground under the centre; a primitive without ground below keeps its position."""
+    """Move the lowest point to the height of the ground under the centre.
+
+    A primitive without ground below is not moved.
+    """
 
     slab_offset_m: float = SLAB_OFFSET_M
     """Height of the ground raster above the real surface, in m: 0.3 for KITTI-360 and the town, 0 for Argoverse 2."""
@@ -431,11 +439,11 @@ class Repair(Edit):
     slab_offset_m: float = SLAB_OFFSET_M
     """Height of the ground raster above the real surface, in metres, as for snap."""
     ground: GroundFaults = "both"
-    """Primitives to move to the ground: floating ones, sunken ones, both or none."""
+    """Primitives to move to the ground: floating, sunken, both or none."""
     push_m: float = 0.25
     """Maximum horizontal displacement of each overlapping primitive, in metres."""
     shrink: float = 0.95
-    """Minimum scale factor of a primitive, used where a displacement does not end the overlap."""
+    """Minimum scale factor of a primitive. Primitives are scaled only if a displacement does not end the overlap."""
     drop: bool = True
     """Whether to remove one of two primitives that still overlap."""
 
@@ -447,9 +455,9 @@ class Repair(Edit):
         """
         super().check()
         if not 0 <= self.push_m < np.inf:
-            raise ValueError(f"push_m is {self.push_m}, expected a finite distance of at least 0 m")
+            raise ValueError(f"push_m is {self.push_m}, expected a finite distance >= 0 m")
         if not 0 < self.shrink <= 1:
-            raise ValueError(f"shrink is {self.shrink}, expected a factor in (0, 1], where 1 means no shrinking")
+            raise ValueError(f"shrink is {self.shrink}, expected a factor in (0, 1]; 1 means no shrinking")
 
     def apply_to(self, scene: Scene, chosen: np.ndarray) -> tuple[Scene, np.ndarray]:
         """Repair selected primitives of a scene.
@@ -459,14 +467,14 @@ class Repair(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The repaired scene, and the previous number of each remaining primitive.
+            The repaired scene, and the previous index of each remaining primitive.
 
         Raises:
             ValueError: A primitive of the result has an invalid position or size.
         """
         scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)
         scene = require_valid_objects(separate_objects(scene, chosen, self.push_m, self.shrink))
-        # A displacement may have moved a primitive over a slope.
+        # Snap again, because a displacement may have moved a primitive on a slope.
         scene = snap_to_ground(scene, chosen, self.slab_offset_m, self.ground)
         gone = find_removable_objects(scene, chosen) if self.drop else np.zeros(len(scene), bool)
         return scene.select(~gone), np.flatnonzero(~gone)
@@ -476,7 +484,7 @@ EDITS = {kind.__name__.lower(): kind for kind in (Remove, Duplicate, Translate, 
 
 
 def _raise_objects(part: Scene, up_m: np.ndarray) -> np.ndarray:
-    """Return the centres (n, 3) after an upward displacement of up_m (n,)."""
+    """Return the centres (n, 3), displaced upwards by up_m (n,)."""
     return (part.center_m + up_m[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)
 
 
@@ -498,7 +506,7 @@ class ObjectChange(NamedTuple):
         primitive: Index of the primitive in the scene before the edit.
         change: One of removed, copied and changed.
         moved_m: Displacement of the centre (m); for a copy, the distance from its original.
-        turned_rad: Largest angle by which an axis turned (rad); opposite directions count as equal.
+        turned_rad: Largest rotation angle of an axis (rad). Opposite directions of an axis are equivalent.
         resized: Largest relative change of length, width or height.
     """
 
@@ -515,7 +523,7 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
     Args:
         before: Scene before the edit.
         after: Scene after the edit, with m primitives.
-        origin: (m,) number in `before` of each primitive of `after`.
+        origin: (m,) index in `before` of each primitive of `after`.
 
     Returns:
         One entry per removed, copied or changed primitive.
@@ -541,9 +549,10 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
 
 
 def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[ObjectChange]]:
-    """Apply edits in order and report the changes of each.
+    """Apply edits in order, and report the changes of each edit.
 
-    Each edit numbers the primitives of its own input. A removal therefore decreases the numbers of later primitives.
+    Numbers of primitives refer to the input of the respective edit. A removal therefore decreases the numbers of later
+    primitives.
 
     Args:
         scene: Scene.

@@ -1,7 +1,8 @@
-"""Repair faults of a scene with small changes: move objects to the ground, push them apart, and remove the others.
+"""Repair faults of a scene with small changes.
 
-metrics/validity.py defines the faults. A repair never makes another fault of the same kind worse: it skips a
-displacement that would move a primitive into a third primitive.
+Objects are moved to the ground, pushed apart or, if necessary, removed. metrics/validity.py defines the faults. A
+repair never worsens another fault of the same kind. For example, a displacement that would move a primitive into a
+third primitive is skipped.
 """
 
 from __future__ import annotations
@@ -15,21 +16,22 @@ from models.geometry.iou3d import Boxes, compute_iou3d_matrix, compute_iou3d_pai
 from models.scene import Scene
 from pipelines.metrics.validity import OVERLAP_IOU3D, SOLID, TOLERANCE_M, find_faults
 
-# Goals slightly below the limits of a fault. Rounding in the tables would otherwise turn a valid result into a fault.
+# These goals are slightly stricter than the fault limits. Otherwise, rounding in the tables could turn a valid result
+# into a fault.
 GOAL_IOU3D = 0.98 * OVERLAP_IOU3D
 GOAL_TOLERANCE_M = 0.98 * TOLERANCE_M
 ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # Number of displacement lengths to try.
-PAIRS_AT_ONCE = 256  # Number of pairs that are processed together, which takes 50 MB.
-CANDIDATES = 6  # Number of directions that are tested against all other primitives, the shortest displacements first.
+PAIRS_AT_ONCE = 256  # Number of pairs that are processed together (50 MB).
+CANDIDATES = 6  # Number of directions, in order of displacement, that are tested against all other primitives.
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
 
 
 def snap_to_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which: GroundFaults = "both") -> Scene:
-    """Move floating or sunken primitives vertically so that their lowest point lies on the ground.
+    """Move floating or sunken primitives vertically until the lowest point lies on the ground.
 
     Args:
         scene: Scene with n primitives.
@@ -71,8 +73,8 @@ def find_overlapping_pairs(boxes: Boxes, solid: np.ndarray) -> np.ndarray:
 def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> Scene:
     """Displace overlapping solid primitives horizontally to end their overlaps.
 
-    For each pair, the shortest displacement that moves neither primitive into a third one is used. The smaller
-    primitive moves farther. If no displacement suffices, both primitives also shrink about their centres.
+    Each pair gets the shortest displacement that moves neither primitive into a third primitive. The smaller primitive
+    moves farther. If no displacement suffices, both primitives also shrink about their centres.
 
     Args:
         scene: Scene with n primitives.
@@ -92,7 +94,7 @@ def separate_objects(scene: Scene, chosen: np.ndarray, most_m: float, shrink: fl
 
 
 class _Separation:
-    """State of the separation: given boxes, current boxes, and which boxes may move."""
+    """State of the separation: the original boxes, the current boxes, and a mask of the boxes that may move."""
 
     def __init__(self, scene: Scene, chosen: np.ndarray, most_m: float, shrink: float) -> None:
         self.given, self.now = extract_boxes(scene), extract_boxes(scene)
@@ -100,7 +102,7 @@ class _Separation:
         self.most_m, self.shrink = most_m, shrink
 
     def round(self) -> bool:
-        """Separate pairs, and move each box at most once; return whether any box moved."""
+        """Separate overlapping pairs. Move each box at most once. Return whether any box moved."""
         pairs = find_overlapping_pairs(self.now, self.solid)
         moved = np.zeros(len(self.solid), bool)
         for scale in (1.0, self.shrink):
@@ -114,12 +116,11 @@ class _Separation:
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
-        """Find up to CANDIDATES positions (k, 2) for each pair where its boxes do not overlap, the shortest
-        displacement first.
+        """For each pair, find up to CANDIDATES positions (k, 2) of its boxes without overlap.
 
-        If two boxes overlap at both ends of a straight path, they overlap along the whole path, because their common
-        volume is log-concave (Brunn-Minkowski). A direction is therefore skipped if its longest displacement does not
-        separate the boxes.
+        The shortest displacement comes first. If two boxes overlap at both ends of a straight path, they overlap along
+        the whole path, because their common volume is log-concave (Brunn-Minkowski). A direction is therefore skipped
+        if its longest displacement does not separate the boxes.
         """
         start = self.now.take(pairs)  # (p, 2, ...)
         share = self.select_primitives[pairs] * start.size_m.prod(axis=2)[:, ::-1]
@@ -138,7 +139,7 @@ class _Separation:
         within &= share.any(axis=1)[:, None, None]
 
         def parted(where: np.ndarray) -> np.ndarray:
-            """(p, directions, steps) bool: the displacements in the mask `where` that separate their pair."""
+            """Return a mask (p, directions, steps) of the displacements in `where` that separate their pair."""
             pair, *_ = np.nonzero(where)
             a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
             found = where.copy()
@@ -147,7 +148,7 @@ class _Separation:
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
         found = parted(within & parted(longest).any(axis=2, keepdims=True))
-        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none.
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS: no displacement.
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]
@@ -156,9 +157,9 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """(k,) bool: whether a box of the pair overlaps a third box above the limit and more than now.
+        """For each pair of positions (k, 2), return whether a box of the pair would overlap a third box.
 
-        The pair is at positions (k, 2).
+        The overlap must exceed the limit and the current overlap.
         """
         others = self.solid.copy()
         others[pair] = False
@@ -174,7 +175,8 @@ class _Separation:
 def find_removable_objects(scene: Scene, chosen: np.ndarray) -> np.ndarray:
     """Select a small set of primitives whose removal ends the overlaps.
 
-    Between equal candidates, a lower existence probability comes first, then a smaller volume.
+    Among equivalent candidates, the primitive with the lowest existence probability is removed. If these are equal, the
+    smallest primitive is removed.
 
     Args:
         scene: Scene with n primitives.

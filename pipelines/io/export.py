@@ -1,4 +1,4 @@
-"""Export scenes as GLB, PLY, voxels or OpenDRIVE, in one Ray task per shard."""
+"""Export scenes as GLB, PLY, voxels or OpenDRIVE, with one Ray task per shard."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ def export_scenes(
 ) -> tuple[dict[Format, int], dict[str, str]]:
     """Export each scene to output/<format>/<scene_id>.<format>.
 
-    If a format cannot hold a scene, such as OpenDRIVE for a scene without roads, the scene is listed in the table
-    `rejects` of the output. The export continues with the next scene.
+    A format may be unable to represent a scene; for example, OpenDRIVE needs roads. Such a scene is listed in the table
+    `rejects` of the output, and the export continues.
 
     Args:
         selection: Scenes.
         formats: File formats.
         output: Output directory.
         overwrite: Whether to replace existing files.
-        on_scene: Called after each shard with the number of its scenes.
+        on_scene: Function that is called after each shard, with the number of its scenes.
 
     Returns:
-        Number of files per format, and the reason per scene that was not written.
+        Number of files per format, and the reason for each scene that was not written.
     """
     parts = selection.shards()
 

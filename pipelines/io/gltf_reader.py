@@ -1,4 +1,4 @@
-"""Read binary glTF 2.0 files from untrusted sources as meshes with their transforms applied.
+"""Read binary glTF 2.0 files from untrusted sources as meshes, and apply the transforms of the nodes.
 
 The reader uses only the JSON chunk and the binary chunk. It follows no URI, decodes no texture and decompresses
 nothing. Colours are returned as stored.
@@ -20,7 +20,7 @@ POINTS, TRIANGLES = 0, 4
 HARMLESS = {"KHR_materials_unlit", "KHR_mesh_quantization"}  # Required extensions that do not affect the reader.
 MOVES_VERTICES = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing"}
 FAR_M = 1e6
-# Limit on vertices and triangle corners after placement, because a small file can place one mesh a million times.
+# Maximum number of vertices and of triangle corners in a scene. A small file can reference one mesh a million times.
 MAX_NUMBERS = 2**25
 
 
@@ -29,7 +29,7 @@ class MeshPart(NamedTuple):
 
     Attributes:
         extras: Extras of the node.
-        file_from_mesh: Transform from the mesh to the file.
+        file_from_mesh: Transform from the frame of the mesh to the frame of the file.
         vertices: Vertices in the frame of the file.
         triangles: Vertex indices; (0, 3) for points.
         color: Stored colours in [0, 1]: the vertex colour times the colour of the material.
@@ -43,7 +43,7 @@ class MeshPart(NamedTuple):
 
 
 class Glb(NamedTuple):
-    """Content of a file: the extras of its default scene, and its mesh parts in the order of the node tree."""
+    """Content of a file: the extras of the default scene, and the mesh parts in the order of the node tree."""
 
     extras: dict
     parts: list[MeshPart]
@@ -59,7 +59,7 @@ def read_glb(data: bytes) -> Glb:
         Extras and mesh parts of the scene.
 
     Raises:
-        ValueError: The file is invalid or uses a feature that is not read; the message names the fault.
+        ValueError: The file is invalid or uses an unsupported feature; the message names the fault.
     """
     try:
         tree, binary = _read_chunks(data)
@@ -79,7 +79,7 @@ def read_glb(data: bytes) -> Glb:
 
 
 def _read_chunks(data: bytes) -> tuple[dict, bytes]:
-    """Return the parsed JSON chunk and the binary chunk, which is empty if absent."""
+    """Return the parsed JSON chunk and the binary chunk. An absent binary chunk is returned as empty."""
     if data[:4] != b"glTF" or len(data) < 20:
         raise ValueError(f"the file begins with {data[:4]!r} and is not a binary glTF file; export as .glb")
     version, length = np.frombuffer(data, "<u4", 2, 4).tolist()
@@ -107,7 +107,7 @@ def _refuse(tree: dict) -> None:
 
 
 def _list_placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarray]]:
-    """Yield the nodes and their (4, 4) file_from_node transforms, parents first."""
+    """Yield the nodes with the transforms file_from_node (4, 4). Parents come first."""
     seen, todo = set(), [(root, np.eye(4)) for root in reversed(roots)]
     while todo:
         index, file_from_parent = todo.pop()

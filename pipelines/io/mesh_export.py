@@ -1,7 +1,7 @@
 """Convert a Scene to meshes: layout reconstruction (paper, supplement B.2), GLB files and PLY files.
 
-The ground is one fused surface. Each occupied pixel becomes a vertex at its centre, in the colour of the class that won
-the pixel. Each 2 x 2 block of occupied pixels becomes two triangles along the same diagonal. A primitive is a unit
+The ground is one fused surface. Each occupied pixel becomes a vertex at the pixel centre, with the colour of the
+pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles along the same diagonal. A primitive is a unit
 cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
 """
 
@@ -24,7 +24,7 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
 GROUND = -1  # Value of `primitive` for a ground triangle.
-ABOUT = (  # Scene-level fields that a file holds.
+ABOUT = (  # Scene-level fields in the extras of a file.
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
     *("vegetation_density", "vehicle_density", "ground_classes"),
 )
@@ -39,9 +39,10 @@ class Triangles(NamedTuple):
     """A triangle soup in the scene frame.
 
     Attributes:
-        corners_m: Corners, counter-clockwise seen from outside or, for ground, from above (m).
+        corners_m: Corners (m), counter-clockwise seen from outside. Ground triangles are counter-clockwise seen from
+            above.
         class_id: Class id of the palette; a ground triangle has the class of its first corner.
-        primitive: Index of the primitive in the scene, GROUND for ground.
+        primitive: Index of the primitive in the scene; GROUND for ground.
     """
 
     corners_m: np.ndarray  # (t, 3, 3) float64
@@ -51,7 +52,7 @@ class Triangles(NamedTuple):
 
 @cache
 def make_unit_cuboid() -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit cuboid: vertices (8, 3) at ±0.5 and triangles (12, 3) that face outwards."""
+    """Return the unit cuboid: vertices (8, 3) at ±0.5, and triangles (12, 3) that face outwards."""
     mesh = trimesh.creation.box()
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
@@ -60,7 +61,7 @@ def make_unit_cuboid() -> tuple[np.ndarray, np.ndarray]:
 def make_unit_ellipsoid() -> tuple[np.ndarray, np.ndarray]:
     """Return the sphere of diameter 1: vertices (642, 3) and triangles (1280, 3) that face outwards.
 
-    The mesh has 0.99 of the volume pi/6 of the sphere.
+    The volume of the mesh is 0.99 times the volume pi/6 of the sphere.
     """
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
@@ -85,14 +86,14 @@ def compute_placements(scene: Scene) -> np.ndarray:
 def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Build the mesh of the fused ground surface (paper, supplement B.2).
 
-    The mesh has two triangles per 2 x 2 block of occupied pixels, cut along the diagonal (i, j + 1) - (i + 1, j).
+    Each 2 x 2 block of occupied pixels gives two triangles. Their common edge is the diagonal (i, j + 1) - (i + 1, j).
 
     Args:
         scene: Scene.
 
     Returns:
-        vertices_m (v, 3), one per occupied pixel, in the scene frame; triangles (t, 3), facing up; vertex_class_id
-        (v,).
+        vertices_m (v, 3) in the scene frame, one per occupied pixel; triangles (t, 3), which face up; and
+        vertex_class_id (v,).
     """
     height, winner = scene.surface()
     occupied = winner >= 0
@@ -173,8 +174,8 @@ def export_glb(scene: Scene) -> bytes:
       and the exact parameters.
 
     The extras of the file hold the grid and the fields of ABOUT. From this file, mesh_import.py reads the same scene,
-    except that only the fused ground is kept. Colours are in linear light, as glTF requires. A viewer then shows the
-    sRGB values of the palette.
+    but with the fused ground only. Colours are in linear light, as glTF requires. A viewer then shows the sRGB values
+    of the palette.
 
     Args:
         scene: Scene.
@@ -187,7 +188,7 @@ def export_glb(scene: Scene) -> bytes:
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = build_ground_mesh(scene)
     if len(vertices):
-        # A triangle without area keeps isolated pixels in the file, because trimesh omits meshes without triangles.
+        # trimesh omits meshes without triangles. A triangle without area therefore keeps isolated pixels in the file.
         triangles = triangles if len(triangles) else np.zeros((1, 3), int)
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}
@@ -202,7 +203,7 @@ def export_glb(scene: Scene) -> bytes:
 
 
 def _set_buffer_targets(tree: dict) -> None:
-    """Set the glTF hints for the GPU that distinguish buffer views of vertices from those of indices."""
+    """Set the glTF hints that tell the GPU whether a buffer view holds vertices or indices."""
     for mesh in tree.get("meshes", ()):
         for part in mesh["primitives"]:
             targets = {index: ARRAY_BUFFER for index in part["attributes"].values()}
@@ -242,8 +243,8 @@ def export_ply(scene: Scene) -> bytes:
 def write_glb(scene: Scene, path: str | Path) -> None:
     """Write a scene to a .glb file.
 
-    The function writes a temporary file next to `path` and renames it. An interruption therefore leaves no partial
-    file.
+    The function writes a temporary file next to `path` and then renames the file. An interruption therefore leaves no
+    partial file.
 
     Args:
         scene: Scene.
@@ -260,12 +261,12 @@ def _make_unit_mesh(category: int) -> trimesh.Trimesh:
     if category != ELLIPSOID:
         return trimesh.Trimesh(*make_unit_cuboid(), visual=visual, process=False)
     vertices, triangles = make_unit_ellipsoid()
-    # Viewers shade a mesh with normals smoothly, and a mesh without normals facet by facet.
+    # Viewers shade a mesh smoothly if it has normals. Without normals, viewers shade each facet separately.
     return trimesh.Trimesh(vertices, triangles, vertex_normals=2 * vertices, visual=visual, process=False)
 
 
 def _paint_mesh(vertices_m: np.ndarray, triangles: np.ndarray, class_id: np.ndarray) -> trimesh.Trimesh:
-    # The material is white, because a viewer multiplies the colours of material and vertex.
+    # The material is white, because a viewer multiplies its colour by the vertex colour.
     visual = trimesh.visual.TextureVisuals(material=_make_material("ground", EMPTY))
     opaque = np.full((len(vertices_m), 1), 255, np.uint8)
     visual.vertex_attributes["color"] = np.hstack([_convert_to_linear(CLASS_COLORS)[class_id], opaque])

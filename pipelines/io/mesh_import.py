@@ -1,26 +1,28 @@
-"""Import binary glTF meshes as Scenes: exports of this project, and meshes in class colours like those of the authors.
+"""Import binary glTF meshes as Scenes: exports of this project, and meshes with class colours as in the authors' files.
 
-The extras of a file written by `mesh_export.export_glb` identify it as an export of this project. Its nodes are the
-primitives: the transforms give centre, rotation and size, and the extras give the other fields. Changes that a user
-makes in a mesh editor are therefore imported.
+The extras of a file written by `mesh_export.export_glb` identify it as an export of this project. Each node is a
+primitive. The transform of the node gives centre, rotation and size; the extras give the other fields. Changes that a
+user makes in a mesh editor are therefore imported.
 
 Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), with these assumptions:
 
 * x is forward, y right and z down, in metres, unless `axes` gives other directions. The frame includes the pitch and
   roll of the authors' IMU.
-* The class of a vertex is the palette colour within COLOR_TOLERANCE (mesh_segmentation.py) of its vertex or material
-  colour. The reader chooses between sRGB and linear light (the glTF standard) by comparing the colours of the file with
-  the palette. It ignores textures.
+* The vertex or material colour determines the class of a vertex. The colour must match a palette colour within
+  COLOR_TOLERANCE (mesh_segmentation.py). Colours are sRGB or linear light (the glTF standard); the reader chooses the
+  one that matches the palette better. It ignores textures.
 * Ground has one vertex per occupied pixel, with or without triangles. In the authors' grid, the vertex of pixel (i, j)
-  lies at its corner x = 64 - .25 i, y = -32 + .25 j (y right). In exports of this project, the vertex lies at the pixel
-  centre. On the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the
+  lies at the pixel corner x = 64 - .25 i, y = -32 + .25 j (y right). In exports of this project, the vertex lies at the
+  pixel centre. On the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the
   nearest vertex with a class colour.
 * Primitives are connected pieces of one class. A mesh may hold any number of primitives. The reader first merges
-  vertices that are repeated along edges. A piece with eight vertices is a box, fitted to its edges. A piece with more
-  vertices is an ellipsoid, fitted as a quadric for any triangulation. Boxes of vegetation become vegetation_cuboid.
+  vertices that are repeated along edges. A piece with eight vertices is a box; the fit uses its edges. A piece with
+  more vertices is an ellipsoid; the fit of a quadric works for any triangulation. Boxes of vegetation become
+  vegetation_cuboid.
 
-An imported box has the corners of the mesh. An imported ellipsoid has the shape of the mesh. A yaw that the shape does
-not determine is lost. The reader raises an error for a piece that fits neither shape within FIT_M (shape_fitting.py).
+An imported box has the same corners as the mesh. An imported ellipsoid has the same shape as the mesh. If the shape
+does not determine the yaw, the yaw is lost. The reader raises an error for a piece that fits neither shape within FIT_M
+(shape_fitting.py).
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
-# Changes below this value are rounding errors and no edits: relative change of a size, or change of a yaw (rad).
+# Smaller changes are rounding errors, not edits: relative change of a size, or change of a yaw (rad).
 UNMOVED = 1e-4
 MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid.
 
@@ -66,14 +68,14 @@ def import_glb(
 ) -> Scene:
     """Import a .glb file as a Scene.
 
-    An export of this project keeps its ids, grid, ground classes and fused ground, which has one class per pixel. Any
-    other mesh gets source "imported" and split "generated".
+    For an export of this project, ids, grid, ground classes and the fused ground are restored. The fused ground has one
+    class per pixel. Any other mesh gets source "imported" and split "generated".
 
     Args:
         source: Content of the file as bytes, or its path or URI.
         scene_id: Id of the scene (default: the id in an export, or the file name without ".glb").
-        axes: Directions of the file's axes, for a mesh that is no export of this project.
-        grid: Raster grid, for a mesh that is no export of this project (default: the paper's).
+        axes: Directions of the file's axes. Used only for meshes that are not exports of this project.
+        grid: Raster grid (default: the paper's). Used only for meshes that are not exports of this project.
 
     Returns:
         The scene.
@@ -119,7 +121,8 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
     center_m = scene_from_unit[:, :3, 3]
     rotation, size_m = fit_boxes_to_edges(scene_from_unit[:, :3, :3], center_m)
-    # Keep the stored sizes where they agree, so that rounding does not swap length and width of a square.
+    # Keep the stored sizes where the fitted sizes agree with them. Otherwise, rounding can swap length and width of a
+    # square.
     size_said_m = size_said_m.reshape(-1, 3)
     size_m = np.where(np.isclose(size_m, size_said_m, rtol=UNMOVED, atol=0), size_said_m, size_m)
     rotation, size_m = canonicalize_boxes(rotation, size_m)

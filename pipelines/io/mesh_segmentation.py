@@ -1,4 +1,4 @@
-"""Segment a mesh in class colours into ground vertices, boxes and ellipsoids."""
+"""Segment a mesh with class colours into ground vertices, boxes and ellipsoids."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from models.scene import ELLIPSOID, Grid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY, GROUND_CLASS_ID
 
-COLOR_TOLERANCE = 12  # Tolerance per channel, of 255. Dark colours stored as 8-bit linear light are off by up to 7.
-FAR = 64  # Limit on the colour distance of one vertex (of 255) in the comparison of sRGB with linear light.
+COLOR_TOLERANCE = 12  # Tolerance per channel (0 to 255). Dark colours have errors of up to 7 as 8-bit linear light.
+FAR = 64  # The colour distance of a vertex is clipped to this value when sRGB and linear light are compared.
 ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre.
 MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes.
-VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # Both classes have the same colour.
+VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # The two classes have the same colour.
 CLASS_IDS = np.array(sorted(set(CLASS_ID.values()) - {VEGETATION[1]}))
 IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values()))
 
@@ -43,10 +43,10 @@ def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -
     Args:
         color: (v, 3) colours in [0, 1].
         linear: Whether the colours are linear light instead of sRGB.
-        class_ids: Class ids to choose from.
+        class_ids: Candidate class ids.
 
     Returns:
-        Class id (v,), and the largest difference of a colour channel (v,), of 255.
+        Class id (v,), and the largest difference in a colour channel (v,), on a scale of 0 to 255.
     """
     levels = np.round(color * 65535).astype(np.int64).clip(0, 65535)
     code, place = np.unique(levels @ np.array([2**32, 2**16, 1], np.int64), return_inverse=True)
@@ -94,7 +94,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
         Ground, boxes and ellipsoids.
 
     Raises:
-        ValueError: A vertex has no class colour, or a piece is neither ground nor box nor ellipsoid. The message gives
+        ValueError: A vertex has no class colour, or a piece is not ground, a box or an ellipsoid. The message gives
             the position of the piece and the fault.
     """
     class_id, off = find_nearest_class(color, linear, CLASS_IDS)
@@ -105,7 +105,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
     votes[:, EMPTY] = 0
     unknown = ~np.any(votes, axis=1)[piece]
     if len(triangles):
-        # Vertices that no triangle uses need no class colour.
+        # Vertices outside all triangles do not need a class colour.
         unknown[np.setdiff1d(np.arange(len(unknown)), triangles)] = False
     if unknown.any():
         stored = "".join(f"{round(255 * value):02x}" for value in color[unknown][0])
@@ -118,7 +118,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
         raise ValueError("the primitives are points without triangles; export boxes and spheres as meshes")
     ground_m, ground_id = vertices_m[on_ground], class_id[on_ground]
     faces = triangles[~on_ground[triangles[:, 0]]]
-    used, faces = np.unique(faces, return_inverse=True)  # The poles of a sphere may be unused vertices.
+    used, faces = np.unique(faces, return_inverse=True)  # Some sphere meshes do not use the vertices at the poles.
     boxes, clouds = _find_primitives(vertices_m[used], class_id[used], faces.reshape(-1, 3))
     return MeshPieces(
         ground_m, _split_mixed(ground_m, np.where(IS_GROUND[ground_id], ground_id, EMPTY)), *boxes, clouds
@@ -126,7 +126,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
 
 
 def _split_connected(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Return the number of the connected piece of each vertex (v,)."""
+    """For each vertex, return the number (v,) of the connected piece to which it belongs."""
     start, end = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
     graph = coo_array((np.ones(len(start), bool), (start, end)), shape=(num_vertices, num_vertices))
     return connected_components(graph, directed=False)[1] if num_vertices else np.zeros(0, int)
@@ -154,7 +154,7 @@ def _find_primitives(
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[np.ndarray]]:
     """Return corners_m (b, 8, 3) and class ids (b,) of the boxes, and the vertices of each ellipsoid."""
     piece = _split_connected(faces, len(points_m))
-    if (np.bincount(piece) < 8).any():  # The mesh repeats vertices along edges, so merge equal vertices.
+    if (np.bincount(piece) < 8).any():  # The mesh repeats vertices along edges. Merge vertices at the same position.
         keys, place = np.unique(np.column_stack([points_m, class_id]), axis=0, return_inverse=True)
         points_m, class_id, faces = keys[:, :3], keys[:, 3].astype(np.int64), place.ravel()[faces]
         piece = _split_connected(faces, len(points_m))
@@ -169,7 +169,7 @@ def _find_primitives(
         round_ & (lowest != VEGETATION[0]),
         points_m,
         start,
-        "has more than eight vertices but is no vegetation",
+        "has more than eight vertices but is not vegetation",
     )
     boxes = start[~round_]
     clouds = [points_m[first : first + count] for first, count in zip(start[round_], size[round_], strict=True)]
@@ -191,10 +191,10 @@ def _refuse(bad: np.ndarray, points_m: np.ndarray, start: np.ndarray, what: str)
 def rasterize_ground(
     vertices_m: np.ndarray, class_id: np.ndarray, classes: tuple[str, ...], grid: Grid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rasterise ground vertices that lie at the corner or the centre of a pixel, one per pixel.
+    """Rasterise ground vertices, which lie at the corners or at the centres of pixels.
 
-    A vertex at a corner belongs to the pixel whose far left corner it is (x = front_m - row resolution_m). Of several
-    vertices of one class in a pixel, the highest counts.
+    A vertex at a corner is the far left corner of its pixel (x = front_m - row resolution_m). If a pixel has several
+    vertices of one class, the highest vertex is used.
 
     Args:
         vertices_m: (v, 3) vertices in the scene frame (m), all at corners or all at centres.

@@ -1,9 +1,9 @@
 """Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes and junctions.
 
-Each road of centerlines.py becomes a road of cubic curves through points of its centreline, with at least one driving
-lane per side. Each road ends before its node. A connecting road then leads from each road at the node to every other
-road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header is the position of the scene in the
-world frame. Traffic keeps to the right.
+Each road of centerlines.py becomes an OpenDRIVE road with at least one driving lane per side. Its reference line
+consists of cubic curves through points of the centreline. Roads end before a node. At the node, a connecting road leads
+from each road to every other road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header is the
+position of the scene in the world frame. Traffic keeps to the right.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ from models.scene import Scene
 from pipelines.geometry.centerlines import Road, RoadNetwork, extract_road_network
 
 KNOT_M = 5.0  # Distance between points of a reference line.
-LANE_M = 3.5  # One lane per side for about this half width of a road.
-LEAST_ROAD_M = 2.0  # Minimum length of a road between its junctions.
-CLEAR = 1.3  # Distance of road ends from a node, in half widths of the widest road.
-SAMPLES = 64  # Number of samples per cubic that measure its length.
+LANE_M = 3.5  # Approximate lane width, which determines the number of lanes per side.
+LEAST_ROAD_M = 2.0  # Minimum length of a road between two junctions.
+CLEAR = 1.3  # Distance from a node to the road ends, as a multiple of the half width of the widest road.
+SAMPLES = 64  # Number of samples per cubic curve for the measurement of its length.
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceLine:
-    """A smooth curve through k knots, parametrised by chord length.
+    """A smooth curve through k knots.
+
+    The parameter is the chord length.
 
     Attributes:
         curve: Map from chord length to x, y and z in the scene frame (m).
@@ -49,13 +51,14 @@ class ReferenceLine:
         Args:
             xyz_m: (k, 3) points in the scene frame (m), k >= 2.
             width_m: (k,) width of the whole road at the points (m).
-            tangents: (2, 2) unit directions at the first and last point, seen from above (default: free ends).
+            tangents: (2, 2) unit directions at the first and last point, seen from above. None: the directions at the
+                ends are free.
 
         Returns:
             The curve.
         """
         breaks = np.append(0, np.cumsum(np.linalg.norm(np.diff(xyz_m[:, :2], axis=0), axis=1)))
-        # The annotation of scipy allows only a string; its documentation also allows tuples.
+        # scipy's annotation allows only a string, but its documentation also allows tuples.
         ends: Any = "natural" if len(xyz_m) > 2 else "not-a-knot"
         if tangents is not None:
             slope = (xyz_m[-1, 2] - xyz_m[0, 2]) / breaks[-1]
@@ -72,7 +75,7 @@ class ReferenceLine:
 
     @property
     def starts_m(self) -> np.ndarray:
-        """(k,) length of the line up to each knot (m)."""
+        """Length of the line up to each knot (k,), in metres."""
         return np.append(0, np.cumsum(self.lengths_m))
 
     def end(self, which: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +92,9 @@ class ReferenceLine:
 
 
 def fit_reference_lines(network: RoadNetwork) -> list[ReferenceLine]:
-    """Fit a curve to each road, shortened where a junction begins.
+    """Fit a curve to each road.
+
+    Roads are shortened at junctions.
 
     Args:
         network: Roads and nodes.
@@ -113,7 +118,7 @@ def _shorten_road(road: Road, from_start_m: float, from_end_m: float) -> Referen
     low, high = from_start_m * min(1, spare_m), along[-1] - from_end_m * min(1, spare_m)
     at = np.linspace(low, high, max(2, round((high - low) / KNOT_M) + 1))
     xyz_m = np.stack([np.interp(at, along, road.xyz_m[:, axis]) for axis in range(3)], axis=1)
-    usual_m = np.median(road.width_m)  # At forks, the mask is wider than any of the roads.
+    usual_m = np.median(road.width_m)  # At a fork, the mask is wider than each of the roads.
     width_m = np.interp(at, along, np.minimum(road.width_m, 1.15 * usual_m))
     return ReferenceLine.through(xyz_m, width_m)
 
@@ -125,7 +130,7 @@ def list_lanes(line: ReferenceLine) -> int:
         line: Reference line of a road.
 
     Returns:
-        Half the median width divided by LANE_M, rounded, at least 1.
+        Half the median road width divided by LANE_M, rounded to an integer >= 1.
     """
     return max(1, round(float(np.median(line.width_m)) / 2 / LANE_M))
 
@@ -156,7 +161,7 @@ def export_opendrive(scene: Scene) -> bytes:
                 ET.SubElement(link, name, elementType="junction", elementId=_make_junction_id(node))
         _make_road_body(element, line, left=list_lanes(line), right=list_lanes(line))
     junctions = [_make_junction(root, network, lines, node) for node in range(len(network.nodes_m))]
-    root.extend(junctions)  # Junctions follow all roads.
+    root.extend(junctions)  # In the file, junctions come after all roads.
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -193,7 +198,7 @@ def _make_road(root: ET.Element, number: int, line: ReferenceLine, junction: int
 def _make_road_body(
     road: ET.Element, line: ReferenceLine, left: int, right: int, links: tuple[int, int] | None = None
 ) -> None:
-    """Write plan, elevation and lanes of a road.
+    """Write the plan view, elevation and lanes of a road.
 
     For a connecting road, `links` holds the signs of the lane numbers of the previous and the next road.
     """
@@ -246,7 +251,7 @@ def _make_road_body(
 
 
 def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
-    """Write the width of a lane, piecewise linear between knots."""
+    """Write the width of a lane, which is linear between knots."""
     width_m = line.width_m / 2 / lanes
     slope = np.diff(width_m) / line.lengths_m
     for s, a, b in zip(line.starts_m[:-1], width_m[:-1], slope, strict=True):
@@ -275,8 +280,8 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         points = ["end" if come_end else "start", "end" if go_end else "start"]
         for name, other, point in zip(("predecessor", "successor"), (come, go), points, strict=True):
             ET.SubElement(link, name, elementType="road", elementId=str(other), contactPoint=point)
-        # Traffic keeps to the right. It leaves a road on negative lanes at the road's end, and on positive lanes at its
-        # start.
+        # Traffic keeps to the right. At the end of a road, traffic leaves on negative lanes. At the start of a road,
+        # traffic leaves on positive lanes.
         signs = (-1 if come_end else 1), (1 if go_end else -1)
         _make_road_body(road, line, left=0, right=lanes, links=signs)
         about = {"incomingRoad": str(come), "connectingRoad": str(number), "contactPoint": "start"}

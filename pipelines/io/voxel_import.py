@@ -1,14 +1,14 @@
 """Read and write voxel grids of any method as .npz files, and draw them from above.
 
-A file holds one scene: the array `voxels`, or the only array, of integer class ids. The ids are those of the authors
-(docs/how_to/import_scenes.md; palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4 parking, 5 road, 6
-vegetation_cuboid, 7 vegetation_ellipsoid, 8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human, 12
-construction_big, 13 construction_small, 14 pole, 15 traffic_control, 16 object. This project adds 17, crossing. An
-array has 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 voxels over the 64 x 64 m of the crop. Coarse voxels are
-repeated (nearest neighbour), as the paper does with its baselines.
+A file holds one scene as an array of integer class ids. The array is named `voxels` or is the only array in the file.
+The ids are those of the authors (docs/how_to/import_scenes.md; palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4
+parking, 5 road, 6 vegetation_cuboid, 7 vegetation_ellipsoid, 8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human,
+12 construction_big, 13 construction_small, 14 pole, 15 traffic_control, 16 object. This project adds the id 17 for
+crossing. An array has 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 voxels, which cover the crop of 64 x 64 m. Coarse
+voxels are upsampled by repetition (nearest neighbour), as in the paper's evaluation of baselines.
 
-In this project's axis order, rows point backwards (row 0 is farthest ahead), columns point to the right (column 0 is
-leftmost), and levels point upwards.
+In this project's axis order, row 0 is farthest ahead and rows continue backwards. Column 0 is leftmost and columns
+continue to the right. Levels continue upwards.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VOXEL_AXES: Axes = ("x-", "y-", "z+")
 ARRAY = "voxels"
 FULL = VoxelGrid().shape
 SHAPES = tuple(tuple(n // factor for n in FULL) for factor in (1, 2, 4))
-MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size of an array of 64-bit numbers with its header.
+MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size of an array of 64-bit numbers, including the header.
 
 
 def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
@@ -73,13 +73,13 @@ def _read_only_array(content: bytes) -> np.ndarray:
     if name != ARRAY and len(sizes) != 1:
         raise ValueError(f"holds {', '.join(sizes) or 'nothing'}")
     if sizes[name] > MAX_BYTES:
-        raise ValueError(f"{name!r} has {sizes[name]} bytes, more than one scene needs")
+        raise ValueError(f"{name!r} has {sizes[name]} bytes, which is too large for one scene")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return arrays[name]
 
 
 def convert_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:
-    """Reorder voxels so that rows point backwards, columns to the right and levels upwards.
+    """Reorder voxels to this project's axis order: rows backwards, columns to the right, levels upwards.
 
     Args:
         voxels: Three-dimensional array in the axis order of a file.
@@ -106,16 +106,16 @@ def export_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
         grid: Voxel grid (default: 256 x 256 x 32).
 
     Returns:
-        Content of a compressed .npz file; equal input gives equal bytes.
+        Content of a compressed .npz file. The same input always gives the same bytes.
 
     Raises:
         ValueError: `read_voxels` does not accept the shape of the grid.
     """
     voxels = voxelize(scene, grid or VoxelGrid())
     if voxels.shape not in SHAPES:
-        raise ValueError(f"a voxel grid of shape {voxels.shape} cannot be read back, expected one of {SHAPES}")
+        raise ValueError(f"a voxel grid of shape {voxels.shape} cannot be read back; expected one of {SHAPES}")
     content = io.BytesIO()
-    # The cast is needed because numpy's annotation of keyword arguments includes allow_pickle.
+    # The cast is needed because of `allow_pickle` in numpy's annotation of the keyword arguments.
     np.savez_compressed(content, **cast("dict[str, Any]", {ARRAY: voxels}))
     return content.getvalue()
 
@@ -133,7 +133,9 @@ def write_voxels(uri: str, scene: Scene, grid: VoxelGrid | None = None) -> None:
 
 
 def draw_voxels(voxels: np.ndarray) -> np.ndarray:
-    """Draw voxels from above: each pixel has the colour of the topmost filled voxel in its column.
+    """Draw voxels from above.
+
+    Each pixel has the colour of the topmost filled voxel in the column.
 
     Args:
         voxels: (rows, cols, levels) uint8 class ids.
@@ -142,6 +144,6 @@ def draw_voxels(voxels: np.ndarray) -> np.ndarray:
         (rows, cols, 3) uint8 sRGB, white for empty columns.
     """
     filled = voxels != EMPTY
-    # In an empty column, this is the highest level, which is EMPTY.
+    # In an empty column, the result is the highest level, which is EMPTY.
     top = voxels.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)
     return CLASS_COLORS[np.take_along_axis(voxels, top[:, :, None], axis=2)[:, :, 0]]

@@ -14,7 +14,7 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.geometry.masks import find_nearest_true
 from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
-NODES = 65  # Number of ground heights along the longer side; they are 1 m apart in a crop.
+NODES = 65  # Number of ground heights along the longer side. In a crop, the spacing is 1 m.
 
 
 def export_web_scene(scene: Scene) -> dict:
@@ -54,7 +54,7 @@ def draw_ground(scene: Scene) -> str:
         scene: Scene.
 
     Returns:
-        PNG image as a data URI, transparent where the scene has no ground.
+        PNG image as a data URI. Pixels without ground are transparent.
     """
     class_id = list_ground_ids(scene)[scene.surface()[1]]
     image = Image.fromarray(class_id, "P")

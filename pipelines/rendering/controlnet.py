@@ -1,4 +1,4 @@
-"""Turn street views into photographs with Stable Diffusion and a ControlNet on semantic images, from local weights."""
+"""Turn street views into photographs. Stable Diffusion and a ControlNet for semantic images run with local weights."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from pipelines.runtime.ray_tasks import map_actors
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 from pipelines.schema.run_guard import find_changed_option
 
-SKY = (70, 130, 180)  # Sky colour of the KITTI-360 and Cityscapes palette, used where a street view is empty.
-MULTIPLE_PX = 8  # Width and height of the network's images are multiples of this value.
+# Sky colour of the KITTI-360 and Cityscapes palette. Empty pixels of a street view get this colour.
+SKY = (70, 130, 180)
+MULTIPLE_PX = 8  # The width and height of the network's images are multiples of this value.
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,11 @@ class PhotoRequest:
         diffusion: Local directory of a Stable Diffusion model in diffusers format (safetensors).
         controlnet: Local directory of a ControlNet in diffusers format (safetensors).
         prompt: Text prompt.
-        negative_prompt: Text prompt of unwanted content; empty for none.
+        negative_prompt: Text prompt that describes unwanted content; empty: no negative prompt.
         steps: Number of denoising steps.
         guidance_scale: Weight of classifier-free guidance.
         control_scale: Weight of the ControlNet.
-        seed: Random seed of the noise, the same for all frames.
+        seed: Random seed of the noise. All frames use the same seed.
     """
 
     diffusion: str
@@ -54,7 +55,7 @@ def make_control_image(class_id: np.ndarray) -> np.ndarray:
         class_id: (H, W) class ids.
 
     Returns:
-        (H, W, 3) uint8 sRGB, SKY where class_id is EMPTY.
+        (H, W, 3) uint8 sRGB. Pixels with class id EMPTY have the colour SKY.
     """
     return np.where((class_id == EMPTY)[..., None], np.array(SKY, np.uint8), CLASS_COLORS[class_id])
 
@@ -83,8 +84,8 @@ class Painter:
             )
         except (OSError, ValueError, ImportError) as error:
             raise ValueError(
-                f"{request.diffusion} and {request.controlnet} hold no Stable Diffusion and ControlNet weights in"
-                f" diffusers format with safetensors ({error})"
+                f"{request.diffusion} must hold Stable Diffusion weights and {request.controlnet} ControlNet "
+                f"weights, both in diffusers format with safetensors ({error})"
             ) from error
         self.pipeline.set_progress_bar_config(disable=True)
         self.pipeline.to("cuda" if torch.cuda.is_available() else "cpu")
@@ -186,13 +187,13 @@ def paint_streets(
 ) -> int:
     """Generate a photograph for every frame of several drives.
 
-    A second call resumes an interrupted one.
+    A second call resumes an interrupted run.
 
     Args:
         request: Options of the photographs.
         directories: Directories of the drives.
         actors: Maximum number of actors.
-        on_drive: Called after each drive.
+        on_drive: Function that is called after each drive.
 
     Returns:
         Number of frames.

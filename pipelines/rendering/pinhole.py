@@ -1,9 +1,9 @@
-"""Render a Scene for a pinhole camera on the CPU: classes, instances and depth, exact and deterministic.
+"""Render classes, instances and depth of a Scene for a pinhole camera.
 
-In the image plane, 1 / depth is linear over a flat triangle. The code that casts vertical rays (rasterize.py) can
-therefore cast camera rays, with 1 / depth instead of height. The intersection of a ray with an ellipsoid is the exact
-solution of a quadratic equation. The camera frame is that of KITTI-360: x right, y down, z forward, in metres. Pixel
-centres have integer coordinates (u to the right, v down).
+The result is exact and deterministic. In the image plane, 1 / depth is linear over a flat triangle. The code for
+vertical rays (rasterize.py) can therefore cast camera rays; 1 / depth replaces the height. The intersection of a ray
+with an ellipsoid is exact: it is the solution of a quadratic equation. The camera frame is that of KITTI-360: x right,
+y down, z forward, in metres. Pixel centres have integer coordinates (u to the right, v down).
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class StreetView(NamedTuple):
 
     @property
     def semantic(self) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB: the palette colour of each pixel, white for sky."""
+        """Palette colour of each pixel: (H, W, 3) uint8 sRGB. The sky is white."""
         return CLASS_COLORS[self.class_id]
 
     def instance(self) -> np.ndarray:
@@ -128,7 +128,7 @@ class StreetView(NamedTuple):
 
 
 class StreetRenderer:
-    """Render one scene for many cameras; data that do not depend on the camera are computed once."""
+    """Render one scene for many cameras. Data that do not depend on the camera are computed once."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -137,7 +137,7 @@ class StreetRenderer:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """(t, 3) float32 unit normals of the triangles."""
+        """Unit normals of the triangles: (t, 3) float32."""
         a, b, c = np.moveaxis(self.soup.corners_m, 1, 0)
         normal = np.cross(b - a, c - a)
         return (normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)).astype(np.float32)
@@ -193,14 +193,17 @@ def _make_rays(lens: Lens, v: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _project_to_image(corners: np.ndarray, lens: Lens) -> np.ndarray:
-    """Project triangles (t, 3, 3) in the camera frame, z > 0, to the grid of `_list_pixels`; their height is 1 / z."""
+    """Project triangles (t, 3, 3) with z > 0 from the camera frame to the grid of `_list_pixels`.
+
+    The height is 1 / z.
+    """
     x, y, z = np.moveaxis(corners, -1, 0)
     u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
     return np.stack([-v - 0.5, -u - 0.5, 1 / z], axis=-1)
 
 
 def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Clip the visible triangles (t, 3, 3) in the camera frame at NEAR_M; return indices (k,) and corners (k, 3, 3)."""
+    """Clip visible triangles (t, 3, 3) at z = NEAR_M in the camera frame. Return indices (k,) and corners (k, 3, 3)."""
     x, y, z = np.moveaxis(corners, -1, 0)
     left, right = (0 - 0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx
     top, bottom = (0 - 0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy
@@ -217,12 +220,15 @@ def _clip_in_front(corners: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndar
 
 
 def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Clip triangles that have one or two corners closer than NEAR_M, each to one or two triangles at z >= NEAR_M."""
+    """Clip triangles with one or two corners closer than NEAR_M.
+
+    Each triangle gives one or two triangles at z >= NEAR_M.
+    """
     found_index, found = [], []
     for count in (1, 2):
         some = np.flatnonzero(behind == count)
         near = corners[some, :, 2] < NEAR_M
-        # The corner that is alone on its side of the plane comes first.
+        # One corner lies alone on its side of the plane. It comes first.
         odd = np.argmax(near if count == 1 else ~near, axis=1)
         turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
         first, second, third = np.moveaxis(turned, 1, 0)
@@ -243,7 +249,7 @@ def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the flat pixel index, primitive and 1 / depth (m,) of each pixel centre on each ellipsoid in front.
+    """For each ellipsoid and each pixel centre on it, return the flat pixel index, the primitive and 1 / depth (m,).
 
     A ray t d, with z = 1 in d, meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d.M^T M p
     and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. Along a row of pixels, this is the interval
@@ -281,7 +287,7 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     d = _make_rays(lens, row, col)
     of_d = np.einsum("ki,ki->k", b[ball], d)
     square_d = np.einsum("ki,kij,kj->k", d, square[ball], d)
-    # Compute the nearer root as C / (B + sqrt), which avoids a difference of large numbers.
+    # The nearer root is computed as C / (B + sqrt). This avoids the difference of large numbers.
     inverse = (of_d + np.sqrt(np.maximum(of_d**2 - square_d * c[ball], 0))) / c[ball]
     return row * lens.width + col, primitive[ball], inverse
 

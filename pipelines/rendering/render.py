@@ -1,4 +1,4 @@
-"""Render a Scene from above in flat class colours or obliquely in soft light, and arrange images on a sheet."""
+"""Render a Scene from above in flat class colours, or obliquely in soft light. Arrange images on a sheet."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ MARK_COLOR = (230, 0, 0)  # sRGB colour of lines over an image.
 
 
 def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.ndarray:
-    """Render a scene from above in class colours, white where it is empty.
+    """Render a scene from above in class colours.
 
-    The projection is orthographic with +x (forward) up and +y left. The grid fills the image. Metrics use this image;
-    it is bit-identical on every call.
+    Empty areas are white. The projection is orthographic with +x (forward) up and +y left. The grid fills the image.
+    The image is bit-identical on every call, because metrics use it.
 
     Args:
         scene: Scene.
         size_px: Number of pixels along the longer side.
-        supersample: Each pixel is the mean of supersample^2 points.
+        supersample: Number of samples per pixel along each axis; a pixel is the mean of its samples.
 
     Returns:
         (H, W, 3) uint8 sRGB.
@@ -61,7 +61,7 @@ def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) ->
 
     Args:
         scene: Scene.
-        region: (rows, cols) bool in the raster grid of the scene; True inside the region.
+        region: (rows, cols) mask in the raster grid of the scene; True inside the region.
         size_px: Number of pixels along the longer side.
 
     Returns:
@@ -92,14 +92,14 @@ def _list_color_pairs() -> np.ndarray:
 def _paint_pixels(class_id: np.ndarray) -> np.ndarray:
     """Return CLASS_COLORS[class_id] (H, W, 3) for class_id (H, W) uint8.
 
-    The function processes two pixels at a time, because a copy of six bytes takes the same time as a copy of three.
+    The function processes two pixels at a time, because copying six bytes takes the same time as copying three bytes.
     """
     pair = np.resize(class_id, class_id.size + class_id.size % 2).view("<u2")
     return _list_color_pairs().take(pair, axis=0).reshape(-1, 3)[: class_id.size].reshape(*class_id.shape, 3)
 
 
 def _make_oblique_view(grid: Grid, size_px: int) -> Grid:
-    """Return a grid of the same rectangle with size_px pixels along its longer side."""
+    """Return a grid that covers the same rectangle with size_px pixels along the longer side."""
     resolution_m = max(grid.rows, grid.cols) * grid.resolution_m / size_px
     rows, cols = (max(1, round(n * grid.resolution_m / resolution_m)) for n in (grid.rows, grid.cols))
     return Grid(grid.front_m, grid.left_m, resolution_m, rows, cols)
@@ -113,10 +113,10 @@ def render_3d(
     elevation_deg: float = 38.0,
     supersample: int = 2,
 ) -> np.ndarray:
-    """Render a scene obliquely in soft light, as a model on a table, with an orthographic camera.
+    """Render a scene obliquely with an orthographic camera, like a model on a table in soft light.
 
-    The camera depends only on the scene's grid. Images of scenes of equal size are therefore comparable. The light
-    plate under the scene is visible where the scene has no ground.
+    The camera depends only on the scene's grid. Images of scenes of the same size are therefore comparable. A
+    light-coloured plate under the scene is visible where the scene has no ground.
 
     Args:
         scene: Scene.
@@ -124,7 +124,7 @@ def render_3d(
         height: Image height in pixels.
         azimuth_deg: Angle of the view direction to the left of +x (forward), in degrees.
         elevation_deg: Downward angle of the view direction, in degrees, in (0, 90].
-        supersample: Each pixel is the mean of supersample^2 points.
+        supersample: Number of samples per pixel along each axis; a pixel is the mean of its samples.
 
     Returns:
         (height, width, 3) uint8 sRGB.
@@ -170,9 +170,9 @@ def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
 def arrange_contact_sheet(
     pictures: Sequence[np.ndarray], columns: int, captions: Sequence[str] | None = None, gap_px: int = 12
 ) -> np.ndarray:
-    """Arrange images on a white sheet, each with its caption below.
+    """Arrange images on a white sheet.
 
-    All cells have the size of the largest image.
+    The caption is below each image. All cells have the size of the largest image.
 
     Args:
         pictures: Images (h, w, 3) uint8.

@@ -1,7 +1,7 @@
-"""Compute surface and light of each pixel in 3D images.
+"""Compute the visible surface and the light of each pixel in 3D images.
 
-The light consists of a sun with soft shadows, a sky and thin outlines around primitives. The sky light is stronger on
-surfaces that face up and weaker close to other surfaces. Class colours are kept: a horizontal surface in the sun has
+The scene is lit by a sun with soft shadows and by a sky. Primitives have thin outlines. The sky light is stronger on
+surfaces that face up. It is weaker near other surfaces. Class colours are kept: a horizontal surface in the sun has
 exactly its palette colour.
 """
 
@@ -25,20 +25,21 @@ from pipelines.geometry.rasterize import cast_rays_down
 from pipelines.io.mesh_export import make_unit_cuboid, triangulate_cuboids, triangulate_ground
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS
 
-PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids after those of the classes.
+PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids of plate and table; they follow the class ids.
 _SRGB = np.vstack([CLASS_COLORS, [[226, 228, 232], [243, 245, 248]]]) / 255
 LINEAR_COLORS = (_SRGB**2.2).astype(np.float32)
 
-SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0  # Direction of the sun's rays, defined like a camera direction.
+# Direction of the sun's rays, with the angles of a camera's view direction.
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0
 SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface.
 SKY = 1 - SUN
 SHADOW_PX, SHADOW_BIAS_PX = 900, 1.2
-# Height map: pixels along the longer side, standard deviation of the blur, margin around the grid
+# Height map: number of pixels along the longer side, standard deviation of the blur, and margin around the grid.
 SKY_PX, NEARBY_M, MARGIN_M = 640, 1.6, 12.0
-# Share of light removed on a line between two primitives, and between two faces of one primitive
+# Share of light that is removed on a line between two primitives, and on a line between two faces of one primitive.
 OUTLINE, CREASE = 0.5, 0.25
 
-SCENERY = 0  # Part number of ground, plate and table, which have no lines between them.
+SCENERY = 0  # Part number of ground, plate and table. Their borders have no lines.
 
 
 class Faces(NamedTuple):
@@ -136,9 +137,9 @@ def _make_cuboid_faces(scene: Scene) -> Faces:
 
 
 def _make_sheet(scene: Scene) -> np.ndarray:
-    """Return the heights (rows, cols) of the plate, about one node per metre, just below the ground.
+    """Return the heights (rows, cols) of the plate, which lies just below the ground.
 
-    Outside the ground, the plate continues at the height of the nearest ground.
+    There is about one node per metre. Where the scene has no ground, the plate has the height of the nearest ground.
     """
     height, winner = scene.surface()
     if (winner < 0).all():
@@ -151,7 +152,7 @@ def _make_sheet(scene: Scene) -> np.ndarray:
 
 
 def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
-    """Return the plate over the whole grid, with walls down to the table."""
+    """Return the plate, which covers the whole grid and has walls down to the table."""
     rows, cols = sheet_m.shape
     x, y = np.linspace(grid.front_m, grid.back_m, rows), np.linspace(grid.left_m, grid.right_m, cols)
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), sheet_m], axis=-1)
@@ -162,13 +163,13 @@ def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
 
 
 def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
-    """(H, 1) depth of the table at each row of the image: its scene z equals up x + near depth."""
+    """Return the depth (H, 1) of the table in each image row, from scene z = up x + near depth."""
     up, _, near = camera.camera_from_scene[:, 2]
     return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 
 
 def _make_quads(points: np.ndarray) -> np.ndarray:
-    """Return the triangles (2 (r - 1) (c - 1), 3, 3) of a net of points (r, c, 3).
+    """Return the triangles (2 (r - 1) (c - 1), 3, 3) of a grid of points (r, c, 3).
 
     They face up if x and y decrease along the rows and columns.
     """
@@ -195,14 +196,17 @@ def _compute_ellipsoid_normals(
 
 
 def _find_top(scene: Scene, solid: Faces, camera: Camera) -> np.ndarray:
-    """(H, W) float32 depth of the nearest plate, cuboid or ellipsoid; -inf without one."""
+    """Return the depth (H, W) float32 of the nearest plate, cuboid or ellipsoid; -inf if there is no hit."""
     turned = camera.turn(solid.corners_m)
     (flat,), _ = cast_rays_down(turned[find_facing_sides(turned)], camera.view)
     return np.maximum(flat, cast_ellipsoids(scene, camera)[0]).astype(np.float32)
 
 
 def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray], cosine: np.ndarray) -> np.ndarray:
-    """(H, W) share of the sun in [0, 1] at each point, from a shadow map averaged over neighbouring pixels."""
+    """Return the share (H, W) of sunlight at each point, in [0, 1].
+
+    The shadow map is averaged over neighbouring pixels.
+    """
     blocker = _add_rim(_find_top(scene, solid, sun), -np.inf)
     x, y, z = (a * point[0] + b * point[1] + c * point[2] for a, b, c in sun.camera_from_scene.tolist())
     z += SHADOW_BIAS_PX * sun.view.resolution_m / cosine.clip(0.15)  # The bias is larger at grazing incidence.
@@ -215,7 +219,10 @@ def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray
 
 
 def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
-    """(H, W) share of the sky light, which decreases with the depth of a point below the mean height around it."""
+    """Return the share (H, W) of sky light.
+
+    It decreases with the depth of a point below the mean height around the point.
+    """
     grid = scene.grid
     length_m, width_m = (n * grid.resolution_m + 2 * MARGIN_M for n in (grid.rows, grid.cols))
     resolution_m = max(length_m, width_m) / SKY_PX
@@ -228,7 +235,7 @@ def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[
 
 
 def _add_rim(picture: np.ndarray, value: float) -> np.ndarray:
-    """Return the flattened image (H W,), with `value` in its two outermost rows and columns.
+    """Return the flattened image (H W,) with `value` in the two outermost rows and columns on each side.
 
     These pixels represent the area outside the image.
     """
@@ -238,14 +245,17 @@ def _add_rim(picture: np.ndarray, value: float) -> np.ndarray:
 
 
 def _project_flat(view: Grid, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the index into the flattened image for each point; points outside get the nearest pixel."""
+    """Return the index into the flattened image for each point. Points outside the image get the nearest pixel."""
     row = ((view.front_m - x) * (1 / view.resolution_m)).clip(0, view.rows - 1).astype(np.int32)
     col = ((view.left_m - y) * (1 / view.resolution_m)).clip(0, view.cols - 1).astype(np.int32)
     return row * view.cols + col
 
 
 def _draw_lines(seen: Surfaces) -> np.ndarray:
-    """(H, W) share of light removed by lines, which lie on the nearer side of each border between parts."""
+    """Return the share (H, W) of light that lines remove.
+
+    A line lies on the nearer side of a border between two parts.
+    """
     lost = np.zeros(seen.part.shape, np.float32)
     for axis in (0, 1):
         one, two = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])

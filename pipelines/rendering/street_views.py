@@ -1,4 +1,4 @@
-"""Render street views along the roads of scenes, one Ray task per scene.
+"""Render street views along the roads of scenes, with one Ray task per scene.
 
 The output of a scene consists of images, cameras, a contact sheet and an animation.
 """
@@ -22,14 +22,17 @@ from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.run_guard import find_changed_option
 from pipelines.schema.scene_subset import SceneSubset
 
-DEPTH_PER_M = 256  # Units per metre in a 16-bit depth image, as in KITTI; 0 marks sky and depths above 255 m.
+# Units per metre in a 16-bit depth image, as in KITTI. The value 0 marks sky and depths greater than 255 m.
+DEPTH_PER_M = 256
 FRAMES_PER_SECOND = 10
 ON_SHEET = 24
 
 
 @dataclass(frozen=True)
 class StreetRequest:
-    """Options of street views, which are written to streets/<run>/<scene_id>/.
+    """Options of street views.
+
+    The output directory is streets/<run>/<scene_id>/.
 
     Attributes:
         output: Output directory.
@@ -39,7 +42,7 @@ class StreetRequest:
         pitch_deg: Upward angle of the view direction, in degrees.
         lens: Camera intrinsics.
         right: Offset to the right of the centreline, as a share of the road width.
-        most: Maximum number of frames per scene; None means no limit.
+        most: Maximum number of frames per scene; None: no limit.
     """
 
     output: str
@@ -64,7 +67,9 @@ class StreetRequest:
 
 
 def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:
-    """Place cameras along a path on the ground, each looking along the path.
+    """Place cameras along a path on the ground.
+
+    Each camera looks along the path.
 
     Args:
         way_m: (k, 3) points of the path in the scene frame (m), k >= 2.
@@ -108,7 +113,7 @@ def encode_depth(view: StreetView) -> np.ndarray:
         view: Rendered images of one camera.
 
     Returns:
-        (H, W) uint16 with DEPTH_PER_M units per metre; 0 for sky and depths above 255 m.
+        (H, W) uint16 with DEPTH_PER_M units per metre; 0 for sky and for depths greater than 255 m.
     """
     depth = np.round(view.depth_m * DEPTH_PER_M)
     return np.where(depth < 2**16, depth, 0).astype(np.uint16)
@@ -118,7 +123,7 @@ def encode_animation(frames: list[np.ndarray]) -> bytes:
     """Encode frames as an animated WebP file, which web browsers display.
 
     Args:
-        frames: Images (H, W, 3) uint8 of equal size.
+        frames: Images (H, W, 3) uint8 of the same size.
 
     Returns:
         Content of the file.
@@ -174,18 +179,18 @@ def render_streets(
 ) -> dict[str, int]:
     """Render street views of the selected scenes.
 
-    A second call resumes an interrupted one.
+    A second call resumes an interrupted run.
 
     Args:
         request: Cameras and output.
         selection: Scenes.
-        on_scene: Called after each scene.
+        on_scene: Function that is called after each scene.
 
     Returns:
-        Number of frames by scene id; 0 for a scene without a road.
+        Number of frames for each scene id; 0 for a scene without a road.
 
     Raises:
-        ValueError: The output holds a run of the same name with other cameras, or no scene has a road.
+        ValueError: The output holds a run with the same name but other cameras, or no scene has a road.
     """
     record = storage.join_uri(request.output, "streets", f"{request.run}.json")
     if said := find_changed_option(record, asdict(request)):

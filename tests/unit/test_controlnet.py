@@ -55,7 +55,7 @@ def test_painter_names_missing_weights(controlnet_weights, tmp_path):
         paint(Config(diffusion=controlnet_weights[0], controlnet=str(tmp_path / "nowhere")))
     for path in Path(controlnet_weights[1]).glob("*.json"):
         (tmp_path / path.name).write_text(path.read_text())
-    with pytest.raises(ValueError, match="no Stable Diffusion and ControlNet weights"):
+    with pytest.raises(ValueError, match="must hold Stable Diffusion weights"):
         Painter(make_request((controlnet_weights[0], str(tmp_path))))
     with pytest.raises(ValueError, match="holds no street views; run jobs/render_streets"):
         paint(Config(streets=str(tmp_path), diffusion=controlnet_weights[0], controlnet=controlnet_weights[1]))

@@ -206,7 +206,7 @@ def test_snap_leaves_nothing_floating_or_sunken(town_scenes):
 
 def test_edit_rejects_degenerate_primitive(scene):
     for wrong in (edit.Scale(ALL, (0, 1, 1)), edit.Scale(ALL, (1e6, 1, 1)), edit.Translate(ALL, (np.inf, 0, 0))):
-        with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*thinner than 1 mm"):
+        with pytest.raises(ValueError, match=rf"edit 0 \({wrong.name}\): .*size outside 1 mm to 1 km"):
             replay_edits(scene, [wrong])
 
 

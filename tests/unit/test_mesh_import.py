@@ -354,11 +354,11 @@ FAULTS = {
     "nothing": (lambda: trimesh.Scene(trimesh.PointCloud([[0, 0, 0]])).export(file_type="glb"), "no class colour"),
     "colour": (export_green_box, r"colour #0ac80a \(sRGB\) of 8 vertices is no class colour"),
     "sheared": (export_sheared_box, "eight vertices that are not the corners of a box|edges are not perpendicular"),
-    "welded": (lambda: export_welded_boxes("vehicle_small"), "more than eight vertices but is no vegetation"),
+    "welded": (lambda: export_welded_boxes("vehicle_small"), "more than eight vertices but is not vegetation"),
     "bush": (lambda: export_welded_boxes("vegetation_cuboid"), "neither on a box nor on an ellipsoid"),
     "ball": (
         lambda: export_mesh(*make_three_sphere(), "vehicle_small"),
-        "more than eight vertices but is no vegetation",
+        "more than eight vertices but is not vegetation",
     ),
     "flat": (lambda: export_mesh(make_three_box()[0] * [1, 1, 0], make_three_box()[1]), "thinner than 1 mm"),
     "triangle": (lambda: export_mesh(np.eye(3), [[0, 1, 2]]), "fewer than eight"),
