@@ -1,7 +1,7 @@
 """Edit the primitives of a scene: select primitives, change their parameters exactly, and record the changes.
 
 A list of edits is plain data. Applying the same list to the same scene gives a bit-identical result. The list can also
-be applied to other scenes. In JSON, each edit is an object such as
+be applied to other scenes. An edit in JSON is an object such as
 
     {"edit": "translate", "select": {"category": ["vehicle_small"], "where": "length_m > 4"}, "by_m": [5, 0, 0]}
 """
@@ -445,7 +445,7 @@ class Repair(Edit):
     shrink: float = 0.95
     """Minimum scale factor of a primitive. Primitives are scaled only if a displacement does not end the overlap."""
     drop: bool = True
-    """Whether to remove one of two primitives that still overlap."""
+    """Whether to remove one primitive of each pair that still overlaps."""
 
     def check(self) -> None:
         """Check the edit without a scene.
@@ -500,7 +500,7 @@ def _parse_category(name: str) -> int:
 
 
 class ObjectChange(NamedTuple):
-    """Changes of one edit, with one entry per changed primitive.
+    """Changes by one edit; each changed primitive has one entry.
 
     Attributes:
         primitive: Index of the primitive in the scene before the edit.

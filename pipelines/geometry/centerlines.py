@@ -69,13 +69,15 @@ class RoadNetwork:
     nodes_m: np.ndarray  # (n, 3)
 
     def list_leaving(self, node: int) -> list[Road]:
-        """Return the roads at a node, each directed away from it.
+        """Return the roads at a node.
+
+        Each road is directed away from the node.
 
         Args:
             node: Number of the node.
 
         Returns:
-            Roads whose start is the node, in either direction.
+            Roads that start at the node. Roads that end at the node are reversed.
         """
         return [r for road in self.roads for r in (road, road.reverse()) if r.start == node]
 

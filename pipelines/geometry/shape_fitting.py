@@ -49,7 +49,7 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
 def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
     """Fit boxes to their eight corners.
 
-    The two shortest vectors from one corner to the others are edges. The third edge is the vector to the opposite
+    The two shortest vectors from a corner to the other corners are edges. The third edge is the vector to the opposite
     corner, minus these two edges.
 
     Args:

@@ -131,7 +131,7 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 def _set_class(planes: np.ndarray, column: np.ndarray, class_id: np.ndarray | int) -> None:
     """Write a class id to the empty voxels in `column` (columns,).
 
-    The class id is one number for all columns, or one number per column.
+    The class id is a single number, or an array with one number per column.
     """
     for bit, plane in enumerate(planes):
         has_bit = (class_id >> bit) & 1
@@ -297,7 +297,9 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 @dataclass(frozen=True)
 class OutsideCounts:
-    """Numbers of ground columns and primitives above or below a voxel grid. The numbers of several scenes can be added.
+    """Numbers of ground columns and primitives above or below a voxel grid.
+
+    The numbers of several scenes can be added.
 
     Attributes:
         ground: (2,) int64: number of columns with ground, and number of columns with ground outside the grid.

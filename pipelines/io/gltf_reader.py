@@ -25,7 +25,7 @@ MAX_NUMBERS = 2**25
 
 
 class MeshPart(NamedTuple):
-    """One mesh primitive of one node, transformed to the frame of the file.
+    """A mesh primitive of a node, transformed to the frame of the file.
 
     Attributes:
         extras: Extras of the node.

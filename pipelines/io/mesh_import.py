@@ -10,7 +10,7 @@ Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), wi
   roll of the authors' IMU.
 * The vertex or material colour determines the class of a vertex. The colour must match a palette colour within
   COLOR_TOLERANCE (mesh_segmentation.py). Colours are sRGB or linear light (the glTF standard); the reader chooses the
-  one that matches the palette better. It ignores textures.
+  interpretation that matches the palette better. It ignores textures.
 * Ground has one vertex per occupied pixel, with or without triangles. In the authors' grid, the vertex of pixel (i, j)
   lies at the pixel corner x = 64 - .25 i, y = -32 + .25 j (y right). In exports of this project, the vertex lies at the
   pixel centre. On the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the

@@ -103,7 +103,7 @@ class StreetCamera:
 
 
 class StreetView(NamedTuple):
-    """Rendered images of one camera, (H, W) each.
+    """Rendered images of one camera, with H x W pixels.
 
     Attributes:
         class_id: Class id of the palette; EMPTY for sky.
@@ -228,7 +228,7 @@ def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np
     for count in (1, 2):
         some = np.flatnonzero(behind == count)
         near = corners[some, :, 2] < NEAR_M
-        # One corner lies alone on its side of the plane. It comes first.
+        # The first corner is the corner that lies alone on its side of the plane.
         odd = np.argmax(near if count == 1 else ~near, axis=1)
         turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
         first, second, third = np.moveaxis(turned, 1, 0)
@@ -251,8 +251,8 @@ def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each ellipsoid and each pixel centre on it, return the flat pixel index, the primitive and 1 / depth (m,).
 
-    A ray t d, with z = 1 in d, meets |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d.M^T M p
-    and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. Along a row of pixels, this is the interval
+    A ray t d, with z = 1 in d, intersects |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d.M^T M
+    p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. Along a row of pixels, this is the interval
     between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are skipped.
     """
     lens = camera.lens

@@ -57,7 +57,7 @@ class Faces(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """Visible surface of each pixel, (H, W) each.
+    """Visible surface of each pixel, for H x W pixels.
 
     Attributes:
         depth_m: z in the camera frame (m).

@@ -161,7 +161,7 @@ class Dataset:
             The dataset's metadata.
 
         Raises:
-            ValueError: `root` holds no complete dataset, or its dataset.json is invalid.
+            ValueError: `root` does not contain a complete dataset, or dataset.json is invalid.
         """
         path = storage.join_uri(root, DESCRIPTION)
         if not storage.exists(path):
@@ -184,7 +184,7 @@ def merge_extremes(parts: Iterable[Extremes]) -> Extremes:
     """Merge the value ranges of several parts.
 
     Args:
-        parts: Lowest and highest value of each name, one mapping per part. A part need not contain every name.
+        parts: For each part, a map from name to lowest and highest value. A name may be missing in some parts.
 
     Returns:
         Lowest and highest value of each name over all parts.

@@ -50,12 +50,12 @@ def classify_density(
     percentile. It is medium otherwise (paper, supplement A, Scene Labeling).
 
     Args:
-        count: Number of the group's primitives: an array with one value per scene, or a single value.
+        count: Number of the group's primitives in each scene, or in a single scene.
         volume_m3: Total volume of the group's primitives (m3), same shape as `count`.
         thresholds: Percentiles of the training split.
 
     Returns:
-        Array of str with the shape of `count`; a numpy str if `count` is a single value.
+        Labels (str) with the shape of `count`.
     """
     count, volume_m3 = np.asarray(count), np.asarray(volume_m3)
     low = (count < thresholds.count_p25) & (volume_m3 < thresholds.volume_p25_m3)

@@ -18,8 +18,8 @@ def guard_options(
 ) -> None:
     """Record the options of a run, or raise an error if results with other options exist.
 
-    If the file records other options but the results are not in use, the function deletes these results. It then
-    records the new options.
+    If the file records other options and the results of that run are not in use, the function deletes the results. It
+    then records the new options.
 
     Args:
         record: Path of the JSON file with the options.
@@ -39,7 +39,9 @@ def guard_options(
 
 
 def guard_run(output: str, source: str, run: str, options: Mapping[str, object], parts: Sequence[str] = ()) -> None:
-    """Bind a run name to one set of options. The file `<source>.json` of the dataset directory records the options.
+    """Bind a run name to one set of options.
+
+    The file `<source>.json` of the dataset directory records the options.
 
     Args:
         output: Dataset directory.

@@ -59,7 +59,7 @@ class SceneSubset:
         The first call makes the selection; later calls return the same result.
 
         Returns:
-            Shards in order, each with its selected row numbers in ascending order.
+            Shards in order, with the selected row numbers of each shard in ascending order.
 
         Raises:
             ValueError: The dataset directory holds no matching scene.

@@ -52,7 +52,7 @@ GROUND_MEANING = {
 
 
 def _make_schema(description: str, *columns: tuple[str, pa.DataType, str, str]) -> pa.Schema:
-    """Make a self-describing schema from rows of (name, type, unit, description); "" means that there is no unit.
+    """Make a self-describing schema from rows of (name, type, unit, description); the unit "" means dimensionless.
 
     Every field has the metadata `unit` and `description`. DuckDB does not show field metadata. The metadata of the
     table therefore repeats the rows as JSON under `pritti_columns`.
@@ -488,7 +488,9 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """One shard of a dataset directory: the Parquet files with the same number, one in each table.
+    """One shard of a dataset directory.
+
+    It has one Parquet file per table, all with the same number.
 
     Attributes:
         root: Dataset directory.

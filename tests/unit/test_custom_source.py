@@ -622,7 +622,11 @@ MISTAKES = {
         "boxes",
         "z_m of row 3 is 5000000.0, expected a number of -10000..10000 m (z up)",
     ),
-    "endless integer": (change_row("boxes", 3, x_m=10**4000), "boxes", "x_m of row 3 is an integer of more than 40 digits"),
+    "endless integer": (
+        change_row("boxes", 3, x_m=10**4000),
+        "boxes",
+        "x_m of row 3 is an integer of more than 40 digits",
+    ),
     "degrees": (
         change_row("boxes", 0, yaw_rad=90),
         "boxes",

@@ -71,7 +71,9 @@ SIGHT_M = 100.0
 
 
 def list_drives(root: str | Path) -> list[str]:
-    """Return the drives: all folders except those with a dot at the beginning of their name.
+    """Return the drives.
+
+    A drive is a folder with a name that does not begin with a dot.
 
     Args:
         root: Directory of all drives.
@@ -139,7 +141,7 @@ def read_ground_classes(root: str | Path) -> tuple[str, ...]:
         root: Directory of all drives.
 
     Returns:
-        Ground classes that at least one drive has, in the order of GROUND_CLASSES.
+        Ground classes that occur in at least one drive, in the order of GROUND_CLASSES.
 
     Raises:
         ValueError: No drive has ground.
@@ -384,7 +386,8 @@ def read_poses(root: str | Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         left and z up.
 
     Raises:
-        ValueError: The poses are not those of an upright vehicle in driving order; the message names file and row.
+        ValueError: The poses do not fit an upright vehicle, or they are not in driving order; the message names file
+            and row.
     """
     table = _read_table(Path(root, name), "poses", POSE_COLUMNS, ("frame",))
     if not table.rows:

@@ -1,4 +1,4 @@
-"""Drives: all annotations along one sequence, in the world frame.
+"""Define Drive, which holds all annotations along one sequence in the world frame.
 
 Each reader returns a Drive. The same code therefore crops the Scenes of all sources (paper, supplement A, Dataset
 Construction). This module depends only on numpy. The town can therefore be used without ray or pyarrow.
@@ -210,7 +210,9 @@ class MapGround:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGround:
-    """Ground as triangles of the real surface (own drives), each with a class.
+    """Ground as triangles of the real surface (own drives).
+
+    Each triangle has a class.
 
     Attributes:
         triangles_m: Corners in the world frame (m).

@@ -104,13 +104,13 @@ class Defect:
 
 @dataclass(frozen=True)
 class ReadReport:
-    """Numbers of objects in one XML file, by result.
+    """Number of objects in one XML file for each result of reading.
 
     `objects` is the sum of boxes, slabs and all dropped objects.
 
     Attributes:
-        dropped: Number of objects per label; known labels without a category.
-        unknown: Number of objects per label; labels that are in none of the tables.
+        dropped: Number of objects for each known label without a category.
+        unknown: Number of objects for each label that is in none of the tables.
         duplicates: Number of dropped second copies.
         defects: Objects that cannot be read.
     """

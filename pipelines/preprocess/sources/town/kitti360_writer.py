@@ -18,7 +18,7 @@ import numpy as np
 from models.scene import ELLIPSOID
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
 
-WINDOW_POSES = 20  # An annotation window covers about 200 m of a drive with one pose every 10 m.
+WINDOW_POSES = 20  # Number of poses per annotation window. With one pose every 10 m, a window covers about 200 m.
 # Name of each ground class in the XML: "ground" means terrain, and "unknownGround" means ground.
 XML_GROUND = {
     "road": "road",

@@ -139,8 +139,8 @@ class Sheet:
         Args:
             frame: Frame of (s, t).
             label: Label of the boxes.
-            s: Position along the street (m): (n,), or one value for all boxes.
-            t: Distance from the street (m): (n,), or one value for all boxes.
+            s: Position along the street (m), (n,) or one value for all boxes.
+            t: Distance from the street (m), (n,) or one value for all boxes.
             size_m: (n, 3) or (3,) length, width and height.
             yaw_rad: Angle from the s axis to the length axis (rad).
             bottom_m: Height of the lower side above the surface.
@@ -282,7 +282,7 @@ def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
             at, refused = (at + 1) % (n - 1), 0  # Skip one corner to avoid fans of thin triangles.
         else:
             at, refused = (at + 1) % n, refused + 1
-            if refused > n:  # All remaining corners are collinear, so accept flat ears.
+            if refused > n:  # Accept flat ears, because all remaining corners are collinear.
                 assert slack == 0.0, "the outline must not cross itself"
                 slack, refused = 1e-6, 0
     triangles.append(tuple(left))

@@ -100,7 +100,7 @@ class CityBlock:
 def lay_streets(
     rng: np.random.Generator, spacing_u_m: list[float], spacing_v_m: list[float], missing: float
 ) -> tuple[Streets, list[tuple[int, int, int, int]]]:
-    """Return streets with the given spacings, and blocks as node ranges (i0, i1, j0, j1).
+    """Return streets with the specified spacings, and blocks as node ranges (i0, i1, j0, j1).
 
     The share `missing` of the streets between two blocks is omitted. The two blocks then form one block, and the
     junctions at the ends of the omitted street become T-junctions.
@@ -194,7 +194,7 @@ def trace_junction(streets: Streets, node: Node) -> list[tuple[float, float]]:
     points: list[tuple[float, float]] = []
     for quadrant, (su, sv) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
         first, second = arms[quadrant], arms[(quadrant + 1) % 4]
-        # The end of an arm is a straight edge; the two adjacent quadrants add one corner each.
+        # The end of an arm is a straight edge. Each of the two adjacent quadrants adds one corner.
         along_first = (hu + r, hv) if quadrant % 2 == 0 else (hu, hv + r)
         along_second = (hu, hv + r) if quadrant % 2 == 0 else (hu + r, hv)
         if first and second:
