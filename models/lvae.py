@@ -161,7 +161,7 @@ class LayoutVAE(ConfiguredModel):
             parameter.requires_grad_(name.startswith(OBJECT_DECODER))
 
     def learning_rate_factors(self) -> dict[str, float]:
-        """Return factors of the learning rate, keyed by prefix of the parameter name.
+        """Return a mapping from prefixes of parameter names to factors of the learning rate.
 
         Parameters that are initialised in closed form have factors below 1.
         """

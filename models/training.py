@@ -1,7 +1,8 @@
-"""Training of both stages in plain torch: optimisation step, EMA, learning-rate schedule and checkpoint.
+"""Training of both stages in torch: optimisation steps, EMA, learning-rate schedule and checkpoints.
 
-This module does not use Ray, so it also trains in a single process. Random numbers are keyed by (seed, step, position
-of the sample in the global batch). A resumed run and a run on more workers therefore draw the same numbers.
+This module does not use Ray, so it can also train in a single process. Random numbers depend only on the seed, the step
+and the position of the sample in the global batch. They are therefore the same in a resumed run and for any number of
+workers.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from models.vae.matching import NonFiniteCostError
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Options of AdamW with a constant or a cosine learning rate (OneCycle without its warm-up).
+    """Options of AdamW. The learning rate is constant or follows a cosine (OneCycle without warm-up).
 
     Attributes:
         steps: Number of training steps.
@@ -42,7 +43,7 @@ class OptimizerConfig:
         final_learning_rate: Learning rate of the last step; None: the learning rate is constant.
         warmup_steps: Number of initial steps during which the learning rate rises linearly.
         betas: beta1 and beta2 of AdamW.
-        cycle_momentum: beta1 of the first and of the last step; it follows the cosine (None: constant beta1).
+        cycle_momentum: beta1 of the first and the last step, with a cosine in between; None: beta1 is constant.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
         seed: Seed of all random numbers.
@@ -60,10 +61,10 @@ class OptimizerConfig:
     seed: int = 0
 
     def at(self, step: int) -> tuple[float, float]:
-        """Return learning rate and beta1 of a step.
+        """Return the learning rate and beta1 of a step.
 
         Args:
-            step: Index of the step, from 0.
+            step: Index of the step, starting at 0.
 
         Returns:
             Learning rate and beta1.
@@ -81,12 +82,12 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """Options of the execution of a training step. These options change the result only by rounding.
+    """Options of how a training step is computed. They change the result only by rounding.
 
     Attributes:
-        accumulate: Number of parts into which a batch is split to save memory; the parts are computed one after
-            another.
-        precision: "fp32", "bf16" or "auto". "auto" is bf16 if the device supports it in hardware.
+        accumulate: Number of parts into which a batch is split. The parts are computed one after another to save
+            memory.
+        precision: "fp32", "bf16" or "auto". "auto" selects bf16 if the hardware supports it, otherwise fp32.
         compile: Use torch.compile.
 
     Raises:
@@ -111,7 +112,7 @@ class ExecutionConfig:
             device: Device of the training.
 
         Returns:
-            Context manager; it is disabled for fp32.
+            Autocast context, which has no effect for fp32.
         """
         fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
         wanted = self.precision == "bf16" or (self.precision == "auto" and fast)
@@ -123,12 +124,13 @@ class NonFiniteLossError(ValueError):
 
     Attributes:
         step: Index of the step.
-        positions: Positions in the global batch of the samples with a non-finite loss; empty if all samples have one.
+        positions: Positions (in the global batch) of the samples whose loss is not finite; empty if no sample has a
+            finite loss.
     """
 
     def __init__(self, step: int, positions: list[int]) -> None:
-        which = f"of samples {positions} of its batch" if positions else "of every sample, so the weights are invalid"
-        super().__init__(f"step {step}: the loss is not finite because {which}; lower the learning rate")
+        which = f"samples {positions} of the batch" if positions else "all samples, because the weights are invalid"
+        super().__init__(f"step {step}: the loss is not finite for {which}; lower the learning rate")
         self.step, self.positions = step, positions
 
 
@@ -152,7 +154,7 @@ def sample_noise(generators: list[torch.Generator], shape: tuple[int, ...], devi
 def sample_corruption(
     generators: list[torch.Generator], shape: tuple[int, ...], spread: float, device: torch.device
 ) -> Tensor:
-    """Draw normal noise; the standard deviation of each sample is a random number |N(0, spread^2)|.
+    """Draw normal noise. Each sample has a random standard deviation |s|, where s is drawn from N(0, spread^2).
 
     Args:
         generators: One generator per sample.
@@ -170,7 +172,7 @@ def sample_corruption(
 def make_layout_loss(
     spec: LayoutSpec, latent_shape: tuple[int, int, int], kl_weight: float, latent_noise: float = 0.0
 ) -> LossFunction:
-    """Make the loss function of stage 1, which trains the layout VAE.
+    """Return the loss function of stage 1 (training of the layout VAE).
 
     Args:
         spec: Layout of the scenes.
@@ -179,7 +181,7 @@ def make_layout_loss(
         latent_noise: Scale of the noise that is added to training latents (`sample_corruption`); 0: no noise.
 
     Returns:
-        A function that maps compact layouts (`tensors.encode_layout`) to the parts of the objective.
+        A function that computes the parts of the objective from compact layouts (`tensors.encode_layout`).
     """
 
     def loss(
@@ -198,16 +200,16 @@ def make_layout_loss(
 
 
 TimestepSampling = Literal["uniform", "logit_normal"]
-# Mean and standard deviation of the logit of t / 1000. Half of the timesteps lie between 196 and 552.
+# Mean and standard deviation of logit(t / 1000). Half of the timesteps lie between 196 and 552.
 LOGIT_NORMAL = (-0.6, 1.2)
 
 
 def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, num_timesteps: int) -> Int[Tensor, " b"]:
     """Convert uniform random numbers to training timesteps.
 
-    "uniform" is the paper's density. "logit_normal" prefers middle timesteps, as in SD3 (Esser et al., 2024). The
-    existence of objects is decided between timesteps 126 and 467. This interval contains a third of the uniform
-    timesteps and half of the logit-normal ones.
+    The paper uses "uniform". "logit_normal" prefers middle timesteps, as in SD3 (Esser et al., 2024). The existence of
+    objects is decided between timesteps 126 and 467. This interval contains a third of the timesteps with "uniform" and
+    half with "logit_normal".
 
     Args:
         uniform: Random numbers between 0 and 1.
@@ -225,20 +227,19 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
 def make_diffusion_loss(
     dit: DiT, diffusion: Diffusion, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
 ) -> LossFunction:
-    """Make the loss function of stage 2, which trains the DiT: mean squared error of the noise (Eq. "LDM").
+    """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
-    With v-prediction, the error is weighted by `DiT.loss_weight`. Each step samples the latents from the cached
-    posterior.
-    Each sample has one label-dropout mask.
+    With v-prediction, the error is weighted by `DiT.loss_weight`. Each step samples new latents from the cached
+    posteriors. Labels are dropped once per sample.
 
     Args:
         dit: Model.
         diffusion: Noise schedule.
-        label_dropout: Probability of training a sample with the null label.
+        label_dropout: Probability that a training sample gets the null label.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
 
     Returns:
-        A function that maps posteriors and labels {mean, logvar, label} to the losses.
+        A function that computes the losses from posteriors and labels {mean, logvar, label}.
     """
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
@@ -265,15 +266,15 @@ def make_diffusion_loss(
 class Trainer:
     """Train a model step by step and save checkpoints.
 
-    A run that is saved, loaded and resumed equals an uninterrupted one.
+    Saving, loading and resuming does not change the result of a run.
 
     Args:
         model: Model whose weights are saved.
         loss: Loss function.
         settings: Options of the optimizer.
         device: Device of the training.
-        wrapped: Module that is called instead of `model`, such as `model` under DistributedDataParallel (default:
-            `model`).
+        wrapped: Module that is called instead of `model`, such as `model` wrapped in DistributedDataParallel. None:
+            `model`.
         execution: Options of the execution; None: the defaults of `ExecutionConfig`.
     """
 
@@ -289,7 +290,7 @@ class Trainer:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
         self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
-        rates = getattr(model, "learning_rate_factors", dict)()  # factors by prefix of the parameter name
+        rates = getattr(model, "learning_rate_factors", dict)()  # Maps prefixes of parameter names to factors.
         share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
         groups = [
             {"params": [p for n, p in self.parameters.items() if share[n] == value], "share": value}
@@ -306,13 +307,13 @@ class Trainer:
 
         Args:
             arrays: Batch of this worker.
-            positions: Positions of the samples of `arrays` in the global batch.
+            positions: Position in the global batch of each sample in `arrays`.
 
         Returns:
-            Detached losses, and the gradient norm as `grad_norm`.
+            Detached losses by name. `grad_norm` is the gradient norm.
 
         Raises:
-            NonFiniteLossError: The loss is not finite; the weights are unchanged.
+            NonFiniteLossError: The loss is not finite. The weights are not changed.
         """
         rate, beta1 = self.settings.at(self.steps_done)
         for group in self.optimiser.param_groups:
@@ -326,7 +327,7 @@ class Trainer:
             part = slice(first, first + size)
             share = len(positions[part]) / len(positions)
             more = first + size < len(positions)
-            no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # a method of DistributedDataParallel
+            no_sync = getattr(self.wrapped, "no_sync", nullcontext)  # Method of DistributedDataParallel.
             with no_sync() if more else nullcontext():
                 losses = self._compute_losses(self.wrapped, {k: v[part] for k, v in arrays.items()}, positions[part])
                 if losses is None:
@@ -357,10 +358,9 @@ class Trainer:
 
     @torch.no_grad()
     def _find_nonfinite_samples(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
-        """Return the positions of the samples whose loss is not finite, or an empty list if all losses are not finite.
+        """Return the positions of the samples whose loss is not finite; the list is empty if no loss is finite.
 
-        The model is called without its wrapper. A wrapper such as DistributedDataParallel would wait for the other
-        workers.
+        The model is called without its wrapper, because DistributedDataParallel would wait for the other workers.
         """
         bad = [
             position
@@ -385,7 +385,7 @@ class Trainer:
 
     @torch.no_grad()
     def ema_model(self) -> ConfiguredModel:
-        """Return a copy of the model with EMA weights, or the model itself if there is no EMA."""
+        """Return a copy of the model with EMA weights, or the model itself if EMA is off."""
         if not self.ema:
             return self.model
         copy = type(self.model).from_config(self.model.config)
@@ -393,7 +393,7 @@ class Trainer:
         return copy.to(self.device).eval()
 
     def save(self, directory: str | Path) -> None:
-        """Save everything that an exact resumption needs, as safetensors and JSON without pickles.
+        """Save everything that is needed to resume training exactly, as safetensors and JSON (no pickles).
 
         `state.json` is written last.
 
@@ -416,13 +416,13 @@ class Trainer:
         os.replace(temporary, directory / "state.json")
 
     def load(self, directory: str | Path) -> None:
-        """Load a checkpoint that `save` wrote.
+        """Load a checkpoint written by `save`.
 
         Args:
             directory: Directory of the checkpoint.
 
         Raises:
-            ValueError: The checkpoint was trained with other settings.
+            ValueError: The settings of the checkpoint differ from those of this trainer.
         """
         directory = Path(directory)
         state = json.loads((directory / "state.json").read_text())
@@ -463,7 +463,7 @@ def make_lvae_trainer(
     execution: ExecutionConfig | None = None,
     latent_noise: float = 0.0,
 ) -> Trainer:
-    """Make a trainer of a layout VAE.
+    """Return a trainer of a layout VAE.
 
     Args:
         model: Model; it is moved to `device`.
@@ -492,12 +492,12 @@ def make_dit_trainer(
     execution: ExecutionConfig | None = None,
     timestep_sampling: TimestepSampling = "uniform",
 ) -> Trainer:
-    """Make a trainer of a diffusion transformer.
+    """Return a trainer of a diffusion transformer.
 
     Args:
         model: Model; it is moved to `device`.
         settings: Options of the optimizer.
-        label_dropout: Probability of training a sample with the null label.
+        label_dropout: Probability that a training sample gets the null label.
         device: Device of the training.
         wrap: Function that wraps the model, for example with DistributedDataParallel; None: no wrapper.
         execution: Options of the execution; None: the defaults of `ExecutionConfig`.

@@ -46,7 +46,7 @@ def rank_outward(index: BlockIndex) -> int:
 
 
 def rank_four_colors(index: BlockIndex) -> int:
-    """Return the rank of a block of an unbounded grid: one of four ranks, given by the parities of i and j.
+    """Return one of four ranks for a block of an unbounded grid, depending on whether i and j are odd.
 
     Args:
         index: Index of the block.

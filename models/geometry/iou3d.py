@@ -251,8 +251,8 @@ def _clip_crossing_edges(
             parallel = sine < PARALLEL
             inverse = 1 / np.where(parallel, 1, sine)
             normal_k, normal_l = axes[k, j] * inverse, axes[l, j] * inverse  # Normal of the line within the face of A.
-            # rho (2, 2, n) is the signed distance of the line from the centre of A, projected onto the face. Points of
-            # the line are x = rho normal + tau tangent.
+            # rho (2, 2, n): signed distance of the line within the face, measured from the projection of A's centre.
+            # Points of the line are x = rho normal + tau tangent.
             rho = (offset[j] + _list_signs(half_b[j])[None] - axes[i, j] * plane_a) * inverse
             clip = _Clip(-np.inf, np.inf)
             clip.slab(rho * normal_k, -normal_l, half_a[k])
@@ -310,8 +310,8 @@ def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     swap = a.volume_m3 > b.volume_m3
     small = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), q, p) for p, q in zip(a, b, strict=True)))
     large = Boxes(*(np.where(swap.reshape(-1, *[1] * (p.ndim - 1)), p, q) for p, q in zip(a, b, strict=True)))
-    # In unit-ball coordinates of an ellipsoid, the ellipsoid is the unit ball. large_from_small maps unit-ball
-    # coordinates of the small ellipsoid to those of the large ellipsoid.
+    # Each ellipsoid has a frame in which it is the unit ball. large_from_small maps the frame of the small ellipsoid to
+    # that of the large ellipsoid.
     large_from_world = np.swapaxes(large.rotation, 1, 2) / np.maximum(large.size_m / 2, 1e-12)[:, :, None]
     large_from_small = large_from_world @ (small.rotation * (small.size_m / 2)[:, None, :])
     shift = np.einsum("nij,nj->ni", large_from_world, small.center_m - large.center_m)

@@ -141,10 +141,8 @@ class SamplingSchedule:
     def step_down(self, latent: Tensor, predicted_noise: Tensor, noise: Tensor, state: int) -> Tensor:
         """Perform one denoising step: sample p(z_{state-1} | z_state).
 
-        If eta is 1, mean and variance are those of the posterior of DDPM.
-
-        The formula contains z_0 and therefore also holds for spaced timesteps, with beta = 1 - alpha_bar_i /
-        alpha_bar_{i-1}.
+        If eta is 1, mean and variance are those of the posterior of DDPM. The formula contains z_0 and therefore also
+        holds for spaced timesteps, with beta = 1 - alpha_bar_i / alpha_bar_{i-1}.
 
         Args:
             latent: Latent at `state`.

@@ -1,12 +1,12 @@
-"""An object decoder without queries: each latent cell proposes the primitives in and around itself.
+"""Object decoder without queries: each latent cell proposes primitives inside or close to the cell.
 
-Differs from the paper, whose DETR decoder searches the whole latent for every query. The encoder writes each primitive
-into the cell under its centre, so this cell contains the information about the primitive. Here, each cell therefore
-makes a few proposals per category.
+The paper instead uses a DETR decoder, whose queries attend to the whole latent. The encoder writes each primitive into
+the cell under its centre, so this cell contains the information about the primitive. Here, each cell therefore makes a
+few proposals per category.
 
-The latent, the outputs and the losses are those of the paper. Matching measures distances in cells. Existence
-probabilities decide only between proposals at almost the same position. With the paper's matching weights, the cell
-with the highest existence probability would be trained on primitives of all other cells.
+The latent, the outputs and the losses are the same as in the paper. The unit of distances in the matching is one cell.
+Existence probabilities then matter only between proposals at almost the same position. With the matching weights of the
+paper, cells with high existence probabilities would be matched to primitives of other cells.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
-REACH_CELLS = 0.5  # how far outside its cell a proposal's centre may lie
+REACH_CELLS = 0.5  # Largest distance of a proposal's centre from its cell (in cells).
 MAX_PER_CELL = 4
-SPARE = 16  # proposals per slot, if MAX_PER_CELL allows it: many primitives can lie in one cell
+SPARE = 16  # Proposals per slot. The number is high because many primitives can lie in one cell.
 
 
 class CellDecoder(nn.Module):
-    """Decode an object latent to features and existence logits of `proposals[k]` primitives per category k.
+    """Decode an object latent to features and existence logits of `proposals[k]` proposals per category k.
 
-    Features are normalised to [0, 1]. The decoder makes SPARE proposals per slot. The number of proposals per cell and
-    category is limited to the range from `min_proposals_per_cell` to MAX_PER_CELL. The minimum number of proposals
-    exists because rare objects also occur in groups. One small network decodes each cell separately, because the
-    encoder writes a primitive into one cell only.
+    Features are normalised to [0, 1]. The decoder makes SPARE proposals per slot, but at least `min_proposals_per_cell`
+    and at most MAX_PER_CELL proposals per cell and category. A minimum is needed because rare objects also occur in
+    groups. One small network decodes each cell separately, because the encoder writes each primitive into only one
+    cell.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:
@@ -51,7 +51,7 @@ class CellDecoder(nn.Module):
             nn.Linear(hidden, hidden),
         )
         self.head = nn.Linear(hidden, sum(self.per_cell) * (1 + FEATURES))
-        # Normalised (x, y) of each cell's centre, row-major: row 0 is farthest ahead, column 0 is leftmost.
+        # Normalised (x, y) of the cell centres in row-major order. Row 0 is farthest ahead; column 0 is leftmost.
         middle = 1 - (torch.arange(latent_size, dtype=torch.float32) + 0.5) / latent_size
         self.register_buffer("middle", torch.cartesian_prod(middle, middle)[:, None], persistent=False)
         self.reach = (1 + 2 * REACH_CELLS) / latent_size
@@ -72,14 +72,14 @@ class CellDecoder(nn.Module):
         values = out[..., 1:].sigmoid()
         center_xy = (self.middle + (values[..., :2] - 0.5) * self.reach).clamp(0, 1)
         features = torch.cat([center_xy, values[..., 2:]], dim=-1)  # (b, cells, k, 9)
-        # Order (b, k, cells): k is ordered by category, so the proposals are, too.
+        # The order (b, k, cells) sorts proposals by category, because k is sorted by category.
         return features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1)
 
     def init_from_data(self, feature_logit: Float[Tensor, "categories 9"], count: Float[Tensor, " categories"]) -> None:
-        """Set the output biases: cell centres, mean height and shape per category, and mean existence.
+        """Set the output biases to the cell centres, and to the mean height, shape and existence of each category.
 
         Args:
-            feature_logit: Logit of the mean normalised features per category.
+            feature_logit: Logits of the mean normalised features of each category.
             count: Mean number of primitives of each category in a scene.
         """
         existence = (count / count.new_tensor(self.proposals)).clamp(0.001, 0.99).logit()

@@ -1,4 +1,4 @@
-"""Options of the layout VAE's two branches. This module does not import torch, because presets.py uses it."""
+"""Options of the two branches of the layout VAE. This module does not import torch, because presets.py uses it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ class GroundConfig:
     """Options of the ground branch: a convolutional autoencoder of rasters (models/vae/ground.py).
 
     Attributes:
-        channels: Number of channels of each block. All blocks but the last halve the resolution. With four blocks, a
-            latent cell has a side of 8 pixels, as in the paper.
+        channels: Number of channels of each block. Each block except the last halves the resolution. With four blocks,
+            a latent cell has a side of 8 pixels, as in the paper.
         norm_groups: Number of groups of each group normalisation.
-        pixel_unshuffle: Side of the pixel blocks that pixel unshuffle converts to channels before the first
-            convolution. The value 1 means no pixel unshuffle, as in the paper.
-        attention: Self-attention over all cells in the middle block of encoder and decoder, as in the paper.
+        pixel_unshuffle: Factor of the pixel unshuffle before the first convolution; 1: no pixel unshuffle, as in the
+            paper.
+        attention: If True, the middle blocks of encoder and decoder have self-attention over all cells, as in the
+            paper.
     """
 
     channels: tuple[int, ...] = (64, 128, 256, 512)
@@ -35,7 +36,7 @@ class GroundConfig:
 
 @dataclass(frozen=True)
 class ObjectConfig:
-    """Options of the object branch: a transformer encoder (models/vae/objects.py) and one of two decoders.
+    """Options of the object branch, which has a transformer encoder (models/vae/objects.py) and one of two decoders.
 
     Attributes:
         width: Width of the transformer tokens.
@@ -43,8 +44,8 @@ class ObjectConfig:
         heads: Number of attention heads.
         hidden: Width of the feed-forward networks of the transformer.
         head_hidden: Width of the output networks.
-        decoder: "detr", the paper's decoder, or "cells" (models/vae/cell_decoder.py).
-        min_proposals_per_cell: Minimum number of proposals per category and cell, for the decoder "cells".
+        decoder: "detr", as in the paper, or "cells" (models/vae/cell_decoder.py).
+        min_proposals_per_cell: Minimum number of proposals per category and cell (only for the decoder "cells").
     """
 
     width: int = 512
@@ -58,17 +59,17 @@ class ObjectConfig:
 
 @dataclass(frozen=True)
 class LayoutVAEConfig:
-    """Architecture of a `LayoutVAE`, except its layout.
+    """Architecture of a `LayoutVAE` without its layout.
 
     Attributes:
         latent_channels: Number of latent channels per branch.
         ground: Options of the ground branch.
         objects: Options of the object branch.
-        shortcut: Add linear maps parallel to the ground networks and a small network parallel to the object encoder.
-            The paper has no shortcuts.
-        split_latent: Each decoder reads its own half of the latent channels, as in the paper. If False, both decoders
-            read all channels.
-        branches: "both", or the only branch of an ablation model.
+        shortcut: If True, add linear maps in parallel to the ground networks and a small network in parallel to the
+            object encoder. The paper has no shortcuts.
+        split_latent: If True, each decoder reads only its half of the latent channels, as in the paper. If False, both
+            decoders read all channels.
+        branches: "both"; or "ground" or "objects" for an ablation model with only one branch.
     """
 
     latent_channels: int = 32
@@ -79,7 +80,7 @@ class LayoutVAEConfig:
     branches: Branches = "both"
 
 
-# Config entries of versions before 0.2: flat name -> branch and current name.
+# Maps flat names of versions before 0.2 to the branch and the current name.
 _FLAT_NAMES = {
     **{name: ("ground", name) for name in ("channels", "norm_groups", "attention")},
     "fold": ("ground", "pixel_unshuffle"),
@@ -89,13 +90,13 @@ _FLAT_NAMES = {
 
 
 def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
-    """Nest the options of the branches under `ground` and `objects`.
+    """Convert flat options to options that are nested under `ground` and `objects`.
 
     Args:
-        config: Stored config. Versions before 0.2 wrote flat configs; nested configs are accepted, too.
+        config: Stored config. Flat configs were written by versions before 0.2. Nested configs are returned unchanged.
 
     Returns:
-        Options of `LayoutVAE`, with one dictionary per branch.
+        Options of `LayoutVAE`; the options of each branch are one dictionary.
     """
     nested: dict[str, Any] = {}
     for name, value in config.items():
@@ -114,7 +115,7 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
         config: Stored config.
 
     Returns:
-        Keyword arguments with one dataclass per branch.
+        Keyword arguments; the options of each branch are one dataclass.
 
     Raises:
         ValueError: An option of a branch is unknown.
@@ -126,16 +127,16 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
             try:
                 options[name] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})
             except TypeError as error:
-                raise ValueError(f"LayoutVAE: {name} is not a {kind.__name__}: {error}") from error
+                raise ValueError(f"LayoutVAE: cannot convert {name} to {kind.__name__}: {error}") from error
     return options
 
 
 def override_options(options: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
-    """Return keyword arguments of `LayoutVAE` with changes.
+    """Return keyword arguments of `LayoutVAE` after changing some of them.
 
     Args:
         options: Keyword arguments of `LayoutVAE`.
-        changes: New values by name. A mapping replaces fields of the dataclass of a branch.
+        changes: New values by name. For a branch, the value can be a mapping that replaces only some fields.
 
     Returns:
         The changed keyword arguments.

@@ -1,8 +1,8 @@
 """Convolutional encoder and decoder of image autoencoders (Rombach et al., 2022), for the ground branch.
 
-Parameters have the names, the order and the initial values of diffusers' `Encoder` and `Decoder`. Outputs equal those
-of diffusers exactly (tests/unit/test_convolutional.py). This module replaces the networks of diffusers, because the
-import of diffusers costs each process two to three seconds.
+Parameters have the same names, order and initial values as in the classes `Encoder` and `Decoder` of diffusers. Outputs
+are bit-identical to those of diffusers (tests/unit/test_convolutional.py). This module replaces these classes, because
+importing diffusers takes two to three seconds in each process.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-EPSILON = 1e-6  # for every group normalisation
+EPSILON = 1e-6  # Used by every group normalisation.
 
 
 class ResnetBlock(nn.Module):
-    """Two normalised 3 x 3 convolutions with a skip connection.
+    """Two 3 x 3 convolutions, each after a normalisation, with a skip connection.
 
     The skip connection is a 1 x 1 convolution if the number of channels changes.
     """
@@ -42,7 +42,7 @@ class ResnetBlock(nn.Module):
         y = self.conv1(F.silu(self.norm1(x)))
         y = self.conv2(F.silu(self.norm2(y)))
         if self.conv_shortcut is not None:
-            x = self.conv_shortcut(x.contiguous() if self.training else x)  # DDP needs dense strides
+            x = self.conv_shortcut(x.contiguous() if self.training else x)  # DDP needs dense strides.
         return x + y
 
 
@@ -73,7 +73,7 @@ class CellAttention(nn.Module):
 
 
 class Downsample(nn.Module):
-    """Halve the resolution with a 3 x 3 convolution of stride 2, padded at the bottom and the right."""
+    """Halve the resolution by a 3 x 3 convolution with stride 2 and padding at the bottom and on the right."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Double the resolution by nearest neighbour, then apply a 3 x 3 convolution."""
+    """Double the resolution by nearest-neighbour interpolation, then apply a 3 x 3 convolution."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -179,7 +179,7 @@ class MidBlock(nn.Module):
 
 
 class ConvolutionalEncoder(nn.Module):
-    """Encode maps (batch, in_channels, H, W); all blocks but the last halve the resolution."""
+    """Encode maps (batch, in_channels, H, W). Each block except the last halves the resolution."""
 
     def __init__(
         self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
@@ -210,7 +210,7 @@ class ConvolutionalEncoder(nn.Module):
 
 
 class ConvolutionalDecoder(nn.Module):
-    """Decode latents (batch, in_channels, h, w); all blocks but the last double the resolution."""
+    """Decode latents (batch, in_channels, h, w). Each block except the last doubles the resolution."""
 
     def __init__(
         self, in_channels: int, out_channels: int, channels: tuple[int, ...], norm_groups: int, attention: bool
@@ -218,7 +218,7 @@ class ConvolutionalDecoder(nn.Module):
         super().__init__()
         upward = tuple(reversed(channels))
         self.conv_in = nn.Conv2d(in_channels, upward[0], 3, padding=1)
-        # diffusers registers `up_blocks` before `mid_block` but initialises them after it; this order is kept.
+        # As in diffusers, register `up_blocks` before `mid_block`, but initialise `mid_block` first.
         self.up_blocks = nn.ModuleList()
         self.mid_block = MidBlock(upward[0], norm_groups, attention)
         self.up_blocks.extend(

@@ -12,16 +12,16 @@ from torch.nn import functional as F
 from models.vae.config import GroundConfig
 from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
 
-# Candidates for the occupancy logit per pixel of distance from an edge; `init_from_data` selects the best one.
+# Candidates for the factor from signed distance (pixels) to occupancy logit. `init_from_data` selects the best.
 LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
-HEIGHT_WEIGHT = 10.0  # weight of normalised heights relative to signed distances in `init_from_data`
+HEIGHT_WEIGHT = 10.0  # Weight of normalised heights in `init_from_data`; signed distances have weight 1.
 
 
 class GroundEncoder(nn.Module):
-    """Encode rasters [H; B] to mean and log-variance of the ground latent, concatenated along the channel axis.
+    """Encode rasters [H; B] to mean and log-variance of the ground latent (concatenated along the channel axis).
 
-    With `shortcut`, the mean is the sum of the network's output and a linear map of each cell's `compute_smooth_maps`.
-    `init_from_data` computes this map in closed form. The paper has no shortcut.
+    With `shortcut`, a linear map of the smooth maps of each cell (`compute_smooth_maps`) is added to the mean.
+    `init_from_data` computes the linear map in closed form. The paper has no shortcut.
     """
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
@@ -56,7 +56,7 @@ class GroundEncoder(nn.Module):
 
 
 class GroundDecoder(nn.Module):
-    """Decode a ground latent to normalised heights and occupancy logits, concatenated along the channel axis."""
+    """Decode a ground latent to normalised heights and occupancy logits (concatenated along the channel axis)."""
 
     def __init__(self, num_classes: int, latent_channels: int, config: GroundConfig, shortcut: bool) -> None:
         super().__init__()
@@ -91,12 +91,13 @@ def init_from_data(
     height: Float[Tensor, "batch ground rows cols"],
     occupied: Float[Tensor, "batch ground rows cols"],
 ) -> None:
-    """Initialise the outputs to their means, and the shortcuts to the best linear autoencoder.
+    """Initialise the outputs to their means and the shortcuts to the best linear autoencoder.
 
-    The shortcuts become the principal components of each cell's `compute_smooth_maps`, scaled to unit variance. Signed
-    distances are converted to logits. The outputs of the networks start at zero. On the town at 256 pixels, the initial
-    ground IoU is 99.4 % (docs/experiments/linear_ground_start.md). If the decoder's shortcut reads the joint latent,
-    its weights for the object channels become zero.
+    The shortcuts become the principal components of the smooth maps (`compute_smooth_maps`) of cells, scaled to unit
+    variance. The decoder's shortcut converts signed distances to logits. The outputs of the networks are initially
+    zero. For the town with 256 pixels per side, the initial ground IoU is 99.4 %
+    (docs/experiments/linear_ground_start.md). If the shortcut of the decoder reads the joint latent, its weights for
+    the object channels become zero.
 
     Args:
         encoder: Encoder to initialise.
@@ -115,7 +116,7 @@ def init_from_data(
     cell, latent = encoder.shortcut.stride[0], encoder.shortcut.out_channels
     maps = _split_cells(compute_smooth_maps(height, occupied, cell), cell)  # (cells, pixels)
     heights, distances = torch.ones(2, maps.shape[1] // 2, dtype=maps.dtype)
-    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # weights for the principal components
+    weight = torch.cat([HEIGHT_WEIGHT * heights, distances])  # Weights for the principal components.
     mean = maps.mean(dim=0)
     components, deviation = compute_principal_components((maps - mean) * weight, latent)
     encode = weight[:, None] * components / deviation
@@ -128,7 +129,7 @@ def init_from_data(
         )
         for logit in LOGITS_PER_PX
     }
-    # Scale from smooth maps to the decoder's outputs.
+    # Factors from smooth maps to outputs of the decoder.
     unit = torch.cat(
         [heights, min(error, key=lambda logit: float(error[logit])) * compute_edge_reach_px(cell) * distances]
     )
@@ -145,10 +146,10 @@ def init_from_data(
 def compute_smooth_maps(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch maps rows cols"]:
-    """Compute smooth maps from rasters: heights without gaps, and signed distances instead of masks.
+    """Convert rasters to smooth maps: heights without gaps, and signed distances instead of masks.
 
-    Within a cell, the mask of an edge is a step, which needs many linear components. The distance from an edge is a
-    plane, which needs three linear components.
+    Within a cell, a mask has a step at an edge, so it needs many linear components. The signed distance from a straight
+    edge is a plane, so it needs only three linear components.
 
     Args:
         height: Normalised heights.
@@ -156,15 +157,15 @@ def compute_smooth_maps(
         cell: Side of a latent cell in pixels.
 
     Returns:
-        Filled heights and signed distances in [-1, 1], concatenated along the channel axis. A distance of 1 is
-        `compute_edge_reach_px` pixels.
+        Filled heights and signed distances in [-1, 1], concatenated along the channel axis. A value of 1 stands for a
+        distance of `compute_edge_reach_px` pixels.
     """
     distance = compute_signed_distance_px(occupied > 0.5, compute_edge_reach_px(cell)) / compute_edge_reach_px(cell)
     return torch.cat([fill_heights(height, occupied, cell), distance.to(height.dtype)], dim=1)
 
 
 def compute_edge_reach_px(cell: int) -> int:
-    """Return the largest distance from an edge that smooth maps represent: half a cell.
+    """Return the largest distance from an edge that smooth maps represent, which is half a cell.
 
     Args:
         cell: Side of a latent cell in pixels.
@@ -180,12 +181,12 @@ def compute_signed_distance_px(
 ) -> Float[Tensor, "*batch rows cols"]:
     """Compute the Euclidean distance from pixel centres to the edge of a mask, positive inside the mask.
 
-    The edge lies half a pixel before the nearest pixel with the other value. The method is that of Felzenszwalb &
-    Huttenlocher (2012) on a bounded window.
+    The edge lies halfway between the last pixel of the mask and the first pixel outside the mask. The method is that of
+    Felzenszwalb & Huttenlocher (2012), restricted to a window.
 
     Args:
         inside: Masks.
-        most: Distance in pixels up to which the result is exact; larger distances are clipped.
+        most: Largest distance (pixels); larger distances are clipped to this value.
 
     Returns:
         Signed distances in pixels.
@@ -203,7 +204,7 @@ def compute_signed_distance_px(
 
 
 def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Float[Tensor, "cells pixels"]:
-    """Return the pixels of each latent cell in the order (map, row, col), as float64."""
+    """Return the pixels of each latent cell as float64, in the order (map, row, col)."""
     pixels = F.pixel_unshuffle(maps, cell)
     return pixels.permute(0, 2, 3, 1).reshape(-1, pixels.shape[1]).double()
 
@@ -211,9 +212,10 @@ def _split_cells(maps: Float[Tensor, "batch maps rows cols"], cell: int) -> Floa
 def fill_heights(
     height: Float[Tensor, "batch ground rows cols"], occupied: Float[Tensor, "batch ground rows cols"], cell: int
 ) -> Float[Tensor, "batch ground rows cols"]:
-    """Fill the heights of unoccupied pixels, where any height is valid, with a mean height.
+    """Replace the heights of unoccupied pixels by a mean height.
 
-    The value is the mean over the cell's occupied pixels, or the mean over the scene if the cell has none.
+    The mean is taken over the occupied pixels of the cell. If the cell has no occupied pixels, it is taken over the
+    scene.
 
     Args:
         height: Normalised heights.
@@ -233,14 +235,14 @@ def fill_heights(
 def compute_principal_components(
     centred: Float[Tensor, "n p"], count: int
 ) -> tuple[Float[Tensor, "p count"], Float[Tensor, " count"]]:
-    """Compute the directions of largest variance and the standard deviations along them.
+    """Compute the principal directions of samples, and the standard deviations along these directions.
 
     Args:
-        centred: n samples with zero mean.
+        centred: Samples with zero mean.
         count: Number of directions.
 
     Returns:
-        Directions as columns, and standard deviations, at least 0.01.
+        Matrix whose columns are the directions; and standard deviations (at least 0.01).
     """
     variance, directions = torch.linalg.eigh(centred.T @ centred / len(centred))
     return directions[:, -count:], variance[-count:].clamp(min=1e-4).sqrt()

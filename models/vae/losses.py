@@ -1,4 +1,4 @@
-"""Losses of the layout VAE, one function per equation (paper, supplement B.2, Training)."""
+"""Losses of the layout VAE: one function for each equation (paper, supplement B.2, Training)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LVAELoss:
 
 
 def compute_occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]) -> Float[Tensor, ""]:
-    """Compute the binary cross-entropy of the occupancy: mean over pixels, classes and batch.
+    """Compute the binary cross-entropy of the occupancy, averaged over pixels, classes and batch.
 
     Args:
         logit: Occupancy logits.
@@ -79,7 +79,7 @@ def compute_occupancy_loss(logit: Float[Tensor, "b g h w"], occupied: Float[Tens
 def compute_height_loss(
     height: Float[Tensor, "b g h w"], truth: Float[Tensor, "b g h w"], occupied: Float[Tensor, "b g h w"]
 ) -> Float[Tensor, ""]:
-    """Compute the L1 loss of the heights: mean over the occupied pixels of a sample, then over the batch.
+    """Compute the L1 loss of the heights, averaged over the occupied pixels of each sample, then over the batch.
 
     Args:
         height: Predicted normalised heights.
@@ -104,16 +104,15 @@ def compute_object_losses(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the weighted existence, centre and Cholesky losses (supplement Eqs. "match", "line").
 
-    Each loss is summed over the proposals of a category and divided by max(n_c, 1), where n_c is the number of
-    primitives.
-    The result is summed over categories and averaged over the batch.
+    For each category c, each loss is summed over the proposals and divided by max(n_c, 1), where n_c is the number of
+    primitives. The results are then summed over categories and averaged over the batch.
 
     Args:
         features: Features of the proposals.
         existence_logit: Existence logits of the proposals.
         truth: Features of the true primitives.
         real: True for each slot that holds a primitive.
-        assignment: Slot of each proposal, -1 for padding (`match_primitives`).
+        assignment: Slot of each proposal; -1: padding (`match_primitives`).
         spec: LayoutSpec with the categories and slots.
         proposals: Number of proposals per category.
 
@@ -136,9 +135,10 @@ def compute_object_losses(
 
 
 def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
-    """Compute the KL divergence to the standard normal: sum over channels and cells, mean over the batch.
+    """Compute the KL divergence to the standard normal distribution, averaged over the batch.
 
-    The paper does not specify the reduction over cells. Cells are summed, as in latent diffusion.
+    The divergence is summed over channels and cells. The paper does not specify the reduction over cells; the sum is
+    that of latent diffusion.
 
     Args:
         posterior: Posterior of the encoders.
@@ -163,7 +163,7 @@ def compute_lvae_loss(
         kl_weight: Weight of the KL loss.
 
     Returns:
-        The weighted parts. The ground parts are 0 if the model has no ground branch.
+        The weighted parts. If the model has no ground branch, the ground parts are 0.
     """
     ground = float(output.branches != "objects")
     unit = batch.features.new_tensor(output.feature_unit)

@@ -1,13 +1,13 @@
 """Bipartite matching of proposals and true primitives per category (paper, supplement Eqs. "permutation", "match").
 
-Only real primitives are assigned, although the paper matches the padded list. A padded slot costs 6 BCE(0, p_j) for any
-proposal j. The padded slots therefore add a constant and a cost per proposal. If proposal j is assigned to the real
-primitive i, the total changes by
+The paper assigns proposals to the padded list of primitives. This module assigns proposals only to real primitives,
+with the same result. In the paper, each proposal j that is assigned to a padded slot costs 6 BCE(0, p_j). If proposal j
+is instead assigned to the real primitive i, the total cost changes by
 
     6 [BCE(1, p_j) - BCE(0, p_j)] + 3 |t_i - t_j| + 3 |c_i - c_j|,    BCE(1, p) - BCE(0, p) = -logit(p).
 
-A rectangular assignment over the n real primitives is therefore equivalent to the paper's square problem. The solution
-is exact.
+Minimising the sum of these changes over the real primitives is therefore equivalent to the assignment problem of the
+paper. The solution is exact.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from torch import Tensor
 
 
 class NonFiniteCostError(ValueError):
-    """Raised when predictions are not finite, because they cannot be matched."""
+    """Raised when predictions are not finite and can therefore not be matched."""
 
 
 class MatchWeights(NamedTuple):
-    """Weights of the matching cost, equal for all categories; the defaults are the paper's (supplement B.2).
+    """Weights of the matching cost for all categories. The defaults are those of the paper (supplement B.2).
 
     Attributes:
         existence: Weight of the existence logit.
@@ -51,7 +51,7 @@ def compute_match_cost(
     truth: Float[Tensor, "batch m 9"],
     weights: MatchWeights = PAPER_WEIGHTS,
 ) -> Float[Tensor, "batch m n"]:
-    """Compute the cost of assigning each proposal to each real primitive, up to a constant per sample.
+    """Compute the cost of each assignment of a proposal to a real primitive, up to a constant per sample.
 
     Args:
         features: Features of the proposals.
@@ -60,7 +60,7 @@ def compute_match_cost(
         weights: Weights of the cost.
 
     Returns:
-        Cost per real primitive m and proposal n.
+        Costs; one row per real primitive and one column per proposal.
     """
     weight = features.new_tensor([weights.center] * 3 + [weights.cholesky] * 6)
     return torch.cdist(truth * weight, features * weight, p=1) - weights.existence * existence_logit[:, None, :]
@@ -78,9 +78,9 @@ def match_primitives(
 ) -> Int[Tensor, "batch proposals"]:
     """Assign each proposal to a true slot or to padding.
 
-    `proposals[k]` must be at least `slots[k]` for each category k. Within a category, real primitives come first
-    (tensors.py). Costs are computed on the device of the tensors and copied to the CPU in one piece. Threads solve the
-    samples in parallel, because scipy's solver releases Python's global interpreter lock.
+    `proposals[k]` must be at least `slots[k]` for each category k. Within a category, the slots of real primitives come
+    before padded slots (tensors.py). Costs are computed on the device of the tensors and copied to the CPU all
+    together. Threads solve the samples in parallel, because scipy's solver releases Python's global interpreter lock.
 
     Args:
         features: Features of the proposals.
@@ -92,7 +92,7 @@ def match_primitives(
         weights: Weights of the cost.
 
     Returns:
-        Index of the slot that each proposal is assigned to, or -1 for padding.
+        Index of the slot to which each proposal is assigned; -1: padding.
 
     Raises:
         NonFiniteCostError: A prediction is not finite.

@@ -3,7 +3,7 @@
 A transformer encoder computes one feature per primitive and scatters these features onto the latent grid. A DETR
 decoder predicts primitives from the latent.
 
-Shapes: N slots over all categories, width d, latent grid (h, w).
+In shapes, N is the number of slots of all categories, d the width, and (h, w) the size of the latent grid.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
-CATEGORY_EMBEDDING = 10  # paper, Sec. 3.2: 9 features + 10 + padding flag = 20
+CATEGORY_EMBEDDING = 10  # 9 features + 10 channels + padding flag = 20 inputs (paper, Sec. 3.2).
 
 
 class Attention(nn.Module):
-    """Multi-head attention with separate projections, computed by torch's fused kernel."""
+    """Multi-head attention with separate projections, computed by the fused kernel of torch."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class Attention(nn.Module):
             query: (b, n, d) queries.
             key: (b, m, d) keys.
             value: (b, m, d) values.
-            mask: (b, m) True where a key is visible (default: all are).
+            mask: (b, m); True marks visible keys. None: all keys are visible.
 
         Returns:
             (b, n, d) tokens.
@@ -62,7 +62,7 @@ class Attention(nn.Module):
 
 
 def make_feed_forward(width: int, hidden: int) -> nn.Sequential:
-    """Make a two-layer network with ReLU.
+    """Return a two-layer network with ReLU.
 
     Args:
         width: Width of input and output.
@@ -75,7 +75,7 @@ def make_feed_forward(width: int, hidden: int) -> nn.Sequential:
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm transformer encoder layer (Vaswani et al.)."""
+    """Transformer encoder layer with post-norm (Vaswani et al.)."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class EncoderLayer(nn.Module):
 
         Args:
             x: Tokens.
-            mask: True where a token is visible.
+            mask: True for each visible token.
 
         Returns:
             Tokens of the same shape.
@@ -97,7 +97,7 @@ class EncoderLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Post-norm DETR decoder layer: positions are added to queries and keys, not to values."""
+    """DETR decoder layer with post-norm. Positions are added to queries and keys but not to values."""
 
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
@@ -110,9 +110,9 @@ class DecoderLayer(nn.Module):
 
         Args:
             x: (b, n, d) tokens.
-            query_position: (n, d) learned position of each query.
+            query_position: (n, d) learned position embedding of each query.
             memory: (b, hw, d) projected latent cells.
-            memory_key: (b, hw, d) sum of `memory` and the positions of the cells.
+            memory_key: (b, hw, d) sum of `memory` and the position embeddings of the cells.
 
         Returns:
             (b, n, d) tokens.
@@ -129,7 +129,7 @@ def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -
     The latent grid is oriented like the rasters: row 0 is farthest ahead and column 0 is leftmost.
 
     Args:
-        centers: Centres, normalised to [0, 1]; x points forward and y to the left.
+        centers: Centres, normalised to [0, 1]. x points forward, and y points to the left.
         rows: Number of rows of the latent grid.
         cols: Number of columns of the latent grid.
 
@@ -144,12 +144,12 @@ def find_grid_cells(centers: Float[Tensor, "batch n 3"], rows: int, cols: int) -
 class ObjectEncoder(nn.Module):
     """Encode primitives to mean and log-variance of the object latent.
 
-    A cell is the sum of a learned value and the mean of the features of its primitives. Padded slots are masked in the
-    attention and are not scattered.
+    The value of a cell is a learned value plus the mean of the features of its primitives. Padded slots are masked in
+    the attention and are not written to the latent grid.
 
-    With `shortcut`, a small network also maps each primitive to a term of the mean. The inputs of this network are the
-    position in the cell, the shape and the category. This network bypasses the transformer, whose normalisations reduce
-    the numerical precision. The paper has no shortcut.
+    With `shortcut`, a small network computes an additional term of the mean from each primitive. The inputs of this
+    network are the position in the cell, the shape and the category. The shortcut avoids the loss of numerical
+    precision in the normalisations of the transformer. The paper has no shortcut.
     """
 
     slot_category: Tensor
@@ -198,7 +198,8 @@ class ObjectEncoder(nn.Module):
         moments, rows, cols = self.grid.shape
         category = self.category(category)  # (b, n, 10)
         x = self.project_in(torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1))  # (b, n, d)
-        # In a scene without primitives, attention needs one visible token. The first padded slot is not scattered.
+        # Attention needs at least one visible token, also in a scene without primitives. The first slot is therefore
+        # visible, but if it is padding, it is not written to the latent grid.
         visible = real.clone()
         visible[:, 0] |= ~real.any(dim=1)
         for layer in self.layers:
@@ -225,25 +226,26 @@ class ObjectEncoder(nn.Module):
             category: (b, n, 10) category embeddings.
 
         Returns:
-            (b, n, 19): x and y relative to the cell centre in cells, the other features scaled to [-2, 2], and the
-            category.
+            (b, n, 19): x and y relative to the cell centre (in cells), other features scaled to [-2, 2], category
+            embedding.
         """
         _, rows, cols = self.grid.shape
         down, right = (1 - features[..., 0]) * rows - row - 0.5, (1 - features[..., 1]) * cols - col - 0.5
         return torch.cat([down[..., None], right[..., None], 4 * features[..., 2:] - 2, category], dim=-1)
 
     def drop_padding(self, features: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Move real primitives to the front and drop slots that are padding in the whole batch.
+        """Move real primitives to the front, and remove trailing slots that are padding in all samples.
 
-        Masked slots do not change the result but cost as much as real ones. On average, half of the paper's 514 slots
-        are empty.
+        Masked slots do not change the result, but they cost as much time as real primitives. On average, half of the
+        paper's 514 slots are empty.
 
         Args:
             features: (b, N, 9) normalised features.
             real: (b, N) True for each slot that holds a primitive.
 
         Returns:
-            Features, `real` and categories (b, n), where n is the largest number of primitives of a scene in the batch.
+            Features, `real` and categories of n slots per sample, where n is the largest number of primitives in a
+            scene of the batch.
         """
         most = max(int(real.sum(dim=1).max()), 1)
         order = real.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :most]  # (b, most)
@@ -252,15 +254,15 @@ class ObjectEncoder(nn.Module):
 
 
 def make_sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cells d"]:
-    """Make DETR's normalised sine positions of a grid.
+    """Return the normalised sine position embeddings of DETR for a grid.
 
     Args:
         rows: Number of rows.
         cols: Number of columns.
-        width: Number of channels; half of them encode the row and half the column.
+        width: Number of channels. One half encodes the row, the other half the column.
 
     Returns:
-        Positions of the cells in row-major order.
+        Position embeddings of the cells in row-major order.
     """
 
     def axis(n: int) -> Tensor:
@@ -274,7 +276,7 @@ def make_sine_positions(rows: int, cols: int, width: int) -> Float[Tensor, "cell
 
 
 class OutputHeads(nn.Module):
-    """Output networks of one category: a 3-layer network for nine features and a linear layer for existence."""
+    """Output networks of one category: a three-layer network for nine features, and a linear layer for existence."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -325,10 +327,10 @@ class ObjectDecoder(nn.Module):
     def init_from_data(
         self, feature_logit: Float[Tensor, "categories features"], count: Float[Tensor, " categories"]
     ) -> None:
-        """Set the output biases to mean features and mean existence per category.
+        """Set the output biases to the mean features and the mean existence of each category.
 
         Args:
-            feature_logit: Logit of the mean normalised features per category.
+            feature_logit: Logits of the mean normalised features of each category.
             count: Mean number of primitives of each category in a scene.
         """
         for head, mean, expected, offered in zip(self._list_heads(), feature_logit, count, self.proposals, strict=True):

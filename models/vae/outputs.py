@@ -1,4 +1,4 @@
-"""Outputs of the layout VAE: the posterior of its encoders and the layouts of its decoders."""
+"""Outputs of the layout VAE: the posterior from the encoders, and the layouts from the decoders."""
 
 from __future__ import annotations
 
@@ -52,10 +52,11 @@ class LayoutOutput:
         occupancy_logit: Logit of the probability that a pixel is occupied.
         features: Normalised features of the proposals, ordered by category.
         existence_logit: Logit of the existence probability of the proposals.
-        proposals: Number of proposals per category: the spec's slots for "detr", at least as many for "cells".
+        proposals: Number of proposals per category. It equals the number of slots for "detr"; for "cells", it may be
+            larger.
         match_weights: Weights of the matching cost.
-        feature_unit: Unit of each normalised feature for matching and losses.
-        branches: Branches of the model. The values of a missing branch are placeholders.
+        feature_unit: Length unit of each normalised feature in matching and losses.
+        branches: Branches of the model. The outputs of a missing branch are placeholders.
     """
 
     height: Float[Tensor, "batch ground rows cols"]

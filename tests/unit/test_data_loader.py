@@ -44,6 +44,6 @@ def test_nonfinite_loss_names_its_scenes(layout_shards):
     shard, row = stream.positions(8, 4)
     ids = [layout_shards[shard[k]].scenes([int(row[k])])[0].scene_id for k in (1, 3)]
     message = with_scene_ids(NonFiniteLossError(2, [1, 3]), stream)
-    assert "step 2: the loss is not finite because of samples [1, 3]" in message
+    assert "step 2: the loss is not finite for samples [1, 3]" in message
     assert f"Scenes: {ids[0]}, {ids[1]}; inspect them" in message
-    assert "every sample" in with_scene_ids(NonFiniteLossError(2, []), stream)
+    assert "not finite for all samples" in with_scene_ids(NonFiniteLossError(2, []), stream)

@@ -276,13 +276,13 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
     before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
     trainer.wrapped = lambda *inputs: calls.append(1) or trainer.model(*inputs)
     batch["mean"][3] = float("nan")
-    with pytest.raises(NonFiniteLossError, match=r"step 0: the loss is not finite because of samples \[11\]") as caught:
+    with pytest.raises(NonFiniteLossError, match=r"step 0: the loss is not finite for samples \[11\]") as caught:
         trainer.step(batch, range(8, 16))
     assert (
         caught.value.positions == [11] and len(calls) == 1
     )  # the search for the sample does not call the wrapped model, which would wait for other workers
     batch["mean"][:] = float("nan")
-    with pytest.raises(NonFiniteLossError, match="of every sample, so the weights are invalid"):
+    with pytest.raises(NonFiniteLossError, match="for all samples, because the weights are invalid"):
         trainer.step(batch, range(8))
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.state_dict().items())
 

@@ -411,7 +411,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
     base = dit(latent, time, label)
     assert not torch.allclose(base, dit(latent, time, torch.tensor([1, 2, 0])))
     assert not torch.allclose(base, dit(latent, time.flip(0), label))
-    with pytest.raises(ValueError, match="must be whole"):
+    with pytest.raises(ValueError, match="patch 2 must divide size 9"):
         DiT(size=9)
     prepared = dit.precompute_conditioning([999, 500, 0, 4], [3, 1, 0, 1])
     assert torch.allclose(prepared(latent, time, label), base, atol=1e-4)

@@ -156,7 +156,7 @@ def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
     assert torch.equal(run_inpainting(QUICK, 1.0), run_inpainting(QUICK, 1.01))
     assert not torch.equal(run_inpainting(RePaintConfig.guided(6), 1.0), run_inpainting(RePaintConfig.guided(6), 1.01))
     assert RePaintConfig.guided().num_evaluations == 50
-    with pytest.raises(ValueError, match="eta is 2, expected 0"):
+    with pytest.raises(ValueError, match="eta is 2, expected a number from 0"):
         RePaintConfig(eta=2)
 
 

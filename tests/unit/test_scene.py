@@ -89,7 +89,7 @@ def test_move_and_crop_are_inverse():
     assert (ahead.center_m[:, 0] > 32).all() and len(ahead) == (scene.center_m[:, 0] > 32).sum()
     moved = ahead.translate(-32, 0, 1.5)
     assert moved.grid == Grid() and np.allclose(moved.center_m + [32, 0, -1.5], ahead.center_m)
-    with pytest.raises(ValueError, match="aligned"):
+    with pytest.raises(ValueError, match="differ by whole pixels"):
         scene.crop(Grid(front_m=64.1))
 
 

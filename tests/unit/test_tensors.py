@@ -92,5 +92,5 @@ def test_layout_spec_round_trips_json_and_names_difference():
         spec.require(other, "the checkpoint")
     with pytest.raises(ValueError, match="not a LayoutSpec"):
         LayoutSpec.from_dict({"slots": [1]})
-    with pytest.raises(ValueError, match="low < high"):
+    with pytest.raises(ValueError, match="each lower bound must be less"):
         Bounds((1.0,), (1.0,))
