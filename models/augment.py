@@ -37,7 +37,6 @@ class Augmentation:
             place: Position in the sample stream; the random change depends on it.
 
         Returns:
-
             The changed scene, or `scene` itself if nothing changes.
         """
         rng = np.random.default_rng([7303, self.seed, place])

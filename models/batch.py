@@ -50,7 +50,6 @@ class LayoutBatch:
             arrays: Compact arrays with a leading batch axis, as tensors on any device.
 
         Returns:
-
             The batch on the same device, with float32 values.
         """
         return cls(

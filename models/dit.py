@@ -238,7 +238,6 @@ class DiT(ConfiguredModel):
             timestep: Timesteps.
 
         Returns:
-
             One weight per sample.
         """
         if self.config.prediction == "epsilon":

@@ -201,7 +201,6 @@ class LayoutVAE(ConfiguredModel):
             latent: Joint latents.
 
         Returns:
-
             Output of both decoders.
         """
         split = self.config.split_latent and self.config.branches == "both"

@@ -346,7 +346,6 @@ class BlockComposer:
             generated: Decoded block.
 
         Returns:
-
             The block, which contains only the cells that it owns.
         """
         own = extract_new_part(generated, condition.known, condition.new_pixels)

@@ -92,7 +92,6 @@ def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
         new: (rows, cols) bool mask of the generated pixels.
 
     Returns:
-
         The scene, which contains only the content of `new`.
     """
     fresh = generated.select(~find_regenerated_objects(generated, known))
