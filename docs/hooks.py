@@ -23,6 +23,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
+EXECUTE = os.environ.get("PRITTI_DOCS_EXECUTE") != "0"
 JOBS = sorted((ROOT / "jobs").glob("[!_]*.py"))
 TUTORIALS = sorted((ROOT / "docs/tutorials").glob("*.ipynb"))
 API = {  # page: folders of its modules
@@ -99,7 +100,7 @@ def execute_notebook(path: Path, environment: dict[str, str]) -> tuple[str, dict
     from nbconvert import MarkdownExporter
 
     notebook = nbformat.read(path, as_version=4)
-    if os.environ.get("PRITTI_DOCS_EXECUTE") != "0":
+    if EXECUTE:
         with tempfile.TemporaryDirectory() as folder:
             resources = {"metadata": {"path": folder}}
             client = NotebookClient(notebook, timeout=180, coalesce_streams=True, resources=resources)
@@ -114,21 +115,22 @@ def execute_notebook(path: Path, environment: dict[str, str]) -> tuple[str, dict
 
 
 def execute_tutorials() -> dict[str, str | bytes]:
-    """Execute all notebooks on one Ray cluster and return their pages and pictures by path within the site."""
-    import ray
+    """Execute all notebooks and return their pages and pictures by path within the site.
 
-    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    environment = {
-        "RAY_ADDRESS": ray.get_runtime_context().gcs_address,
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-    }
+    The notebooks share one Ray cluster, which ends with this process.
+    """
+    environment = {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    if EXECUTE:
+        import ray
+
+        ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        environment["RAY_ADDRESS"] = ray.get_runtime_context().gcs_address
     found: dict[str, str | bytes] = {}
     with ThreadPoolExecutor(2) as pool:
         done = pool.map(execute_notebook, TUTORIALS, [environment] * len(TUTORIALS))
         for path, (text, pictures) in zip(TUTORIALS, done, strict=True):
             found[f"tutorials/{path.stem}.md"] = text
             found |= {f"tutorials/{name}": content for name, content in pictures.items()}
-    ray.shutdown()
     return found
 
 
