@@ -31,7 +31,7 @@ class Encoding:
     any_footprint_train_sizes: tuple[int, ...] = (5000,)
     """Training set sizes for boxes of any footprint; for square ones, the scatter matrix does not determine the yaw."""
     yaw_only_train_sizes: tuple[int, ...] = (1200, 2500)
-    """Training set sizes for vehicle boxes if the network regresses only those code entries that depend on yaw."""
+    """Training set sizes for vehicle boxes; here the network regresses only the code entries that depend on yaw."""
     num_seeds: int = 5
     """Number of seeds."""
     epochs: int = 20
@@ -52,7 +52,10 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Branches:
-    """Compare the layout VAE with variants without latent split, object branch or ground branch, at equal steps."""
+    """Compare the layout VAE with variants that lack the latent split, the object branch or the ground branch.
+
+    All variants train for the same number of steps.
+    """
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
@@ -61,19 +64,19 @@ class Branches:
     minutes: float = 10.0
     """Training time in minutes; a speed measurement converts it to steps (per variant in equal-time studies)."""
     steps: int | None = None
-    """Training steps; this option replaces --minutes (default: computed from --minutes)."""
+    """Number of training steps; this option replaces --minutes (default: computed from --minutes)."""
     num_seeds: int = 3
     """Number of seeds; every variant is trained with seed 0, then every variant with seed 1, and so on."""
     only_variants: tuple[str, ...] = ()
-    """Train and report only these variants, by name; others can be added later (default: all)."""
+    """Train and report only the variants with these names; a later run can add other variants (default: all)."""
     batch_size: int | None = None
     """Global batch size over all workers (default: as in the preset)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     max_scenes: int | None = None
-    """Maximum number of held-out scenes to evaluate, evenly over the split (default: all)."""
+    """Maximum number of held-out scenes to evaluate, selected evenly from the split (default: all)."""
     num_checkpoints: int = 4
-    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
+    """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "branches"
     """Name of the study and of its runs."""
     output: str = ""
@@ -82,29 +85,29 @@ class Branches:
 
 @dataclass(frozen=True)
 class Decoders(Branches):
-    """Compare the cell decoder with the paper's DETR decoder, with and without shortcuts, at equal time."""
+    """Compare the cell decoder with the paper's DETR decoder, with and without shortcuts, for equal training time."""
 
     preset: tyro.conf.Positional[str] = "demo"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
     num_checkpoints: int = 12
-    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
+    """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "decoders"
     """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
 class Ground(Branches):
-    """Compare sizes of the ground branch, from the paper's down to a hundredth of it, at equal time."""
+    """Compare sizes of the ground branch, from 1/100 of the paper's size to the full size, for equal training time."""
 
     num_checkpoints: int = 8
-    """Number of checkpoints per training; the validation at each checkpoint gives one point of a curve."""
+    """Number of checkpoints per training run; the validation at each checkpoint gives one point of a curve."""
     name: str = "ground"
     """Name of the study and of its runs."""
 
 
 @dataclass(frozen=True)
 class Augmentation(Branches):
-    """Compare training with mirrored scenes, moved vehicles, both and neither, at equal steps."""
+    """Compare augmentations (none, mirrored scenes, moved vehicles, both) for the same number of training steps."""
 
     name: str = "augmentation"
     """Name of the study and of its runs."""

@@ -11,8 +11,8 @@
     jobs/edit_scenes.py replay edits.json --input DIR                  a list of edits, one after another
 
 An edit applies to the primitives that match all selection options; --where "true" selects every primitive. The job
-writes scene tables with source=edited-<run> and the changes of each step to edits/. The job also writes the list of
-edits for `replay` to edited-<run>.json, and pictures to <run>.html.
+writes scene tables with source=edited-<run>, and lists the changes of each step in edits/. The job also writes the list
+of edits for `replay` to edited-<run>.json, and pictures to <run>.html.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class EditOptions(SceneOptions):
     run: str = "edited"
     """Name of the run: scenes get source=edited-<run>."""
     num_examples: int = 8
-    """Number of scenes shown on the page, before and after."""
+    """Number of scenes that the page shows before and after the edit."""
 
     def output_directory(self) -> str:
         return resolve_path(self.output, "edited", self.run)
@@ -43,16 +43,18 @@ class EditOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class SelectOptions(EditOptions):
-    """Options for the primitives to edit, which are those that match all given options."""
+    """Options that select the primitives to edit; a primitive must match all given options."""
 
     category: tuple[str, ...] = ()
     """Select primitives of these categories (default: all)."""
     primitives: tuple[int, ...] = ()
-    """Select primitives by index, from 0: the order of the scene's rows in the primitives table (default: all)."""
+    """Select primitives by index in the scene; the first row of the scene in the primitives table is 0 (default:
+    all)."""
     instances: tuple[int, ...] = ()
     """Select primitives by instance_id (default: all)."""
     polygon_m: tuple[float, ...] = ()
-    """Select primitives whose centre is in a polygon: x y of its corners in metres, x ahead, y left (default: all)."""
+    """Select primitives with their centre in a polygon: x y of each corner in metres, x to the front, y to the left
+    (default: all)."""
     where: str = ""
     """Select by an SQL condition on columns of the primitives table; "true" selects all (default: none)."""
 
@@ -75,9 +77,9 @@ class Translate(SelectOptions):
     """Move primitives."""
 
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Offset in metres: x (ahead), y (left), z (up), or along each primitive's own axes with --frame object."""
+    """Offset in metres along x (ahead), y (left), z (up), or along the axes of each primitive with --frame object."""
     frame: Literal["scene", "object"] = "scene"
-    """Axes of the offset: those of the scene frame, or those of each primitive."""
+    """Axes of the offset: the axes of the scene frame, or the axes of each primitive."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Rotate(SelectOptions):
     """Rotate primitives about the vertical axis."""
 
     angle_deg: float = 0.0
-    """Angle in degrees, counter-clockwise seen from above."""
+    """Angle in degrees; a positive angle turns counter-clockwise as seen from above."""
     pivot_m: tuple[float, float] | None = None
     """x and y of the rotation axis in metres (default: the centre of each primitive)."""
 
@@ -95,7 +97,7 @@ class Scale(SelectOptions):
     """Scale primitives."""
 
     factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors of length, width and height."""
+    """Scale factors for length, width and height."""
     anchor: Literal["bottom", "centre"] = "bottom"
     """Point of a primitive that keeps its position."""
 
@@ -107,7 +109,7 @@ class Relabel(SelectOptions):
     to: str = "object"
     """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids."""
     class_name: str | None = None
-    """New class name of the source (default: the class name of the category)."""
+    """New class name, in the terms of the source (default: the class name of the category)."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class Snap(SelectOptions):
     """Put primitives on the ground; primitives over unknown ground keep their position."""
 
     slab_offset_m: float = 0.3
-    """Offset in metres of the ground heights above the surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2."""
+    """Height in metres of the stored ground above the real surface: 0.3 in KITTI-360 and the town, 0 in Argoverse 2."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class Repair(SelectOptions):
     where: str = "true"
     """Select primitives by an SQL condition on columns of the primitives table."""
     slab_offset_m: float = 0.3
-    """Offset in metres of the ground heights above the surface, as for snap."""
+    """Height in metres of the stored ground above the real surface, as for snap."""
     ground: Literal["both", "floating", "sunken", "none"] = "both"
     """Objects to put on the ground."""
     max_push_m: float = 0.25

@@ -4,8 +4,8 @@
     jobs/encode_latents.py                                     the town dataset with the town layout VAE
     jobs/encode_latents.py --dataset DIR --lvae MODEL --num-actors 8
 
-The job writes latents.json and the table latents/, whose rows have the order of the table scenes/. Run the same command
-again to resume after an interruption.
+The job writes latents.json and the table latents/. The rows have the same order as in the table scenes/. Run the same
+command again to resume after an interruption.
 """
 
 from __future__ import annotations

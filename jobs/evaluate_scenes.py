@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Evaluate generated scenes against real scenes, and layout-VAE reconstruction.
+"""Compare generated scenes with real scenes, and evaluate layout-VAE reconstruction.
 
     jobs/evaluate_scenes.py --real DIR --generated DIR
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
@@ -7,11 +7,11 @@
     jobs/evaluate_scenes.py --real DIR --generated samples.npz --inception FILE
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
-The job reads only the scene tables. If --lvae is given without --generated, --run and --generated-source, the job
-evaluates only reconstruction. From an .npz file, the job uses the first --max-scenes pictures. The defaults are the
-paper's: at most 1,000 training scenes, selected by farthest point sampling of their poses, and k = 3. The job compares
-the real scenes with equally many generated scenes, with labels in equal parts. Every score has a 95 % confidence
-interval over scenes.
+The job reads only the scene tables. If --lvae is given and none of --generated, --run and --generated-source is given,
+the job evaluates only the reconstruction. From an .npz file, the job uses the first --max-scenes pictures. The defaults
+are the paper's: k = 3, and at most 1,000 training scenes, selected by farthest point sampling of poses. The job
+compares N real scenes with N generated scenes. Each label has the same share of the generated scenes. Every score has a
+95 % confidence interval over scenes.
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
 also writes reconstruction.html with the best and worst scenes, and reconstruction.parquet with one row per scene. FID,
@@ -31,11 +31,11 @@ from jobs.support.cli import run
 @dataclass(frozen=True)
 class Config:
     real: str = ""
-    """Dataset directory of the real scenes, or .npz in ADM's format (default: $PRITTI_HOME/datasets/town)."""
+    """Dataset directory of the real scenes, or an .npz file in ADM's format (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "train"
-    """Split of the real scenes that generated scenes are compared with, as in the paper."""
+    """Split of the real scenes for the comparison with generated scenes, as in the paper."""
     generated: str = ""
-    """Dataset directory of the generated scenes, or .npz in ADM's format (default: $PRITTI_HOME/generated)."""
+    """Dataset directory of the generated scenes, or an .npz file in ADM's format (default: $PRITTI_HOME/generated)."""
     generated_split: str = ""
     """Read only generated scenes of this split (default: all splits)."""
     run: str = ""
@@ -45,15 +45,16 @@ class Config:
     max_scenes: int = 1000
     """Maximum number of real and of generated scenes; both numbers are equal. The paper uses 1000, 5000 and 10000."""
     reference: Literal["farthest-point", "min-distance", "uniform"] = "farthest-point"
-    """Selection of real scenes: farthest point sampling of poses, poses --min-distance-m apart, or uniform."""
+    """Rule that selects the real scenes: farthest point sampling of poses, a minimum distance of poses, or even
+    spacing."""
     min_distance_m: float = 10.0
     """Minimum distance of poses in metres for --reference min-distance."""
     balance_labels: bool = True
-    """Use equally many generated scenes of each label, if there are enough."""
+    """Use the same number of generated scenes for each label, if there are enough scenes."""
     k: tuple[int, ...] = (3,)
     """Numbers of nearest neighbours for precision, recall, density and coverage."""
     supersample: int = 1
-    """Samples per pixel and axis: with N, each pixel of a picture is the mean of N x N samples."""
+    """Supersampling factor N: each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights for FID, sFID, KID, IS, precision and recall (default: none)."""
     lvae: str = ""
@@ -63,9 +64,9 @@ class Config:
     max_reconstructed_scenes: int | None = None
     """Maximum number of scenes to reconstruct, selected evenly from the split (default: all)."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
-    """Lowest and highest z in metres of the 256 x 256 x 32 voxels."""
+    """Lowest and highest z of the grid of 256 x 256 x 32 voxels, in metres."""
     num_examples: int = 3
-    """Number of scenes to show with the best reconstruction, and with the worst."""
+    """Number of scenes to show in each of two groups: the best and the worst reconstructions."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/<run>, or evaluations/latest without --run)."""
     num_actors: int = 2

@@ -5,7 +5,7 @@
     jobs/evaluate_seams.py --generated DIR --rows-m 32 96 --cols-m 32 96
     jobs/evaluate_seams.py --generated DIR --real DIR --real-rows-m 16 32 48
 
-The job counts changes of class, height steps, cut objects and duplicate objects at each seam. Each score is the ratio
+The job counts class changes, height steps, cut objects and duplicate objects at each seam. Each score is the ratio
 of the count at the seam to the count at parallel lines 4 to 16 m away. A ratio of 1 means that the seam is invisible.
 For comparison, the job also scores lines across the street in real scenes. Lines along the street are not comparable,
 because the borders of a street are parallel to them.
@@ -28,17 +28,19 @@ class Config:
     run: str = ""
     """Read only outpainted scenes of source generated-<run> (default: all sources)."""
     rows_m: tuple[float, ...] = ()
-    """Seams across the street: distances in metres from a scene's far edge (default: borders of the middle 64 m)."""
+    """Seams across the street, as distances from the far edge of a scene in metres (default: borders of the middle 64
+    m)."""
     cols_m: tuple[float, ...] = ()
-    """Seams along the street: distances in metres from a scene's left edge (default: borders of the middle 64 m)."""
+    """Seams along the street, as distances from the left edge of a scene in metres (default: borders of the middle 64
+    m)."""
     real: str = ""
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"
     """Split of the real scenes."""
     real_rows_m: tuple[float, ...] = (16.0, 32.0, 48.0)
-    """Lines across the street in real scenes: distances in metres from a scene's far edge."""
+    """Lines across the street in real scenes, as distances from the far edge of a scene in metres."""
     max_scenes: int | None = None
-    """Maximum number of generated and of real scenes, selected evenly (default: all)."""
+    """Maximum number of scenes of each kind (generated, real), selected evenly (default: all)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/seams)."""
     num_actors: int = 2

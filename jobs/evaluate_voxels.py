@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Evaluate voxel reconstructions of any method: IoU, mIoU, IoU per class, size on disk.
+"""Evaluate voxel reconstructions of any method: IoU, mIoU, IoU per class, and size on disk.
 
     jobs/evaluate_voxels.py --ground-truth TRUTH --reconstructed DIR           two directories of .npz, same names
     jobs/evaluate_voxels.py --ground-truth DATASET --split test --reconstructed DIR    files named by scene_id
@@ -28,9 +28,10 @@ class Config:
     split: str = ""
     """Read only scenes of this split of the dataset (default: all splits)."""
     axes: tuple[str, str, str] | None = None
-    """Directions of the reconstructions' three axes: x forward, y left, z up, each with + or - (default: x- y- z+)."""
+    """Directions of the three axes of the reconstructions: x (forward), y (left) or z (up), each with + or - (default:
+    x- y- z+)."""
     ground_truth_axes: tuple[str, str, str] | None = None
-    """Directions of the ground-truth files' three axes (default: x- y- z+)."""
+    """Directions of the three axes of the ground-truth files (default: x- y- z+)."""
     voxel_range_m: tuple[float, float] = (-1.5, 6.5)
     """Lowest and highest z in metres of a dataset's voxels; the reconstructions must have the same."""
     allow_missing: bool = False

@@ -6,9 +6,9 @@
 
 A GLB file (glTF 2.0) has one named node per primitive; class, instance and exact parameters are in the extras of the
 node. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x 32
-voxels of class ids, which import_scenes and evaluate_voxels read. An XODR file has the roads as OpenDRIVE 1.7 with
-lanes, elevation and junctions, for simulators. The job writes OUTPUT/<format>/<scene_id>.<format> and keeps existing
-files.
+voxels with class ids. The jobs import_scenes and evaluate_voxels read such files. An XODR file describes the roads for
+simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. The job writes OUTPUT/<format>/<scene_id>.<format> and
+keeps existing files.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Import meshes or voxel grids of another method, for evaluate_scenes.
+"""Import meshes or voxel grids of another method for evaluation.
 
     jobs/import_scenes.py DIR --name theirs                     meshes in class colours, as the paper's authors publish
     jobs/import_scenes.py 'DIR/night-*.glb' --name night --axes y+ z+ x+
@@ -26,13 +26,13 @@ from jobs.support.cli import run
 @dataclass(frozen=True)
 class Config:
     files: Annotated[str, tyro.conf.Positional]
-    """Directory, searched recursively, or a quoted pattern such as 'DIR/*.glb'."""
+    """Directory to search recursively, or a quoted pattern such as 'DIR/*.glb'."""
     name: str = "scenes"
     """Name of the import: scenes get source=imported-<name>."""
     format: Literal["glb", "npz"] = "glb"
     """File format: glb for semantic meshes, npz for voxel grids of class ids."""
     axes: tuple[str, str, str] | None = None
-    """Directions of the files' axes, such as x+ y- z- (default: x+ y- z- for meshes, x- y- z+ for voxels)."""
+    """Directions of the axes in the files, such as x+ y- z- (default: x+ y- z- for meshes, x- y- z+ for voxels)."""
     output: str = ""
     """Dataset directory to write (default: $PRITTI_HOME/imported/<name>)."""
 

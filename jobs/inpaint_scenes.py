@@ -23,17 +23,20 @@ from jobs.support.options import RePaintOptions
 @dataclass(frozen=True)
 class Config(RePaintOptions):
     polygon_m: tuple[float, ...] = ()
-    """Corners of the region, x y x y ..., in metres of the scene: x ahead, y left (default: none)."""
+    """Corners of the region as x y x y ... in metres in the scene frame, x to the front, y to the left (default:
+    none)."""
     half_plane: tuple[float, ...] = ()
-    """Region beyond a line: its direction x y, and the distance in metres at which it begins (default: none)."""
+    """Region beyond a line, given by a direction x y and the distance in metres at which the region begins (default:
+    none)."""
     primitives: tuple[int, ...] = ()
-    """Regenerate the surroundings of these primitives, given by their index in the scene, from 0 (default: none)."""
+    """Regenerate the surroundings of the primitives with these indices; the first index of a scene is 0 (default:
+    none)."""
     margin_m: float = 1.0
     """Margin around --primitives in metres."""
     invert_region: bool = False
-    """Regenerate everything outside the region instead."""
+    """Regenerate the area outside the region instead of the region."""
     contents: Literal["both", "ground", "objects"] = "both"
-    """What to regenerate in the region."""
+    """Content to regenerate in the region."""
     num_variants: int = 1
     """Number of different results per scene."""
     output: str = ""
@@ -41,7 +44,7 @@ class Config(RePaintOptions):
     run: str = "inpainted"
     """Name of the run: scenes get source=generated-<run>."""
     num_examples: int = 8
-    """Number of scenes shown on the page."""
+    """Number of scenes that the page shows."""
 
     def output_directory(self) -> str:
         return resolve_path(self.output, "inpainted")

@@ -57,9 +57,11 @@ class Sheet(DatasetOptions):
     max_scenes: int = 64
     """Maximum number of scenes."""
     sort: str = "drive"
-    """Order: drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table (num_pole)."""
+    """Order: drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table such as
+    num_pole."""
     pick: Literal["uniform", "lowest", "highest"] = "uniform"
-    """Selection from the sorted scenes: evenly from all, those with the lowest or those with the highest values."""
+    """Selection from the sorted scenes: evenly from all scenes, the scenes with the lowest or with the highest
+    values."""
     view: Literal["bev", "3d"] = "bev"
     """View: bird's-eye or oblique."""
     size_px: int = 256
@@ -84,7 +86,7 @@ class Report(DatasetOptions):
 
 @dataclass(frozen=True)
 class Gallery(DatasetOptions):
-    """Write one HTML page for publication: scenes in 3D with filters by label and statistics, 35 kB per scene."""
+    """Write one HTML page for publication: scenes in 3D, with filters by label and by statistics (35 kB per scene)."""
 
     max_scenes: int = 100
     """Maximum number of scenes, selected evenly from the dataset."""

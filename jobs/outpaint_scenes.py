@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Extend scenes on all sides by neighbouring blocks, or to any extent.
+"""Extend scenes by neighbouring blocks on all sides, or to a given extent.
 
     jobs/outpaint_scenes.py                                              the first generated town scene
     jobs/outpaint_scenes.py --extent-m 512 512 --num-actors 8            512 m x 512 m around it
@@ -39,11 +39,13 @@ class Config(RePaintOptions):
     blocks_right: int = 1
     """Number of blocks to the right of the scene."""
     overlap: float = 0.5
-    """Overlap of neighbouring blocks, as a share of a block."""
+    """Overlap of neighbouring blocks, as a share of the block size."""
     order: Literal["outward", "colours"] = "outward"
-    """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (--overlap < 0.5)."""
+    """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
+    0.5)."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Known latents of a block: encode the neighbours again in its frame, or copy their shifted latents (the paper)."""
+    """Known latents of a block: encode the neighbours again in the frame of the block, or copy and shift their latents
+    (the paper)."""
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

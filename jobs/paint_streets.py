@@ -4,9 +4,9 @@
     jobs/paint_streets.py --streets DIR/streets/drive --diffusion SD_DIR --controlnet CONTROLNET_DIR
     jobs/paint_streets.py ... --prompt "a quiet street in autumn, photograph" --num-inference-steps 30 --num-actors 2
 
-Both models are local directories in diffusers' layout, as safetensors; the job downloads nothing. The job needs the
-package transformers (pip install 'pritti-on-ray[photos]') and, in practice, a GPU. For each drive, the job writes
-photo/ next to the rendered images, photos.png and photos.webp. Existing frames are kept.
+Both models are local directories in diffusers' layout with safetensors files. The job downloads nothing. The job needs
+the package transformers (pip install 'pritti-on-ray[photos]') and, in practice, a GPU. For each drive, the job writes
+photo/, photos.png and photos.webp next to the rendered images. Existing frames are kept.
 """
 
 from __future__ import annotations

@@ -30,11 +30,12 @@ class Town:
     num_train: int = 10_000
     """Number of training scenes."""
     num_test: int = 1_000
-    """Number of test scenes, from separate towns."""
+    """Number of test scenes, which come from separate towns."""
     seed: int = 0
     """Random seed."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
+    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
+    in total."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,10 @@ class Kitti360:
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
+    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
+    in total."""
     skip_unreadable: bool = False
-    """Skip sequences with unreadable XML, and list them in rejects, instead of stopping."""
+    """Skip sequences with unreadable XML and list them in rejects; without this option, the job stops."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Av2:
     output: str = ""
     """Dataset directory or URI to write (default: $PRITTI_HOME/datasets/av2)."""
     skip_unreadable: bool = False
-    """Skip logs with unreadable files, and list them in rejects, instead of stopping."""
+    """Skip logs with unreadable files and list them in rejects; without this option, the job stops."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,10 @@ class Own:
     make_split: bool = True
     """Split each drive into training and test segments as in the paper; --no-make-split trains on every pose."""
     slots: Literal["p95", "paper"] = "p95"
-    """Number of slots per category: the 95th percentile over the training split, or the paper's 514 in total."""
+    """Rule for the number of slots per category: the 95th percentile over the training split, or the paper's 514 slots
+    in total."""
     skip_unreadable: bool = False
-    """Skip unreadable drives, and list them in rejects, instead of stopping."""
+    """Skip unreadable drives and list them in rejects; without this option, the job stops."""
 
 
 Config = (
@@ -87,7 +90,7 @@ Config = (
     | Annotated[Av2, tyro.conf.subcommand("av2")]
     | Annotated[Own, tyro.conf.subcommand("own")]
 )
-DEFAULT = Town()  # source if the command line names none
+DEFAULT = Town()  # source if the command line does not name a source
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@
     jobs/publish_model.py --name town --evaluation $PRITTI_HOME/evaluations/judged
 
 The job writes weights, configuration and a model card, and registers a version in MLflow. The card describes the MLflow
-runs that trained these weights, and the evaluation of scenes that were generated with them. If a training started from
-published weights, the card quotes their entry. If a run or the evaluation is missing or belongs to other weights, the
-job publishes nothing. Other jobs accept a published pipeline as --model NAME, as its directory, as
+runs that trained these weights, and an evaluation of scenes generated with these weights. If the training started from
+published weights, the card quotes the entry of those weights. If a run or the evaluation is missing or belongs to other
+weights, the job publishes nothing. Other jobs accept a published pipeline as --model NAME, as its directory, as
 models:/NAME/VERSION, or as the id of its MLflow run.
 """
 

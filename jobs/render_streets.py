@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Render street views along roads of scenes: semantic, instance and depth images, poses.
+"""Render street views along roads: semantic, instance and depth images, and camera poses.
 
     jobs/render_streets.py                                          the first generated scene
     jobs/render_streets.py --input DIR --split test --max-scenes 8 --spacing-m 0.5
@@ -9,8 +9,8 @@
 The camera drives on the right half of the road, parallel to the centreline of the road mask. The camera has the lens of
 KITTI-360's image_00. For each scene, the job writes these files to OUTPUT/streets/<run>/<scene_id>/:
 
-* PNG files in semantic/, class_id/, instance/, depth/ and shaded/. An instance is the index of a primitive plus 1. A
-  depth has 16 bits, 256 per metre, and is 0 beyond the range.
+* PNG files in semantic/, class_id/, instance/, depth/ and shaded/. An instance value is the index of a primitive plus
+  1. A depth value has 16 bits and a unit of 1/256 m; it is 0 beyond the range.
 * cameras.json with poses, intrinsics and class ids.
 * sheet.png and drive.webp with previews.
 """
@@ -26,13 +26,13 @@ from jobs.support.options import SceneOptions
 @dataclass(frozen=True)
 class Config(SceneOptions):
     max_scenes: int | None = 1
-    """Maximum number of scenes, taken from the first."""
+    """Maximum number of scenes; the first scenes are used."""
     output: str = ""
-    """Directory in which streets/ is written (default: the input directory)."""
+    """Directory in which the job writes streets/ (default: the input directory)."""
     run: str = "drive"
-    """Name of the run, a directory under streets/."""
+    """Name of the run and of its directory under streets/."""
     spacing_m: float = 1.0
-    """Distance between two frames in metres."""
+    """Distance between consecutive frames in metres."""
     camera_height_m: float = 1.55
     """Height of the camera above the road in metres, as in KITTI-360."""
     pitch_deg: float = 0.0

@@ -27,11 +27,11 @@ class Config:
     num_test: int = 200
     """Number of test scenes of the town."""
     lvae_steps: int = 500
-    """Training steps of the layout VAE."""
+    """Number of training steps of the layout VAE."""
     lvae_batch_size: int = 8
     """Batch size of the layout VAE."""
     dit_steps: int = 1700
-    """Training steps of the diffusion transformer."""
+    """Number of training steps of the diffusion transformer."""
     dit_batch_size: int = 8
     """Batch size of the diffusion transformer; small batches with many steps give recognisable scenes sooner."""
     num_released_scenes: int = 12
@@ -39,11 +39,11 @@ class Config:
     num_scenes: int = 48
     """Number of scenes to generate with the trained model."""
     num_inference_steps: int = 100
-    """Denoising steps of sampling (paper: 250)."""
+    """Number of denoising steps for sampling (paper: 250)."""
     outpaint_inference_steps: int = 50
-    """Denoising steps of outpainting with --guided (paper: 250, each repeated ten times)."""
+    """Number of denoising steps for outpainting with --guided (paper: 250 steps, each repeated ten times)."""
     num_actors: int = 2
-    """Number of models that run in parallel when encoding, sampling and evaluating."""
+    """Number of models that run in parallel during encoding, sampling and evaluation."""
     seed: int = 0
     """Random seed."""
 

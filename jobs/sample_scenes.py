@@ -7,7 +7,7 @@
     jobs/sample_scenes.py --sampler dpm++ --num-inference-steps 20  eleven times as fast
 
 The job writes the same Parquet tables as preprocessing, with source=generated-<run>. Scene i depends only on --seed, i
-and its label, regardless of the number of actors and the batch size. Run the same command again to resume after an
+and its label. The number of actors and the batch size have no effect. Run the same command again to resume after an
 interruption.
 """
 
@@ -44,7 +44,7 @@ class Config:
     existence_threshold: float | None = None
     """Keep primitives with a higher existence probability (default: published value; paper: 0.3)."""
     repair: bool = False
-    """Repair floating, sunken and overlapping objects, as with jobs/edit_scenes.py repair --no-drop."""
+    """Repair floating, sunken and overlapping objects, as jobs/edit_scenes.py repair --no-drop does."""
     num_actors: int = 1
     """Number of pipelines that run in parallel; use one per GPU."""
     batch_size: int = 8

@@ -6,7 +6,7 @@
     jobs/serve_studio.py --host 0.0.0.0 --host-names studio.example.org     prints an address with a token
 
 The studio runs on Ray Serve. Every visitor has a separate scene and edit history. The network serves one visitor at a
-time. This process serves the page and its viewer; the browser loads nothing from other servers. Stop the studio with
+time. This process serves the page and its viewer. The browser loads nothing from other servers. Stop the studio with
 Ctrl-C.
 """
 
@@ -28,11 +28,11 @@ class Config:
     port: int = 8600
     """Port to listen on."""
     host_names: tuple[str, ...] = ()
-    """Further host names under which visitors reach the studio, in addition to --host (default: none)."""
+    """Host names, in addition to --host, that the address of the studio may contain (default: none)."""
     token: str = ""
     """Token that visitors need (default: none for a loopback address, otherwise a random token)."""
     num_threads: int | None = None
-    """Number of threads of the network (default: all cores)."""
+    """Number of CPU threads for the network (default: all cores)."""
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@
     jobs/sweep_references.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
 
 The job reproduces the paper's figure of precision and recall over reference sets. The job extracts the features of all
-scenes once. Then it compares each reference set with equally many generated scenes, with labels in equal parts.
-Reference sets with more scenes than there are generated scenes are omitted. The job writes sweep.json, sweep.parquet,
-two figures (SVG) and sweep.html. Run the same command again to resume after an interruption.
+scenes once. Then it compares each reference set with the same number of generated scenes. Each label has the same share
+of these scenes. The job omits a reference set if there are fewer generated scenes than reference scenes. The job writes
+sweep.json, sweep.parquet, two figures (SVG) and sweep.html. Run the same command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Config:
     k: tuple[int, ...] = (3, 5)
     """Numbers of nearest neighbours, as in the paper."""
     supersample: int = 1
-    """Samples per pixel and axis: with N, each pixel of a picture is the mean of N x N samples."""
+    """Supersampling factor N: each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights; without this file, features come from an untrained network (default: none)."""
     output: str = ""

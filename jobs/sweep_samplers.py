@@ -31,7 +31,7 @@ class Config:
     noise_scalings: tuple[float, ...] = ()
     """Divisors of the predicted noise to compare (default: published value; 1 with ddpm)."""
     num_scenes: int = 256
-    """Number of scenes per setting, and of real scenes."""
+    """Number of generated scenes per setting, which is also the number of real scenes."""
     seed: int = 0
     """Random seed."""
     guidance_scale: float = 1.0
@@ -39,7 +39,7 @@ class Config:
     batch_size: int = 8
     """Number of scenes per batch and pipeline; the batch size changes scenes only by rounding."""
     num_examples: int = 4
-    """Number of scenes of each setting shown on the page."""
+    """Number of scenes per setting that the page shows."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/samplers)."""
     num_actors: int = 1

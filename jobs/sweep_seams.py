@@ -4,10 +4,10 @@
     jobs/sweep_seams.py --max-scenes 50                                     50 generated scenes, 200 seams per setting
     jobs/sweep_seams.py --max-scenes 50 --settings 250 10 10 0 1 50 1 1 1 0      two settings of five numbers
 
-A setting has five numbers: denoising steps, jump length, resamplings, weight of pseudoinverse guidance, and eta, the
-share of DDPM's noise. The paper's setting is 250 10 10 0 1, which needs 2,410 network evaluations per block. The job
-writes the scenes (source=generated-<the five numbers>), sweep.json, sweep.parquet and sweep.html. Run the same command
-again to resume after an interruption.
+A setting has five numbers: denoising steps, jump length, resamplings, weight of pseudoinverse guidance, and eta (share
+of DDPM's noise). The paper's setting is 250 10 10 0 1, which needs 2,410 network evaluations per block. The job writes
+the scenes (source=generated-<the five numbers>), sweep.json, sweep.parquet and sweep.html. Run the same command again
+to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ class Config(GenerationOptions):
     )  # fmt: skip
     """Settings of five numbers each: steps, jump length, resamplings, weight of pseudoinverse guidance, eta."""
     overlap: float = 0.5
-    """Overlap of neighbouring blocks, as a share of a block."""
+    """Overlap of neighbouring blocks, as a share of the block size."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Known latents of a block: encode the neighbours again in its frame, or copy their shifted latents (the paper)."""
+    """Known latents of a block: encode the neighbours again in the frame of the block, or copy and shift their latents
+    (the paper)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     batch_size: int = 4

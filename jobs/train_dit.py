@@ -7,7 +7,7 @@
     jobs/train_dit.py demo --start-from town --learning-rate 5e-4 --name more      continue with the released weights
 
 The job writes a complete pipeline to $PRITTI_HOME/models/pritti-<preset>. The job logs losses and sampled scenes to
-MLflow ($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
+MLflow ($MLFLOW_TRACKING_URI, by default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; the preset provides the values of options that are not given (models/presets.py)."""
+    """Options of a training run; options that are not given have the values of the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-l, kitti360-xl or av2."""
@@ -39,9 +39,9 @@ class Config:
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     start_from: str = ""
-    """Initialise with the weights of this pipeline, given like --model of other jobs (default: random weights)."""
+    """Initialise with the weights of this pipeline, named as for --model of other jobs (default: random weights)."""
     steps: int | None = None
-    """Training steps (default: as in the preset)."""
+    """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None
     """Global batch size over all workers (default: as in the preset)."""
     learning_rate: float | None = None
@@ -49,7 +49,7 @@ class Config:
     final_learning_rate: float | None = None
     """Learning rate at the last step of a cosine schedule (default: a constant learning rate, as in the paper)."""
     warmup_steps: int | None = None
-    """Steps of linear learning-rate warm-up (default: as in the preset)."""
+    """Number of warm-up steps with a linear increase of the learning rate (default: as in the preset)."""
     prediction_type: Literal["epsilon", "v_prediction"] | None = None
     """Target that the network predicts (default: as in the preset; paper: epsilon)."""
     normalise_latents: bool | None = None
@@ -57,13 +57,13 @@ class Config:
     timestep_sampling: Literal["uniform", "logit-normal"] = "uniform"
     """Distribution of training timesteps: uniform (the paper), or logit-normal, which prefers middle timesteps."""
     gradient_accumulation_steps: int = 1
-    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory."""
+    """Divide each worker's batch into this number of parts, which are processed in sequence to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
     """Compile the model with torch.compile, which takes a minute; useful on GPUs."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints (default: a twentieth of the run, at least four)."""
+    """Number of steps between checkpoints (default: a twentieth of the run, at least four steps)."""
     seed: int = 0
     """Random seed."""
 

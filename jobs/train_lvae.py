@@ -11,7 +11,7 @@ transformer of the pipeline remains valid. The job writes the pipeline with the 
 $PRITTI_HOME/models/pritti-<name>.
 
 The job writes the trained model to $PRITTI_HOME/models/lvae-<preset>. The job logs losses and pictures to MLflow
-($MLFLOW_TRACKING_URI, default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
+($MLFLOW_TRACKING_URI, by default an sqlite file under $PRITTI_HOME). Run the same command again to resume.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    """Options of a training run; the preset provides the values of options that are not given (models/presets.py)."""
+    """Options of a training run; options that are not given have the values of the preset (models/presets.py)."""
 
     preset: tyro.conf.Positional[str] = "town"
     """Preset: smoke, demo, town, kitti360, kitti360-light or av2."""
@@ -37,11 +37,12 @@ class Config:
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
     train_object_decoder_of: str = ""
-    """Train only a new object decoder for this pipeline, given like --model of other jobs (default: train all)."""
+    """Train only a new object decoder for this pipeline, named as for --model of other jobs (default: train all
+    parts)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     steps: int | None = None
-    """Training steps (default: as in the preset)."""
+    """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None
     """Global batch size over all workers (default: as in the preset)."""
     learning_rate: float | None = None
@@ -51,13 +52,13 @@ class Config:
     latent_noise: float | None = None
     """Noise on latents during training, in channel standard deviations (default: as in the preset; paper: 0)."""
     gradient_accumulation_steps: int = 1
-    """Number of parts, processed in sequence, into which each worker's batch is divided to save memory."""
+    """Divide each worker's batch into this number of parts, which are processed in sequence to save memory."""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """Floating-point precision; auto is bf16 on GPUs that support it, else fp32."""
     compile: bool = False
     """Compile the model with torch.compile, which takes a minute; useful on GPUs."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints (default: a twentieth of the run, at least four)."""
+    """Number of steps between checkpoints (default: a twentieth of the run, at least four steps)."""
     flip: bool = False
     """Augmentation: mirror half of the scenes left to right."""
     jitter: bool = False

@@ -1,6 +1,6 @@
 """Generate, edit and evaluate 3D semantic urban scenes.
 
-This package contains the public names. Each one is imported on first use:
+This package contains the public names. Each name is imported on first use:
 
 from pritti import PrITTIPipeline, Scene
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 try:
     __version__ = version("pritti-on-ray")
-except PackageNotFoundError:  # a checkout that is not installed
+except PackageNotFoundError:  # the checkout is not installed as a package
     __version__ = "unknown"
 
 __all__ = ["DiT", "LayoutVAE", "PrITTIPipeline", "RePaintConfig", "Scene", "__version__"]

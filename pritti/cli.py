@@ -64,7 +64,7 @@ def main() -> None:
         hint = f"did you mean {' or '.join(near)}?" if near else "pritti --help lists the jobs"
         print(f"error: unknown job {name!r}; {hint}", file=sys.stderr)
         sys.exit(2)
-    from jobs.support.cli import run  # imported here because it imports tyro, which the list of jobs does not need
+    from jobs.support.cli import run  # imported only here: the list of jobs does not need tyro
 
     sys.argv[0] = "pritti"  # the recorded command of a run should not contain a directory of this machine
     run(path.stem, args, prog=f"pritti {name}")

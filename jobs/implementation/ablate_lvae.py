@@ -126,7 +126,7 @@ def compare_variants(config: Branches) -> str:
     """Train and score missing variants, write the table, curves and page, and return the directory."""
     output = resolve_path(config.output, "ablations", config.name)
     if config.minutes <= 0 or config.num_seeds < 1:
-        raise ValueError(f"--minutes is {config.minutes}, --num-seeds {config.num_seeds}: expected more than 0")
+        raise ValueError(f"--minutes is {config.minutes}, --num-seeds is {config.num_seeds}: both must be more than 0")
     find_preset(LVAE_PRESETS, config.preset)
     chosen = select_variants(config)
     guard_study(output, {RECORDED_AS.get(k, k): v for k, v in asdict(config).items() if k not in NOT_RECORDED})
@@ -144,7 +144,7 @@ def compare_variants(config: Branches) -> str:
     rows, curves = ablation.group_by_variant(scores), ablation.draw_curve_chart(scores)
     table = ablation.build_variant_table(rows)
     write_tables(output, config.name, rows, [table], curves)
-    equal = "equal time" if is_at_equal_time(config) and not config.steps else "equally many steps"
+    equal = "the same training time" if is_at_equal_time(config) and not config.steps else "the same number of steps"
     how = [f"Preset {config.preset}, dataset {scores[0]['dataset']}, {equal} for all variants.", describe_machine()]
     html = ablation.render_page("Ablations of the layout VAE", config.name, [table], [curves], how)
     write_page(output, html, [table], tracker)
@@ -172,7 +172,7 @@ def select_variants(config: Branches) -> dict[str, Variant]:
 
 
 def is_at_equal_time(config: Branches) -> bool:
-    """Return whether the variants of a study train for equal time, not for equally many steps."""
+    """Return True if the variants train for the same time, and False if they train for the same number of steps."""
     return isinstance(config, Decoders | Ground)
 
 
@@ -222,7 +222,7 @@ def train_variant(config: Branches, variant: str, seed: int, output: str) -> dic
 
 
 def count_gflops(model: LayoutVAE, batch: LayoutBatch) -> float:
-    """Return the floating-point operations, in 1e9, of encoding and decoding a batch."""
+    """Return the number of floating-point operations that encode and decode a batch, divided by 1e9."""
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         model.decode(model.encode(batch).mean)
     return counter.get_total_flops() / 1e9

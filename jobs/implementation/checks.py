@@ -93,7 +93,7 @@ def check_inpaint_scenes(config: InpaintConfig) -> None:
     if config.num_examples < 0:
         raise ValueError(f"--num-examples is {config.num_examples}, expected 0 or more")
     if config.polygon_m and (len(config.polygon_m) % 2 or len(config.polygon_m) < 6):
-        raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x y of at least three corners")
+        raise ValueError(f"--polygon-m has {len(config.polygon_m)} numbers, expected x and y of at least three corners")
     require_model_labels(find_pipeline_directory(config.model), [config.label] if config.label else [])
 
 

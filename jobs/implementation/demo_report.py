@@ -22,7 +22,7 @@ SHOWN = 4
 
 MEANINGS = {
     "ground_iou": "IoU of the ground classes over all pixels; 1 is perfect (paper, on KITTI-360: 0.9996)",
-    "height_rmse_m": "root mean squared error of the ground height in metres, where there is ground",
+    "height_rmse_m": "root mean squared error of the ground height in metres, over pixels with ground",
     "height_mse_normalised": "mean squared error of heights scaled to [0, 1] by the data's range (paper: 0.0075)",
     "ap3d": "average precision of boxes over ten IoU thresholds, 0.05 to 0.50, without ellipsoids (paper: 0.621)",
     "ap3d_50": "average precision at IoU 0.50 (paper: 0.470)",
@@ -60,7 +60,7 @@ def select_one_per_label(scenes: list[Scene], count: int) -> list[Scene]:
 
 
 def read_curves(experiment: str, names: dict[str, str]) -> dict[str, tuple[list[float], list[float]]]:
-    """Return metric histories of an experiment's last run: label -> (steps, values)."""
+    """Return the metric histories of the last run of an experiment as label -> (steps, values)."""
     api = make_client(find_tracking_uri())
     found = api.get_experiment_by_name(experiment)
     if found is None:
@@ -149,7 +149,7 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
         ),
         draw_scene_pictures(
             "Generated scenes",
-            "Sampled by the diffusion transformer of this demo, for the vegetation label above each picture.",
+            "The diffusion transformer of this demo sampled each scene for the vegetation label above its picture.",
             select_one_per_label(generated, SHOWN),
             "generated",
         ),

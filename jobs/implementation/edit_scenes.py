@@ -68,8 +68,8 @@ def edit_scenes(config: SelectOptions | Replay) -> batch_edit.EditResult:
     """Edit scenes, write them, and return the changes."""
     if config.num_examples < 0 or not config.run or set(config.run) & set("/=\\"):
         raise ValueError(
-            f"--num-examples is {config.num_examples}, --run {config.run!r}: expected a number of 0 or more, and a "
-            "name without / = and \\"
+            f"--num-examples is {config.num_examples}, --run is {config.run!r}: "
+            "expected at least 0 examples, and a run name without /, = and \\"
         )
     edits = read_edits(config)
     for step in edits:

@@ -104,7 +104,7 @@ def evaluate_generation(
 
 
 def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
-    """Return equally many real and generated scenes.
+    """Return the same number of real and of generated scenes.
 
     Raises:
         ValueError: Real and generated pictures differ in size.
@@ -133,7 +133,8 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
         counts[name] = sum(len(rows) for _, rows in side.shards())
     if sizes["real"] != sizes["generated"]:
         raise ValueError(
-            f"real pictures are {sizes['real']} pixels, generated ones {sizes['generated']}: expected equal sizes"
+            f"real pictures have {sizes['real']} pixels, generated pictures have {sizes['generated']} pixels: "
+            "expected the same size"
         )
     return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
 
@@ -147,7 +148,9 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     }[config.reference]
     chosen = {
         "real": f"split {config.real_split}, {how}",
-        "generated": "labels in equal parts if there are enough" if config.balance_labels else "evenly spread",
+        "generated": "the same number of scenes per label, if there are enough scenes"
+        if config.balance_labels
+        else "evenly spread",
     }
     words = [
         f"{name.capitalize()}: {side.limit} of {side.root}, "

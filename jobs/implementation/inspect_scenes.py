@@ -31,7 +31,7 @@ def find_dataset_directory(config: DatasetOptions) -> str:
 
 
 def make_output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> str:
-    """Return --output, or a path under $PRITTI_HOME named after the dataset."""
+    """Return the value of --output, or a path under $PRITTI_HOME that contains the name of the dataset."""
     if config.output:
         return make_absolute(config.output)
     return home_path("inspect", find_dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")

@@ -29,14 +29,14 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
         step_m = BLOCK_M * (1 - config.overlap)
         if not 0 < step_m <= BLOCK_M or min(config.extent_m) < BLOCK_M:
             raise ValueError(
-                f"--extent-m is {config.extent_m}, --overlap {config.overlap}: "
-                f"expected at least {BLOCK_M} m, and 0 to 1"
+                f"--extent-m is {config.extent_m}, --overlap is {config.overlap}: "
+                f"expected an extent of at least {BLOCK_M} m and an overlap in [0, 1)"
             )
         sides = [ceil((extent - BLOCK_M) / 2 / step_m - 1e-9) for extent in config.extent_m]
         counts = sides[0], sides[0], sides[1], sides[1]
     if min(counts) < 0 or not any(counts):
         raise ValueError(
-            f"blocks ahead, behind, left and right are {counts}: expected 0 or more, and at least one block"
+            f"blocks ahead, behind, left and right are {counts}: no number may be negative, and one must be positive"
         )
     return counts
 

@@ -30,8 +30,8 @@ from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import read_scenes
 from pipelines.training.latents import digest_weights
 
-SHOWN = 32  # Number of scenes on the card, taken from the first.
-JUDGED = 256  # Number of scenes from which the scenes with most faults are selected.
+SHOWN = 32  # Number of scenes on the card, from the first scene.
+JUDGED = 256  # Number of scenes from which the scenes with the most faults are selected.
 FAILURES = 8
 CURVES = {"loss": "training loss", "validation_loss": "held-out loss"}
 
@@ -106,7 +106,8 @@ def read_evaluation(directory: str, weights: list[str]) -> tuple[dict, dict]:
         ValueError: There is no complete evaluation, or the evaluation belongs to other weights.
     """
     advice = (
-        "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model first, and specify their --output"
+        "run jobs/sample_scenes.py and jobs/evaluate_scenes.py --lvae with this model, "
+        "and pass the output directory of the evaluation"
     )
     if not storage.exists(storage.join_uri(directory, "evaluation.json")):
         raise ValueError(f"--evaluation {directory}: no evaluation here; {advice}")
@@ -205,7 +206,8 @@ def convert_axes(points: list[tuple[int, float]]) -> tuple[list[int], list[float
 
 
 def compute_hours(tracker, batch_size: int) -> float:
-    """Return the training time in hours from the logged speeds, without start-up, validation and pauses."""
+    """Return the training time in hours from the logged speeds, without the time for start-up, validation and
+    pauses."""
     last, seconds = 0, 0.0
     for step, speed in tracker.history("scenes_per_second"):
         seconds += (step - last) * batch_size / speed
@@ -214,7 +216,7 @@ def compute_hours(tracker, batch_size: int) -> float:
 
 
 def draw_examples(about: Mapping) -> dict[str, bytes]:
-    """Return PNGs of the first evaluated scenes, and of the scenes with most faults among the first JUDGED."""
+    """Return PNG pictures of the first evaluated scenes, and of those with the most faults among JUDGED scenes."""
     offset_m = find_slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
     faults = np.array([compute_scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])

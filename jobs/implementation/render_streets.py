@@ -21,8 +21,8 @@ def render(config: Config) -> dict[str, int]:
             raise ValueError(f"{name} is {value}, expected more than 0")
     if not -90 < config.pitch_deg < 90 or not -0.5 <= config.lateral_offset <= 0.5:
         raise ValueError(
-            f"--pitch-deg is {config.pitch_deg}, --lateral-offset {config.lateral_offset}: "
-            "expected -90 to 90, and -0.5 to 0.5"
+            f"--pitch-deg is {config.pitch_deg}, --lateral-offset is {config.lateral_offset}: "
+            "expected a pitch between -90 and 90 degrees, and an offset in [-0.5, 0.5]"
         )
     selection = select_scenes(config)
     total = sum(len(rows) for _, rows in selection.shards())

@@ -28,7 +28,7 @@ from pipelines.runtime import storage
 from pipelines.schema.tables import read_scenes
 
 RELEASED = "town"
-CHECKPOINTS = 8  # number of checkpoints per training run; each one has a validation with pictures
+CHECKPOINTS = 8  # number of checkpoints per training run; a validation with pictures runs at each checkpoint
 
 
 class Stages:
@@ -51,7 +51,7 @@ class Stages:
 
 
 def show_released(config: Config) -> None:
-    """Generate scenes with the released weights and draw them."""
+    """Generate scenes with the released weights, and draw the scenes."""
     sample(
         SampleConfig(
             model=RELEASED,
@@ -72,7 +72,7 @@ def show_released(config: Config) -> None:
 
 def main(config: Config) -> None:
     os.environ["PRITTI_HOME"] = make_absolute(config.output)
-    os.environ.pop("MLFLOW_TRACKING_URI", None)  # all files are kept under the output directory
+    os.environ.pop("MLFLOW_TRACKING_URI", None)  # the demo writes all files under the output directory
     stages = Stages(home_path("stages.json"), total=9 if config.num_released_scenes else 8)
     start_ray(training=True)
     if config.num_released_scenes:

@@ -56,7 +56,7 @@ def run_sweep(config: Config) -> list[dict]:
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
     how = [
         f"Real: {dataset.root}, split {config.real_split}. "
-        f"Generated: {sides['generated'].root}, labels in equal parts.",
+        f"Generated: {sides['generated'].root}, the same number of scenes per label.",
         "Features: Inception pool3."
         if config.inception
         else "Features: a fixed untrained network, without Inception weights.",

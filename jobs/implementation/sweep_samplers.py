@@ -41,7 +41,8 @@ def sweep_samplers(config: Config) -> list[dict]:
     require_positive(config, "num_actors", "batch_size")
     if config.num_scenes < 5 or config.num_examples < 0:
         raise ValueError(
-            f"--num-scenes is {config.num_scenes}, --num-examples {config.num_examples}: expected 5 and 0 or more"
+            f"--num-scenes is {config.num_scenes}, --num-examples is {config.num_examples}: "
+            "expected at least 5 scenes and at least 0 examples"
         )
     if not config.samplers or not config.num_inference_steps:
         raise ValueError("--samplers or --num-inference-steps is empty: expected at least one value of each")
@@ -83,7 +84,7 @@ def sweep_samplers(config: Config) -> list[dict]:
                 guidance_scale=config.guidance_scale,
                 sampler=sampler,
                 noise_scaling=scaling,
-                # Independent of the number of actors, so that a run can be resumed with another number of actors.
+                # The size does not depend on the number of actors, so a run can resume with another number of actors.
                 shard_scenes=max(1, config.num_scenes // 8),
             )
             seconds_per_scene = sample_and_time(config, request, bar)
@@ -109,7 +110,7 @@ def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> fl
 
     def advance(row: dict) -> None:
         bar.advance(shown, row["scenes"])
-        if row["seconds"]:  # 0 if an interrupted run wrote the shard
+        if row["seconds"]:  # the value is 0 if an interrupted run wrote the shard
             times[str(row["id"])] = [row["seconds"], row["scenes"]]
             storage.write_json(times, record)
 

@@ -191,7 +191,7 @@ class Start:
 
     digest: str
     normalisation: dict  # Shift and scale of the latents for these weights.
-    sampling: dict  # Noise scaling and existence threshold of their pipeline.
+    sampling: dict  # Noise scaling and existence threshold of the pipeline.
     state: dict[str, Tensor]
 
 
@@ -239,11 +239,11 @@ def build(
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
-    """Write layout VAE and scheduler next to a trained DiT, so that `output` is a PrITTIPipeline directory.
+    """Write the layout VAE and the scheduler next to a trained DiT, so that `output` is a PrITTIPipeline directory.
 
     Args:
         lvae: Directory of the layout VAE.
-        sampling: `noise_scaling` and `existence_threshold`, if they differ from the paper's.
+        sampling: Values of `noise_scaling` and `existence_threshold`, if the values differ from the paper's.
         output: Directory that contains dit/. This directory is also returned.
     """
     dit = DiT.from_pretrained(storage.join_uri(output, "dit"))

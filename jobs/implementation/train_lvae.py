@@ -140,7 +140,7 @@ def make_run_identity(
 
 
 def train(config: Config) -> str:
-    """Train, and return the directory of the model, or of the pipeline with --train-object-decoder-of."""
+    """Train and return the directory of the model; with --train-object-decoder-of, that of the pipeline."""
     training = prepare(config)
     output = resolve_path(config.output, "models", training.name)
     trainer.fit(training, config.num_workers, output)
@@ -151,7 +151,7 @@ def train(config: Config) -> str:
 
 @dataclass(frozen=True)
 class Kept:
-    """Weights of a trained layout VAE whose encoders are kept, and the digest of the transformer of its pipeline."""
+    """Weights of a trained layout VAE that provides the encoders, and the digest of the pipeline's transformer."""
 
     digest: str
     transformer: str
@@ -191,10 +191,10 @@ def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def require_replaceable(name: str, kept: Kept) -> None:
-    """Check that the updated pipeline replaces neither another pipeline nor the pipeline that it starts from.
+    """Check that the updated pipeline overwrites no other pipeline and not the initial pipeline.
 
     Raises:
-        ValueError: A pipeline would be replaced.
+        ValueError: The updated pipeline would overwrite a pipeline.
     """
     place = home_path("models", f"pritti-{name}")
     if not storage.exists(storage.join_uri(place, "model_index.json")):

@@ -1,4 +1,4 @@
-"""Validation on rank 0 during training: losses and pictures of the same held-out scenes each time."""
+"""Validate on rank 0 during training: compute losses and pictures, always for the same held-out scenes."""
 
 from __future__ import annotations
 
@@ -93,7 +93,8 @@ class ReconstructionCheck:
 
 @dataclass(frozen=True)
 class SamplingCheck:
-    """Validation of stage 2: loss on held-out latents, and samples from the same noise at each validation."""
+    """Validation of stage 2: the loss on held-out latents, and scenes that are sampled from the same noise each
+    time."""
 
     root: str
     source: str

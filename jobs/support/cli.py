@@ -1,4 +1,4 @@
-"""Paths, command line and error messages, which an executable needs before it imports heavy packages."""
+"""Paths, command line and error messages: functions that an executable needs before it imports heavy packages."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def require_positive(config: object, *names: str) -> None:
 
 
 def find_root_cause(error: BaseException) -> BaseException:
-    """Return the exception that the user should read, because Ray wraps a worker's error several times.
+    """Return the exception that the user should read from the chain of exceptions in which Ray wraps an error.
 
     The outermost ValueError or OSError that is not a wrapper comes from this package. The message of this exception
     names the file and the remedy; the messages of deeper causes do not.
@@ -92,10 +92,10 @@ def find_root_cause(error: BaseException) -> BaseException:
 
 
 def hide_empty_defaults(options: ModuleType) -> None:
-    """Change the option classes of a module such that their help does not show an empty default.
+    """Remove empty defaults from the help of the option classes in a module.
 
-    tyro appends "(default: None)" or "(default: '')" to the help of an option. The help of these options states in
-    words what the job uses instead.
+    tyro appends "(default: None)" or "(default: '')" to the help of an option. The help of these options states the
+    default in words.
 
     Args:
         options: Module jobs.<job>.

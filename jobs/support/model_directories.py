@@ -1,4 +1,4 @@
-"""Find the pipeline that --model names. The import of this module imports neither torch nor MLflow."""
+"""Find the pipeline that --model names. Importing this module imports neither torch nor MLflow."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def find_pipeline_directory(model: str) -> str:
         if storage.exists(storage.join_uri(directory, INDEX_NAME)):
             return directory
     if re.fullmatch(r"models:/.+|[0-9a-f]{32}", model):
-        from jobs.support.registry import download_pipeline  # this module imports MLflow
+        from jobs.support.registry import download_pipeline  # imported here because it imports MLflow
 
         return download_pipeline(model)
     return find_pipeline_path(model)

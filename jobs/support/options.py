@@ -27,7 +27,7 @@ class SceneOptions:
     split: str = ""
     """Read only scenes of this split (default: all splits)."""
     max_scenes: int | None = None
-    """Maximum number of scenes, taken from the first (default: all)."""
+    """Maximum number of scenes; the first scenes are used (default: all)."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class GenerationOptions(SceneOptions):
     """Options for the scenes to change and for the pipeline."""
 
     max_scenes: int | None = 1
-    """Maximum number of scenes, taken from the first."""
+    """Maximum number of scenes; the first scenes are used."""
     model: ModelOption = ""
     label: str = ""
-    """Density label to generate for (default: the label of each scene)."""
+    """Density label of the generated content (default: the label of each scene)."""
     seed: int = 0
     """Random seed."""
     guidance_scale: float = 1.0
@@ -60,7 +60,7 @@ class RePaintOptions(GenerationOptions):
     num_inference_steps: int | None = None
     """Number of denoising steps without RePaint's repetitions (default: 250 as in the paper; 50 with --guided)."""
     jump_length: int | None = None
-    """Number of steps that RePaint goes back at a time, J in the paper (default: 10)."""
+    """Jump length of RePaint in steps, J in the paper (default: 10)."""
     num_resamplings: int | None = None
     """Number of times that RePaint passes each step, R in the paper (default: 10; 1 with --guided)."""
     pseudoinverse_guidance: float | None = None

@@ -25,17 +25,17 @@ def start_ray(training: bool = False) -> None:
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False
-    context.raise_original_map_exception = True  # a worker's ValueError keeps its type: see `find_root_cause`
+    context.raise_original_map_exception = True  # keep the type of a worker's ValueError for `find_root_cause`
     logging.getLogger("ray.data").setLevel(logging.WARNING)
-    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # Jobs show their own progress bars.
-    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # These errors are also raised.
+    logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # the jobs show progress bars
+    for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # Ray also raises these errors
         logging.getLogger(f"ray.data.{name}").setLevel(logging.CRITICAL)
 
 
 def run_packed(config: dict[str, bytes]) -> None:
     """Unpickle and call a function in a Ray Train worker.
 
-    Ray Train's controller also unpickles the training function. With the packed form, the controller does not import
-    the models.
+    Ray Train's controller also unpickles the training function. The packed form avoids that the controller imports the
+    models.
     """
     cloudpickle.loads(config["packed"])()

@@ -1,4 +1,4 @@
-"""Published models in MLflow: a run with the pipeline's files, and a registered model version that points to it."""
+"""Published models in MLflow: a run with the files of a pipeline, and a registered model version for the run."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Earlier names of options and option values.
 
-The use of an earlier name is an error, and its message contains the current name.
+Using an earlier name is an error. The error message contains the current name.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ VALUES = {
 
 
 def find_renamed(job: str, words: Sequence[str]) -> str | None:
-    """Return a message about the first earlier option name or value on a command line, or None.
+    """Return a message about the first outdated option name or value on a command line, or None.
 
     Args:
         job: Module name, such as "sample_scenes".

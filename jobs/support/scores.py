@@ -19,8 +19,8 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     """Write scores to metrics.json and metrics.parquet, and log them with tags and files to MLflow.
 
     Each output directory has one MLflow run, which a repeated evaluation updates. The file metrics.parquet has one row
-    per score, with the bounds of its 95 % interval if it has one. In MLflow, the bounds are separate metrics, NAME.low
-    and NAME.high.
+    per score, and the bounds of the 95 % interval if the score has an interval. In MLflow, the bounds are separate
+    metrics, NAME.low and NAME.high.
 
     Args:
         output: Directory or URI of the files.
@@ -49,7 +49,7 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     finite = [(name, number) for name, number in known.items() if isfinite(number)]
     for start in range(0, len(finite), METRICS_PER_CALL):
         tracker.metrics(dict(finite[start : start + METRICS_PER_CALL]), step=0)
-    if "://" not in output:  # MLflow takes local files only
+    if "://" not in output:  # MLflow accepts only local files
         for file in ("metrics.json", *files):
             tracker.client.log_artifact(tracker.run_id, storage.join_uri(output, file))
     tracker.finish("FINISHED")

@@ -20,7 +20,7 @@ def find_tracking_uri() -> str:
 
 
 def hide_credentials(uri: str) -> str:
-    """Remove user and password from a URI, for messages."""
+    """Return a URI without user and password, for use in messages."""
     return re.sub(r"//[^/@]*@", "//", uri)
 
 
@@ -28,9 +28,9 @@ def make_client(uri: str):
     """Return an MLflow client without log noise and telemetry."""
     os.environ.setdefault("DO_NOT_TRACK", "true")
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    from mlflow import MlflowClient  # reads the variables above when it is imported
+    from mlflow import MlflowClient  # mlflow reads the variables above when it is imported
 
-    for name in ("alembic", "mlflow"):  # the import of mlflow sets their levels
+    for name in ("alembic", "mlflow"):  # importing mlflow sets the levels of these loggers
         logging.getLogger(name).setLevel(logging.WARNING)
     return MlflowClient(tracking_uri=uri)
 
@@ -61,7 +61,7 @@ class Tracker:
             experiment: Name of the MLflow experiment.
             name: Name of the MLflow run.
             parameters: Parameters to log for a new run.
-            record: JSON file with the id of the MLflow run, which is written for a new run (None: no file).
+            record: JSON file with the id of the MLflow run; a new run writes this file (None: no file).
 
         Returns:
             The tracker.

@@ -37,7 +37,7 @@ RETRIES = 2  # restarts from the last checkpoint after a worker failure
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """One training run, as its workers receive it. All fields can be pickled.
+    """Description of a training run for its workers. All fields can be pickled.
 
     The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
     pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that a
@@ -60,13 +60,13 @@ class TrainingRun:
 def convert_to_tensors(batch: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     """Convert a batch of arrays to tensors."""
     return {
-        name: torch.from_numpy(np.array(value))  # copy, because Ray's arrays are read-only
+        name: torch.from_numpy(np.array(value))  # a copy is necessary because Ray's arrays are read-only
         for name, value in batch.items()
     }
 
 
 def train_worker(run: TrainingRun, threads: int) -> None:
-    """Train in one worker: read batches, step, and log, checkpoint and validate at intervals."""
+    """Train in one worker: read batches, take steps, and regularly log, save a checkpoint and validate."""
     logging.getLogger("ray.train").setLevel(logging.WARNING)
     logging.getLogger("ray.data").setLevel(logging.WARNING)
     context = ray.train.get_context()
@@ -110,7 +110,7 @@ def train_worker(run: TrainingRun, threads: int) -> None:
 
 
 def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
-    """Return the message of a non-finite loss, with the ids of the scenes that caused it.
+    """Return the error message for a non-finite loss, with the ids of the scenes that caused this loss.
 
     Args:
         error: Error with the positions of the samples.
@@ -129,7 +129,7 @@ def with_scene_ids(error: NonFiniteLossError, stream: Stream) -> str:
 
 
 def measure_waiting(iterator: Iterator) -> Iterator[tuple[Any, float]]:
-    """Yield items with the seconds spent waiting for each."""
+    """Yield each item with the time in seconds that the iterator needed to return the item."""
     while True:
         started = time.perf_counter()
         try:
@@ -167,7 +167,7 @@ def report(run: TrainingRun, trainer: Trainer, rank: int, loss: float) -> None:
 
 
 def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
-    """Tag an MLflow run with the digest of its weights, with which jobs/publish_model.py finds the run."""
+    """Tag an MLflow run with the digest of its weights; jobs/publish_model.py searches for this tag."""
     tracker.tag("weights", digest_weights(model))
     tracker.tag("steps", str(steps))
 
@@ -223,7 +223,7 @@ def fit(run: TrainingRun, num_workers: int, output: str) -> str:
 
 
 def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
-    """Return the resources of the workers, which leave CPUs for the readers of the data.
+    """Return the resources of the workers; the other CPUs are for the data readers.
 
     Args:
         num_workers: Number of Ray Train workers.
@@ -233,14 +233,13 @@ def make_scaling_config(num_workers: int, batch_size: int) -> ScalingConfig:
         Scaling configuration of Ray Train.
 
     Raises:
-        ValueError: There are too many workers for the cluster, so they would wait forever; or the batch size is not a
-            multiple of their number.
+        ValueError: The cluster has too few CPUs for the workers, or the batch size is not a multiple of `num_workers`.
     """
     cpus, gpus = (float(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
     per_worker = 1.0 if cpus > 2 * num_workers else 0.5
     most = int((cpus - READER_CPUS) // per_worker)
     if not 1 <= num_workers <= most:
-        raise ValueError(f"--num-workers is {num_workers}, this cluster of {cpus:.0f} CPUs can run 1 to {most}")
+        raise ValueError(f"--num-workers is {num_workers}: this cluster of {cpus:.0f} CPUs can run 1 to {most} workers")
     if batch_size < 1 or batch_size % num_workers:
         raise ValueError(f"--batch-size {batch_size} is not a multiple of --num-workers {num_workers}")
     return ScalingConfig(num_workers=num_workers, use_gpu=gpus >= num_workers, resources_per_worker={"CPU": per_worker})
@@ -255,7 +254,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
         identity: Options that a resumed run must share with the run that it continues.
 
     Returns:
-        Path of the file with its MLflow run.
+        Path of the file with the id of the MLflow run.
 
     Raises:
         ValueError: The name belongs to other options and has checkpoints.
@@ -292,7 +291,7 @@ def publish_directory(directory: str, output: str) -> None:
 
 
 def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerConfig:
-    """Return the settings with every change that is not None.
+    """Return the settings after all changes that are not None.
 
     Args:
         settings: Settings of the preset.

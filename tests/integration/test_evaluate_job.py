@@ -59,7 +59,7 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
 
 def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
     write_npz(str(tmp_path / "small.npz"), [np.zeros((4, 64, 64, 3), np.uint8)], 4)
-    with pytest.raises(ValueError, match=r"real pictures are \[256, 256\] pixels, generated ones \[64, 64\]"):
+    with pytest.raises(ValueError, match=r"real pictures have \[256, 256\] pixels, generated pictures have \[64, 64\] pixels"):
         evaluate(
             Config(real=str(smoke / "datasets/smoke"), generated=str(tmp_path / "small.npz"), output=str(tmp_path))
         )

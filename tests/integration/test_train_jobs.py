@@ -128,7 +128,7 @@ def test_train_dit_with_two_workers_matches_one_and_resumes(home, tmp_path, monk
     for name in one:
         assert np.allclose(one[name], two[name], atol=1e-4), name
     assert not list((home / "runs").rglob("*.pkl"))
-    with pytest.raises(ValueError, match=r"--num-workers is 4, this cluster of 2 CPUs can run 1 to 3"):
+    with pytest.raises(ValueError, match=r"--num-workers is 4: this cluster of 2 CPUs can run 1 to 3 workers"):
         train(Config(preset="smoke", name="dit-four", num_workers=4))
     with pytest.raises(ValueError, match="--batch-size 7 is not a multiple of --num-workers 2"):
         train(Config(preset="smoke", name="dit-odd", num_workers=2, batch_size=7))
