@@ -1,8 +1,7 @@
 """Run the paper's ablations as Ray graphs, and build their tables and charts.
 
-The studies of box encodings read no dataset.
-`reconstruct_boxes` compares the encodings of a box. `compute_yaw_losses` measures the IoU3D that errors of the yaw
-cost. The variants compare branches of the layout VAE.
+There are three studies. `reconstruct_boxes` compares the encodings of a box. `compute_yaw_losses` measures the loss of
+IoU3D that yaw errors cause. Both use random boxes and read no dataset. The variants compare branches of the layout VAE.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ from pipelines.runtime.ray_tasks import map_dataset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
-SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Bins of width / length; the "any" boxes also have a score per bin.
+SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Bins of width / length; "any" boxes also have a score per bin.
 
 
 def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray:
-    """Return the exact IoU3D (n,) of boxes that are centred at zero."""
+    """Return the exact IoU3D (n,) of pairs of boxes that are centred at the origin."""
     center = np.zeros_like(truth.size_m)
     return compute_iou3d_pairs(make_boxes(center, *truth), make_boxes(center, *other))
 
@@ -49,14 +48,14 @@ def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray
 
 @dataclass(frozen=True)
 class Trial:
-    """One autoencoder to train.
+    """Settings of one autoencoder that is trained.
 
     Attributes:
-        kind: Kind of boxes.
+        kind: Distribution of the boxes.
         encoding: Encoding of a box.
         count: Number of training boxes.
         seed: Seed of boxes and weights.
-        numbers: Numbers that the autoencoder regresses: all, or only those that vary (moving).
+        numbers: Numbers that the autoencoder regresses: all numbers, or only the varying numbers (moving).
     """
 
     kind: str
@@ -67,15 +66,15 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Return the name of the trial, which names its file of scores."""
+        """Return the name of the trial and of its score file."""
         return f"{self.kind}-{self.encoding}-{self.numbers}-{self.count:05d}-seed{self.seed}"
 
 
 def list_trials(kind: str, counts: Sequence[int], seeds: int, numbers: str = "all") -> list[Trial]:
-    """List the trials of each encoding at each training size, ordered by seed and then by decreasing training size.
+    """List the trials of each encoding and training size, by seed and then by decreasing training size.
 
     Raises:
-        ValueError: A training size is below 2, or there is no training size or no seed.
+        ValueError: A training size is less than 2, or the training sizes or the seeds are empty.
     """
     if not counts or min(counts) < 2 or seeds < 1:
         raise ValueError(
@@ -86,7 +85,7 @@ def list_trials(kind: str, counts: Sequence[int], seeds: int, numbers: str = "al
 
 
 def draw_training_boxes(trial: Trial) -> CenteredBoxes:
-    """Draw the training boxes of a trial. With the same seed, a larger set begins with the boxes of a smaller set."""
+    """Draw the training boxes of a trial. For the same seed, a larger set begins with the boxes of a smaller set."""
     return draw_boxes(BOX_DISTRIBUTIONS[trial.kind], trial.count, TRAIN_KEY, trial.seed)
 
 
@@ -157,7 +156,7 @@ def reconstruct_boxes(
 
 
 def average_by_size(scores: Iterable[dict]) -> list[dict]:
-    """Return mean IoU3D and its variation over seeds, per kind of boxes, numbers, encoding and training size."""
+    """Return the mean IoU3D and its variation over seeds, for each combination of boxes, numbers, encoding and size."""
 
     def key(row: dict) -> tuple:
         return (
@@ -200,26 +199,26 @@ LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # Mean IoU of a square with
 
 
 def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
-    """Return the IoU of a square with itself after a rotation by 0 <= turn <= pi/2: 1 / (sin + cos).
+    """Return the IoU of a square and its rotated copy, 1 / (sin + cos), for rotations in [0, pi/2].
 
-    An upright box with a square footprint has the same IoU3D. The mean over all rotations is LOST_YAW_IOU3D.
+    The IoU3D of an upright box with a square footprint is the same. The mean over all rotations is LOST_YAW_IOU3D.
     """
     return 1 / (np.sin(turn_rad) + np.cos(turn_rad))
 
 
 @cache
 def find_ranges(encoding: str) -> np.ndarray:
-    """Return the range (entries,) of each number of an encoding over "any" boxes."""
+    """Return the range (entries,) of each number of an encoding, measured on "any" boxes."""
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(BOX_DISTRIBUTIONS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
 def compute_yaw_loss(row: dict, count: int) -> dict:
-    """Compute the IoU3D that `count` boxes lose when noise is added to their encoding.
+    """Compute the loss of IoU3D if noise is added to the encoding of `count` boxes.
 
-    The input row holds encoding, width_share and noise. The output row adds the scores. The noise is Gaussian and
-    relative to the range of each entry over "any" boxes, so constant entries remain exact. `iou3d_lost_with_yaw` is the
-    IoU3D with the true axes minus the IoU3D as decoded: the cost of the yaw error alone. The extents along the true
-    axes come from the decoded scatter matrix.
+    The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
+    is Gaussian. It is relative to the range of each entry over "any" boxes, and constant entries get no noise.
+    `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with the true axes minus the IoU3D of
+    the decoded box. The extents along the true axes are computed from the decoded scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -234,7 +233,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
         compute_mean_iou3d(truth, decoded),
         compute_mean_iou3d(truth, CenteredBoxes(truth.rotation, along)),
     )
-    flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # Index of a horizontal axis.
+    flat = np.abs(turned[:, 2, :]).argmin(axis=1)  # Index of the most horizontal axis.
     x, y = (turned[np.arange(count), k, flat] for k in (0, 1))
     error = np.abs((np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
     return dict(row) | {
@@ -245,7 +244,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
 
 
 def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
-    """Return `compute_yaw_loss` of each encoding, footprint and noise. One task computes one encoding and footprint."""
+    """Return `compute_yaw_loss` of each encoding, footprint and noise; one task computes one encoding and footprint."""
     rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
     graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
     found = list(map_dataset(graph, compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
@@ -260,8 +259,8 @@ class Variant:
     """Differences between a variant and the preset.
 
     Attributes:
-        architecture: Changed entries of `LayoutVAEConfig`. Entries of a branch are nested: {"ground": {"channels":
-            (16,)}}.
+        architecture: Changed entries of `LayoutVAEConfig`. The entries of a branch form a nested dictionary: {"ground":
+            {"channels": (16,)}}.
         options: Changed options of the training (jobs/train_lvae.py).
     """
 
@@ -275,13 +274,14 @@ BRANCHES = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# The DETR decoder of the paper has the same branches and latents. It diverges at the learning rate of the cell decoder.
+# The paper's DETR decoder has the same branches and latents as the cell decoder. It diverges at the learning rate that
+# the cell decoder uses.
 DECODERS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Variants of the ground branch alone. The preset town has channels (32,) after pixel unshuffle by 8.
+# Variants with only the ground branch. The preset town uses pixel unshuffle by 8 and channels (32,).
 # models/vae/ground.py explains the linear start.
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
@@ -310,13 +310,13 @@ MEASURES |= {"ap3d": "objects", "ap3d_50": "objects"}
 
 
 def average_measurements(variant: Variant, reconstruction: Mapping) -> dict[str, float | None]:
-    """Return the scores of `evaluate_reconstruction` for a variant. The scores of a missing branch are None."""
+    """Return the scores of `evaluate_reconstruction` for a variant; the scores of a missing branch are None."""
     kept = variant.architecture.get("branches", "both")
     return {name: reconstruction[name] if kept in ("both", side) else None for name, side in MEASURES.items()}
 
 
 def group_by_variant(scores: Iterable[dict]) -> list[dict]:
-    """Return mean, minimum and maximum of each measure over seeds, per variant."""
+    """Return the mean, minimum and maximum over seeds of each measure, for each variant."""
     rows, scores = [], list(scores)
     for variant in dict.fromkeys(row["variant"] for row in scores):
         found = [row for row in scores if row["variant"] == variant]
@@ -349,7 +349,7 @@ def build_encoding_table(rows: Sequence[dict]) -> Table:
 
 
 def build_share_table(rows: Sequence[dict]) -> Table | None:
-    """Tabulate mean IoU3D by width / length for the kinds of boxes with a value in each bin; None if there are none."""
+    """Tabulate mean IoU3D per bin of width / length for kinds of boxes with values in all bins, or return None."""
     kept = [row for row in rows if None not in row["iou3d_per_share"]]
     if not kept:
         return None
@@ -359,13 +359,12 @@ def build_share_table(rows: Sequence[dict]) -> Table | None:
         for row in kept
     ]
     columns = ("boxes", "encoding", "training size", *bins)
-    return Table(
-        "Encodings by footprint", columns, cells, note=("The table shows mean IoU3D by width / length of the true box.")
-    )
+    note = "The table shows the mean IoU3D for each range of width / length of the true box."
+    return Table("Encodings by footprint", columns, cells, note=note)
 
 
 def build_yaw_table(rows: Sequence[dict]) -> Table:
-    """Tabulate, per encoding, footprint and noise, the IoU3D that a yaw error costs and the mean yaw error."""
+    """Tabulate the loss of IoU3D from yaw errors and the mean yaw error, per encoding, footprint and noise."""
     noises = sorted({row["noise"] for row in rows})
     columns = ["encoding", "width / length"]
     columns += [f"IoU3D loss, {100 * n:g} % noise" for n in noises]
@@ -377,8 +376,8 @@ def build_yaw_table(rows: Sequence[dict]) -> Table:
         cells.append([encoding, share, *lost, *(round(row["yaw_error_deg"], 2) for row in found)])
     note = (
         "The noise is relative to the range of each encoded number. The loss is the IoU3D with the true axes minus the "
-        f"IoU3D as decoded. With a random yaw, a square has a mean IoU3D of {LOST_YAW_IOU3D:.4f}, which is a loss of "
-        f"{1 - LOST_YAW_IOU3D:.4f}."
+        f"IoU3D of the decoded box. With a random yaw, a square has a mean IoU3D of {LOST_YAW_IOU3D:.4f}, which is a "
+        f"loss of {1 - LOST_YAW_IOU3D:.4f}."
     )
     return Table("IoU3D loss by yaw error", columns, cells, note=note)
 
@@ -410,7 +409,7 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
 
 
 def draw_curve_chart(scores: Sequence[dict]) -> Chart:
-    """Chart AP3D on the first held-out scenes during training against minutes, with a line per variant and seed."""
+    """Chart AP3D on the first held-out scenes over the training time (minutes), with a line per variant and seed."""
     series = {}
     for row in scores:
         per_step = row["training_seconds"] / 60 / row["steps"]
@@ -424,12 +423,12 @@ def _round_values(value: float | str | None) -> float | str | None:
 
 
 def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Chart:
-    """Chart mean IoU3D against training size (paper's figure), with a line per encoding and whiskers over seeds."""
+    """Chart mean IoU3D over training size (paper's figure), with a line per encoding and whiskers over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (kind, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
         chosen = [row for row in rows if row["encoding"] == encoding]
-        aside = 1 + 0.012 * (k - 1)  # A small shift per encoding prevents overlapping whiskers.
+        aside = 1 + 0.012 * (k - 1)  # Each encoding is shifted slightly, because whiskers would overlap otherwise.
         points = [p for row in chosen for p in _draw_whisker(row["training_size"] * aside, row)]
         series[encoding] = tuple(zip(*points, strict=True)) if points else ((), ())
     title = f"IoU3D of reconstructed boxes ({kind}, {numbers} numbers): mean, minimum and maximum over seeds"
@@ -437,7 +436,7 @@ def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Ch
 
 
 def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
-    """Yield the points mean, maximum, minimum and mean of a whisker, so that the line continues at the mean."""
+    """Yield the points of a whisker: mean, maximum, minimum and again mean, where the line continues."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
@@ -454,7 +453,7 @@ def draw_share_chart(rows: Sequence[dict], kind: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """Chart the IoU3D loss by yaw error: Cholesky at each noise, all other encodings at the largest noise."""
+    """Chart the IoU3D loss from yaw errors: Cholesky at each noise, the other encodings only at the largest noise."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"
@@ -470,7 +469,7 @@ def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
 def render_page(
     title: str, subtitle: str, tables: Sequence[Table], charts: Sequence[Chart], text: Sequence[str] = ()
 ) -> str:
-    """Render a self-contained page of charts, tables and a description of the method."""
+    """Render a self-contained page with charts, tables and a description of the method."""
     sections: list = (
         [DrawingsSection("Figures", [CaptionedSvg(draw_chart_svg(c), c.title) for c in charts], "pairs")]
         if charts

@@ -1,8 +1,9 @@
-"""Score generated scenes against real scenes, or any two sources, from the features of each scene (features.py).
+"""Score generated scenes against real scenes, or any source against another, from features of the scenes.
 
-Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of Inception features have the usual
-names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have a prefix: `layout_` for layout
-statistics, `random_` for an untrained network. reconstruction.py scores reconstructions.
+features.py computes the features. Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of
+Inception features have the usual names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have
+a prefix. The prefix is `layout_` for layout statistics and `random_` for a network with random weights.
+reconstruction.py scores reconstructions.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from pipelines.metrics.neighbours import (
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
-MEMORISED_QUANTILE = 0.01  # Quantile of the distances of real scenes to their nearest other real scene.
+MEMORISED_QUANTILE = 0.01  # Quantile of the distance of a real scene to the nearest other real scene.
 
 
 def compare_datasets(
@@ -54,14 +55,15 @@ def compare_datasets(
     """Score `generated` against `real`.
 
     Args:
-        real: Features of the real scenes, by name.
-        generated: Features of the generated scenes, by name.
-        ground_classes: Ground classes of the layout statistics.
+        real: Features of the real scenes (dictionary from name to array).
+        generated: Features of the generated scenes (dictionary from name to array).
+        ground_classes: Names of the ground classes in the layout statistics.
         k: Neighbourhood sizes of precision and recall.
-        reference: Moments of all real pictures. With it, fid and sfid are computed against them, as in ADM's evaluator.
+        reference: Moments of all real pictures. If given, fid and sfid are computed against these moments, as in ADM's
+            evaluator.
 
     Returns:
-        Nested scores. A leaf is an Estimate if the score has an interval.
+        Nested scores. Scores with an interval are Estimates.
     """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
     if "statistics" in real and "statistics" in generated:
@@ -89,7 +91,7 @@ def compare_datasets(
 
 
 def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    """Estimate the Frechet distance of two sets of features; both sides vary."""
+    """Estimate the Frechet distance of two sets of features; both sets are resampled."""
     a, b = compute_moments(real), compute_moments(generated)
     between = compute_transport(a, b)
     by_real, by_generated = compute_influence_maps(b, between)
@@ -101,7 +103,7 @@ def estimate_frechet(real: np.ndarray, generated: np.ndarray) -> Estimate:
 
 
 def compute_frechet_to(reference: StoredGaussian, generated: np.ndarray) -> Estimate:
-    """Estimate the Frechet distance to fixed moments; only the generated samples vary."""
+    """Estimate the Frechet distance to fixed moments; only the generated samples are resampled."""
     b = compute_moments(generated)
     between = compute_transport(reference, b)
     influence = compute_frechet_influence(generated, b, reference.mean, compute_influence_maps(b, between)[1])
@@ -112,7 +114,7 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
     """Compute frechet, mmd and `compute_neighbourhood_scores`.
 
     Raises:
-        ValueError: Features are not finite. The message names side and sample.
+        ValueError: The features are not finite. The message names the side and the sample.
     """
     real, generated = require_comparable(real, generated, at_least=2)
     found = {"frechet": estimate_frechet(real, generated), "mmd": compute_kernel_distance(real, generated)}
@@ -120,10 +122,10 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
 
 
 def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
-    """Compute precision_k3, recall_k3, density_k3 and coverage_k3, and the same for each other k.
+    """Compute precision, recall, density and coverage for each k, with names such as precision_k3.
 
-    Intervals are over the judged samples. The balls are fixed, because a sample that is drawn twice would be its own
-    neighbour.
+    The intervals resample the samples that are tested for membership in a ball. The balls are not resampled, because a
+    sample that is drawn twice would be its own neighbour.
 
     Raises:
         ValueError: There are too few samples for the largest k.
@@ -143,7 +145,7 @@ def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Seq
 
 
 def map_neighbourhoods(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> list[NeighbourhoodScores]:
-    """Run `compute_neighbourhoods` as Ray tasks of ROWS_PER_TASK rows, which share one copy of the features."""
+    """Run `compute_neighbourhoods` in Ray tasks of ROWS_PER_TASK rows; the tasks share one copy of the features."""
     sides = prepare_features(real, generated, k)
     shared = [ray.put(side) for side in sides]
     radii = [
@@ -175,13 +177,13 @@ def find_within_task(
 
 
 def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
-    """Compare distances from generated to real samples with distances between real samples (paper, supplement).
+    """Compare the distances from generated to real samples with the distances between real samples (paper, supplement).
 
     Returns:
-        `generated` and `real`: statistics of the distance to the nearest (other) real sample. `memorised`: share of
-        generated samples whose distance is below the 1 % quantile of the real distances. `copies`: share of generated
-        samples at distance 0. `nearest` (m, 3): nearest real samples of each generated sample, in order of distance.
-        `distance` (m, 3): their distances.
+        `generated` and `real`: statistics of the distance of each sample to the nearest other sample that is real.
+        `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of real samples.
+        `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real samples of
+        each generated sample, in order of distance. `distance` (m, 3): distances of these samples.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
@@ -205,13 +207,13 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
 
 
 def compute_layout_scores(real: Described, generated: Described, ground_classes: Sequence[str]) -> dict:
-    """Compute statistics and validity of both sides, their distances, and the fidelity to density labels."""
+    """Compute statistics and validity of both sides, distances between the sides, and label fidelity."""
     names = statistics.list_statistic_names(ground_classes)
     sides = {"real": real, "generated": generated}
     means = {side: compute_scene_means(part["statistics"]) for side, part in sides.items()}
     rates = {side: compute_pair_ratios(part["validity"]) for side, part in sides.items()}
     categories = slice(0, len(CATEGORIES))
-    # The distance between two halves of the real scenes is about the lowest distance that a source can reach.
+    # A source can hardly reach a distance lower than the distance between two halves of the real scenes.
     halves = real["statistics"][::2], real["statistics"][1::2]
     floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
     distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
@@ -230,13 +232,13 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
 
 
 def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
-    """Estimate column means over the scenes with a value. NaN means no value; a column without values gives None."""
+    """Estimate column means, ignoring NaN. The estimate is None if all values of a column are NaN."""
     known = np.isfinite(values)
     return estimate_ratios(np.where(known, values, 0), known)
 
 
 def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
-    """Estimate the rates of measures from records (n, 2 measures) in which numerators and denominators alternate."""
+    """Estimate the rates of measures from records (n, 2 * measures), where numerators and denominators alternate."""
     return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 
@@ -244,7 +246,7 @@ def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
 
 
 def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | float]:
-    """Flatten nested scores to names joined by dots. None, arrays and numbers that are not finite are skipped."""
+    """Flatten nested scores; names are joined by dots. None, arrays and numbers that are not finite are skipped."""
     flat: dict[str, Estimate | float] = {}
     for name, value in scores.items():
         if isinstance(value, Mapping):
@@ -257,9 +259,9 @@ def flatten_scores(scores: Mapping, prefix: str = "") -> dict[str, Estimate | fl
 
 
 def convert_estimates(scores: Mapping) -> dict:
-    """Convert nested scores to JSON values.
+    """Convert nested scores to values that JSON can store.
 
-    An Estimate becomes value, low and high. NaN and infinity become null, and arrays are skipped.
+    An Estimate becomes a dictionary with value, low and high. NaN and infinity become null. Arrays are skipped.
     """
 
     def number(value: float) -> float | None:

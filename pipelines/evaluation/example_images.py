@@ -1,4 +1,4 @@
-"""Select the pictures of both sides of a comparison that the page shows, from scenes of tables or from an .npz."""
+"""Select the pictures that the page shows for both sides of a comparison, from scenes or from an .npz."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHOWN = 12  # Number of pictures per side on the page.
 
 
 def select_example_images(side: SceneSet, indices: np.ndarray) -> list[np.ndarray]:
-    """Return the pictures (H, W, 3) uint8 of a side's scenes at `indices`, with antialiasing."""
+    """Return antialiased pictures, (H, W, 3) uint8, of the scenes at `indices`."""
     if isinstance(side, SceneSubset):
         return [render_bev(scene, supersample=2) for scene in load_scenes(side.shards(), indices)]
     wanted = set(indices.tolist())
@@ -29,7 +29,7 @@ def select_example_images(side: SceneSet, indices: np.ndarray) -> list[np.ndarra
 def select_shown_images(
     real: SceneSet, generated: SceneSet, described: Mapping[str, np.ndarray], memorised: Mapping
 ) -> ExamplePictures:
-    """Select evenly spaced pictures, the generated pictures nearest to real ones, and the pictures with most faults.
+    """Select evenly spaced pictures, generated pictures closest to real pictures, and pictures with the most faults.
 
     Args:
         real: Real side.
@@ -51,7 +51,8 @@ def select_shown_images(
     ]
     worst = []
     if "validity" in described:
-        faults = described["validity"][:, :-2:2].sum(axis=1)  # The last measure, road connectivity, counts no faults.
+        # The last measure, road connectivity, does not count faults.
+        faults = described["validity"][:, :-2:2].sum(axis=1)
         most = np.argsort(-faults, kind="stable")[: SHOWN // 2]
         reasons = [f"{faults[index]:.0f} faults" for index in most]
         worst = list(zip(select_example_images(generated, most), reasons, strict=True))

@@ -1,7 +1,7 @@
-"""Compute the features that scores need, for scenes or for pictures of an .npz, as a Ray Data graph.
+"""Compute features of scenes, or of the pictures of an .npz, for the scores, with a Ray Data graph.
 
-Each part becomes a Parquet file with a row per scene. FEATURE_TYPES lists the columns. Finished parts are kept, so that
-an interrupted run resumes.
+Each part is written as a Parquet file with one row per scene. FEATURE_TYPES lists the columns. Finished parts are kept.
+An interrupted run therefore resumes with the missing parts.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from pipelines.schema.tables import Shard
 
 READER_CPUS = 0.5
 PICTURES_PER_PART = 512
-VERSION = 1  # Version of the features; files of another version are computed again.
+VERSION = 1  # Version of the features; files with another version are computed again.
 PICTURE_PX = 256  # Paper, Sec. 4.1, Metrics.
-# Types of the columns other than scene_id. Each cell is a row of numbers.
+# Types of the columns except scene_id. Each entry is a list of numbers.
 FEATURE_TYPES = {
     "statistics": np.float64,
     "histograms": np.uint32,
@@ -45,11 +45,11 @@ FEATURE_TYPES = {
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Options of the features.
+    """Options that determine the features.
 
     Attributes:
-        supersample: Each pixel of a picture is the mean of supersample^2 points.
-        inception: File of Inception weights; "" for none.
+        supersample: Square root of the number of points that are averaged per pixel.
+        inception: File with the Inception weights; "" means no Inception features.
     """
 
     supersample: int = 1
@@ -73,7 +73,7 @@ SceneSet = SceneSubset | ImageFile  # One side of a comparison.
 
 
 def compute_features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
-    """Compute the features of pictures (n, H, W, 3) uint8: random (n, 480), and Inception's if a network is given."""
+    """Compute random features (n, 480) of pictures (n, H, W, 3) uint8, and Inception features if a network is given."""
     named = {"random": inception.compute_random_features(pictures)}
     if network is not None:
         named |= inception.compute_inception_features(network, pictures)._asdict()
@@ -81,7 +81,7 @@ def compute_features(pictures: np.ndarray, network: inception.Inception | None) 
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
-    """Compute statistics, histograms, validity (n, 14) and label fidelity (n, 6), for the dataset's ground classes."""
+    """Compute layout statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes of a dataset."""
     slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
     for scene in scenes:
@@ -98,7 +98,7 @@ def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.nd
 def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
     """Return the label fidelity (3, 2) of a scene.
 
-    Zeros mean that the fidelity is not judged, because the scene has no label or the dataset is None.
+    All entries are zero if the scene has no label or the dataset is None.
     """
     if dataset is None or (scene.vegetation_density is None and scene.vehicle_density is None):
         return np.zeros((len(validity.LABEL_MEASURES), 2))
@@ -108,7 +108,7 @@ def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
 def compute_part(
     number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: FeatureConfig, directory: str
 ) -> dict:
-    """Compute and write the features of one part (rows of a shard), as a Ray task; return the number of its scenes."""
+    """Compute and write the features of one part (rows of a shard) in a Ray task; return the number of scenes."""
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
@@ -121,21 +121,22 @@ def compute_part(
 
 
 def load_network(looks: FeatureConfig) -> inception.Inception | None:
-    """Load the Inception network, if any. Each process loads the network once, and again if the file changes."""
+    """Load the Inception network, if weights are given. A process loads it once, and again if the file changes."""
     return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
 
 
 @lru_cache(maxsize=1)
 def load_cached_inception(path: str, *_: str | int) -> inception.Inception:
-    """Load the Inception network. The fingerprint of the file is the key of the cache."""
+    """Load the Inception network; the cache uses the fingerprint of the file as key."""
     return inception.load_inception(path)
 
 
 class ImageFeatureExtractor:
-    """Actor that computes and writes the features of one part, a range of pictures of an .npz.
+    """Actor that computes and writes the features of one part: a range of pictures of an .npz.
 
-    The input row holds the number of the part. The output row holds the number of its pictures. An actor reads the file
-    in order and skips the parts of other actors. For an earlier part, it reads the file from the beginning again.
+    The input row holds the number of the part. The output row holds the number of pictures in the part. An actor reads
+    the file in order and skips the parts that other actors compute. To go back to an earlier part, the actor starts
+    again at the beginning of the file.
     """
 
     def __init__(self, path: str, parts: list[range], looks: FeatureConfig, directory: str) -> None:
@@ -163,7 +164,7 @@ def make_part_path(directory: str, number: int) -> str:
 
 
 def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
-    """Write the file of a part: one row per scene with its id and its lists of numbers."""
+    """Write the file of a part: one row per scene, with the scene id and one list of numbers per column."""
     arrays = {"scene_id": pa.array(scene_ids, pa.string())}
     for name, values in columns.items():
         flat = pa.array(np.ascontiguousarray(values, FEATURE_TYPES[name]).ravel())
@@ -172,7 +173,7 @@ def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[
 
 
 def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
-    """Read all parts in order: scene_id (n,) and the columns (n, width)."""
+    """Read all parts in order; return scene_id (n,) and the other columns (n, width)."""
     table = pa.concat_tables([storage.read_parquet(make_part_path(directory, number)) for number in range(count)])
     described = {"scene_id": table["scene_id"].to_numpy()}
     for name in table.column_names[1:]:
@@ -189,16 +190,18 @@ def compute_scene_features(
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Compute the features of each scene of a side, or read the parts that `directory` already contains.
+    """Compute the features of each scene of a side; parts that exist in `directory` are read instead.
 
-    One Ray task computes the part of a shard. One actor call computes a part of PICTURES_PER_PART pictures.
+    For scenes, a part is a shard and is computed by one Ray task. For an .npz, a part has PICTURES_PER_PART pictures
+    and is computed by one actor call.
 
     Args:
         side: Scenes, or pictures of an .npz.
-        dataset: Dataset with the ground classes and label thresholds for scenes. Without a dataset, as for pictures,
-            only picture features are computed.
-        looks: Options of the features.
-        directory: Directory with a Parquet file per part. Files of another side or of other options are deleted.
+        dataset: Dataset with the ground classes and the thresholds of density labels. None: only picture features are
+            computed, as for an .npz.
+        looks: Options that determine the features.
+        directory: Directory with one Parquet file per part. Files that belong to another side or to other options are
+            deleted.
         num_actors: Maximum number of concurrent tasks or actors.
         on_scenes: Called with the number of scenes of each finished part.
 
@@ -246,7 +249,7 @@ def compute_scene_features(
 
 
 def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
-    """Load scenes by their numbers within a selection, in the order of `indices`."""
+    """Load the scenes at `indices` of a selection, in this order."""
     counts = np.array([len(rows) for _, rows in parts])
     starts = np.cumsum(counts) - counts
     scenes = {}
@@ -259,7 +262,7 @@ def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> li
 
 
 def make_options_record(looks: FeatureConfig) -> dict:
-    """Return the options that features depend on. The hash identifies the weights, so the file may be renamed."""
+    """Return the options that determine the features; a hash identifies the weights, instead of the file name."""
     return asdict(looks) | {
         "version": VERSION,
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",

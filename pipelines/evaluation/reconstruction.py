@@ -1,6 +1,6 @@
 """Evaluate layout-VAE reconstruction with Ray: actors encode and decode scenes, and tasks score them.
 
-The graph returns one record per scene. Records can be added, and one function computes the scores from their sum.
+The graph returns one record per scene. Records can be added, and one function computes the scores from the sum.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 from pipelines.training.latents import load_lvae
 
-Chunk = tuple[Shard, list[int]]  # A shard and rows of it.
+Chunk = tuple[Shard, list[int]]  # A shard and some of its rows.
 AP_VARIANTS = {
-    "ranked": {},  # All proposals are ranked by existence probability.
+    "ranked": {},  # Minimum existence probability for AP3D: all proposals are ranked.
     "ranked_100": {"max_detections": MAX_DETECTIONS},
     "threshold": {"min_score": EXISTENCE_THRESHOLD},
     "threshold_100": {"min_score": EXISTENCE_THRESHOLD, "max_detections": MAX_DETECTIONS},
@@ -77,7 +77,7 @@ SCENE_SCORES = pa.schema(
 
 
 def make_voxel_grid(spec: LayoutSpec, range_m: tuple[float, float] = VOXEL_RANGE_M) -> VoxelGrid:
-    """Make the paper's grid of 256 x 256 x 32 voxels over the scene, regardless of the raster resolution."""
+    """Make the paper's grid of 256 x 256 x 32 voxels, which covers the scene at any raster resolution."""
     return VoxelGrid(spec.with_resolution(VOXEL_PX).grid, *range_m)
 
 
@@ -87,10 +87,10 @@ def split_chunks(selection: SceneSubset, size: int) -> list[Chunk]:
 
 
 class Reconstructor:
-    """Actor that encodes and decodes one chunk per row.
+    """Actor that encodes and decodes scenes, one chunk per row.
 
-    The input row holds the number of a chunk. The output row holds the latent means and decoded layouts of its scenes,
-    stacked.
+    The input row holds the number of a chunk. The output row holds the stacked latent means and the stacked decoded
+    layouts of the scenes in the chunk.
     """
 
     def __init__(self, chunks: list[Chunk], lvae: str) -> None:
@@ -109,7 +109,7 @@ class Reconstructor:
 
 
 def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene, DecodedLayout, np.ndarray]]:
-    """Yield row of the shard, true scene, decoded layout and latent of each scene in a row from a Reconstructor."""
+    """Yield (row of the shard, true scene, decoded layout, latent) per scene in an output row of a Reconstructor."""
     shard, rows = chunks[row["id"]]
     for k, (number, scene) in enumerate(zip(rows, shard.scenes(rows), strict=True)):
         layout = DecodedLayout(**{name: row[name][k] for name in DecodedLayout.__dataclass_fields__})
@@ -118,18 +118,18 @@ def unstack_layouts(row: dict, chunks: list[Chunk]) -> Iterator[tuple[int, Scene
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The sums of one scene from which reconstruction scores are computed.
+    """Sums over one scene, from which reconstruction scores are computed.
 
     Attributes:
         ground: Ground sums at the resolution of the true scene.
-        raster: Ground sums at the resolution of the model, to which the true scene is resampled.
+        raster: Ground sums at the resolution of the model; the true scene is resampled.
         matches: Matched detections.
         pairs: Sums over matched primitives.
         confusion: (classes, classes) voxels.
         outside: Ground pixels and objects outside the voxel grid.
-        memory: Bytes of each of MEMORY.
-        labels: (measures, 2) label fidelity: whether the reconstruction has the label of the true scene; zeros if
-            unknown.
+        memory: Bytes of each representation of MEMORY.
+        labels: (measures, 2) label fidelity: whether the reconstruction and the true scene have the same label; zeros
+            if unknown.
     """
 
     ground: GroundSums
@@ -151,7 +151,7 @@ class SceneRecord:
 
     @classmethod
     def from_row(cls, row: dict) -> SceneRecord:
-        """Return the record of a row of flat arrays."""
+        """Make the record from a row of flat arrays."""
 
         def part(name: str, kind: type, **shapes: tuple[int, ...]):
             values = {field: np.asarray(row[f"{name}_{field}"]) for field in kind.__dataclass_fields__}
@@ -177,10 +177,10 @@ def make_scene_record(
     voxels: VoxelGrid,
     dataset: Dataset | None = None,
 ) -> SceneRecord:
-    """Compare a scene with its reconstruction, with the ground at the resolutions of the true scene and of the model.
+    """Compare a scene with its reconstruction. The ground is compared at the resolutions of the scene and of the model.
 
-    All true primitives count, including those without a slot. AP3D ranks all proposals. Pairs and voxels come from the
-    decoded scene, which contains the proposals above the existence threshold.
+    All true primitives count, including primitives without a slot. AP3D ranks all proposals. Pairs and voxels are
+    computed from the decoded scene, which contains only proposals above the existence threshold.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     rebuilt = decode_layout(layout, spec, truth)
@@ -205,7 +205,7 @@ def make_scene_record(
 def score_chunk(
     row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
 ) -> list[dict]:
-    """Compute one record per scene from a row of a Reconstructor."""
+    """Compute one record per scene from an output row of a Reconstructor."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
         | make_scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
@@ -214,7 +214,7 @@ def score_chunk(
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
-    """Render the pictures of each scene from a row of a Reconstructor, (H, W, 3) uint8, all of one size."""
+    """Render (H, W, 3) uint8 pictures of equal size of each scene from an output row of a Reconstructor."""
     out = []
     for _, scene, layout, _ in unstack_layouts(row, chunks):
         sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}
@@ -225,7 +225,7 @@ def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
 
 
 def reconstruct_chunks(chunks: list[Chunk], lvae: str, num_actors: int) -> ray.data.Dataset:
-    """Build the graph that reconstructs chunks, with one actor per GPU or CPU actors of READER_CPUS each."""
+    """Build the graph that reconstructs chunks, with one actor per GPU or with CPU actors that use READER_CPUS each."""
     per_actor, cluster = count_gpus_per_actor(), ray.cluster_resources()
     room = int(cluster.get("GPU", 0)) if per_actor else max(1, int(cluster.get("CPU", 1)))
     return map_dataset(
@@ -243,9 +243,9 @@ class Reconstruction:
     """Reconstruction scores of a dataset and of each scene.
 
     Attributes:
-        scores: Scores of the dataset as nested plain numbers.
-        scenes: Row of scores per scene, highest voxel mIoU first.
-        places: Chunk of one row for each scene, in the same order.
+        scores: Nested dictionary of the scores of the dataset.
+        scenes: One row of scores per scene, in order of decreasing voxel mIoU.
+        places: Location of each scene (a chunk with one row), in the order of `scenes`.
     """
 
     scores: dict
@@ -267,10 +267,10 @@ def evaluate_reconstruction(
     Args:
         selection: Scenes.
         lvae: Directory of the layout VAE.
-        num_actors: Maximum number of actors, each with a model.
+        num_actors: Maximum number of actors; each actor holds a model.
         batch_size: Maximum number of scenes per forward pass.
         voxel_range_m: Bottom and top of the voxel grid (m, scene frame).
-        dataset: Dataset with the thresholds of density labels. Without a dataset, label fidelity is not scored.
+        dataset: Dataset with the thresholds of density labels. None: label fidelity is not scored.
         on_scene: Called after each scene.
 
     Returns:
@@ -294,14 +294,15 @@ def evaluate_reconstruction(
     scores = compute_reconstruction_scores(records, spec, voxels)
     scores["memory_bytes"]["tables"] = measure_table_bytes(chunks)
     table = compute_scene_scores([row["scene_id"] for row in rows], records)
-    order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")  # Empty scenes, with NaN, are last.
+    # Empty scenes have NaN and are sorted to the end.
+    order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")
     return Reconstruction(scores, table.take(order), [(chunks[rows[k]["id"]][0], [int(rows[k]["row"])]) for k in order])
 
 
 def draw_scenes(
     places: list[Chunk], lvae: str, num_actors: int = 1, on_scene: Callable[[], None] | None = None
 ) -> list[dict]:
-    """Draw scenes and their reconstructions, each from above and in an oblique view, in the order of `places`."""
+    """Draw each scene of `places` and its reconstruction, from above and in an oblique view."""
     graph = flat_map_dataset(
         reconstruct_chunks(places, lvae, num_actors),
         draw_chunk,
@@ -317,7 +318,7 @@ def draw_scenes(
 
 
 def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, voxels: VoxelGrid) -> dict:
-    """Compute the scores over all scenes as nested plain numbers, with dictionaries of scores per class."""
+    """Return the scores over all scenes as a nested dictionary of numbers, including scores per class."""
     low, high = (list(getattr(spec.height_bounds_m, side)) for side in ("low", "high"))
     ground, raster = (
         compute_ground_scores(_sum(parts), spec.ground_classes, np.array([*low, *high]))
@@ -377,7 +378,7 @@ def _sum(parts: Iterable):
 
 
 def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa.Table:
-    """Return a row of scores per scene. An undefined score, such as a height error without ground, is null."""
+    """Return one row of scores per scene; undefined scores are null (e.g. height errors if there is no ground)."""
 
     def share(part: float, whole: float) -> float | None:
         return float(part / whole) if whole else None
@@ -408,7 +409,7 @@ def compute_scene_scores(scene_ids: list[str], records: list[SceneRecord]) -> pa
 
 
 def measure_table_bytes(chunks: list[Chunk]) -> float:
-    """Return the mean bytes per scene of the Parquet files with the scenes, primitives and rasters of the chunks."""
+    """Return the mean number of bytes per scene in the Parquet files of scenes, primitives and rasters."""
     total, scenes = 0.0, 0
     for shard, rows in chunks:
         written = sum(storage.measure_file_bytes(shard.path(table)) for table in ("scenes", "primitives", "rasters"))

@@ -1,4 +1,4 @@
-"""Measure how precision and recall depend on the number of reference scenes and on their selection by pose.
+"""Measure how precision and recall depend on the number of reference scenes and on the selection by pose.
 
 The paper studies this in its supplement (Precision and Recall Metrics, and the figure on sampling strategies).
 """
@@ -24,8 +24,8 @@ class ReferenceSet:
 
     Attributes:
         strategy: "farthest" or "apart".
-        setting: Number of scenes for "farthest", minimum distance in metres for "apart".
-        rows: (n,) rows of the real scenes.
+        setting: For "farthest", the number of scenes. For "apart", the minimum distance between scenes (m).
+        rows: (n,) indices of the selected real scenes.
     """
 
     strategy: str
@@ -36,10 +36,7 @@ class ReferenceSet:
 def list_references(
     xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
 ) -> Iterator[ReferenceSet]:
-    """Yield the reference sets of `least` to `most` scenes among poses (n, 2).
-
-    Sizes above the number of poses are skipped.
-    """
+    """Yield reference sets of `least` to `most` scenes, selected from poses (n, 2); sizes above n are skipped."""
     fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
     order = select_farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
     for size in fitting:
@@ -53,9 +50,9 @@ def list_references(
 def score_reference(
     reference: ReferenceSet, real: np.ndarray, generated: np.ndarray, labels: np.ndarray, k: Sequence[int]
 ) -> list[dict]:
-    """Score the features of a reference set against an equal number of generated scenes; return a row for each k.
+    """Score a reference set against the same number of generated scenes; return one row for each k.
 
-    The generated scenes are selected so that their labels occur equally often.
+    Each label occurs equally often among the selected generated scenes.
     """
     count = len(reference.rows)
     found = compute_neighbourhood_scores(real[reference.rows], generated[select_balanced(labels, count)], k)
@@ -70,7 +67,7 @@ def score_reference(
 
 
 def draw_sweep_charts(rows: Sequence[dict]) -> list[Chart]:
-    """Chart precision and recall over the number of scenes, with a chart per strategy as in the paper's figure."""
+    """Chart precision and recall over the number of scenes, one chart per strategy, as in the paper's figure."""
     charts = []
     for strategy, title in (
         ("apart", "Poses with a minimum distance"),
@@ -106,7 +103,7 @@ def build_sweep_table(rows: Sequence[dict]) -> Table:
 def render_sweep_html(rows: Sequence[dict], how: Sequence[str]) -> str:
     """Render the page."""
     sections = [Charts("Precision and recall", draw_sweep_charts(rows)), build_sweep_table(rows), Text("Method", how)]
-    return render_report_html("Precision and recall by reference set", sections)
+    return render_report_html("Precision and recall for each reference set", sections)
 
 
 def sweep_references(
@@ -117,7 +114,7 @@ def sweep_references(
     k: Sequence[int],
     on_reference: Callable[[], None] = lambda: None,
 ) -> list[dict]:
-    """Score all reference sets. Raises ValueError if there is none."""
+    """Score all reference sets. Raises ValueError if there is no reference set."""
     if not chosen:
         raise ValueError(
             f"no reference set fits {len(real)} real and {len(generated)} generated scenes; "

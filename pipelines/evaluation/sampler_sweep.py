@@ -1,4 +1,4 @@
-"""Compare scores by sampler and number of steps: rows, table, charts and page of `jobs/sweep_samplers.py`."""
+"""Build the rows, the table, the charts and the page of `jobs/sweep_samplers.py`, which compares samplers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
-# Scores of `compare_datasets`: keys, name in words, and better direction ("one" means close to 1).
+# Scores of `compare_datasets`: keys, display name and better direction ("one": close to 1 is better).
 MEASURES = {
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),
@@ -19,16 +19,16 @@ MEASURES = {
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
-    "count_ratio": (("count_ratio",), "most deviating count ratio of a category", "one"),
+    "count_ratio": (("count_ratio",), "count ratio of the category that differs most from 1", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
-COMMON = 3.0  # Minimum number of objects per scene; the counts of rarer categories vary too much.
+COMMON = 3.0  # Minimum number of objects per scene. Categories with fewer objects vary too much.
 
 
 def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
-    """Return the common category with the most deviating ratio of generated to real mean count, and this ratio.
+    """Return the common category whose ratio of generated to real mean count differs most from 1, and this ratio.
 
-    The result is None if no category has COMMON objects per real scene.
+    The result is None if no category has at least COMMON objects per real scene.
     """
     ratios = {}
     for name, sides in statistics.items():
@@ -38,14 +38,14 @@ def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
 
 
 def compute_deviation(ratio: float) -> float:
-    """Return the absolute logarithm of a ratio, which is 0 for a ratio of 1."""
+    """Return the absolute logarithm of a ratio; it is 0 for the ratio 1."""
     return abs(math.log(ratio)) if ratio > 0 else math.inf
 
 
 def make_sampler_row(
     sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
-    """Make the row of one setting: measures with intervals, and seconds per scene of one actor; None if unknown."""
+    """Make the row of one setting: measures with intervals, and seconds per scene and actor; None if unknown."""
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
@@ -59,7 +59,7 @@ def make_sampler_row(
 
 
 def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
-    """Return whether each measure of both rows is better than the reference or within the interval of the reference."""
+    """Return, for each measure of both rows, whether it is better than the reference or within its interval."""
 
     def good(name: str, better: str) -> bool:
         if row[name] is None or reference[name] is None:
@@ -73,12 +73,12 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
 
 
 def name_settings(row: Mapping) -> str:
-    """Return the name of the sampler, with the noise scaling if it is not 1."""
+    """Return the name of the sampler; a noise scaling other than 1 is appended."""
     return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] != 1 else "")
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row of the paper's sampler with the most steps, or of any sampler if the paper's is missing."""
+    """Return the row with the most steps: a row of the paper's sampler if there is one, otherwise of any sampler."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 
@@ -107,7 +107,7 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
 
 
 def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
-    """Make a chart per measure over the number of steps, with a series per sampler."""
+    """Make one chart per measure over the number of steps, with one series per sampler."""
     charts = []
     for name in CHARTED:
         series = {}
@@ -121,7 +121,7 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
 
 def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
     """Render the page. Each row of `pictures` shows the same `columns` scenes."""
-    note = "Each row shows one sampler and number of steps. All rows have the same scene numbers and labels."
+    note = "Each row shows one sampler and number of steps. The scene numbers and labels are the same in all rows."
     sections = [
         build_sampler_table(rows),
         Charts("Scores by number of steps", draw_sampler_charts(rows)),

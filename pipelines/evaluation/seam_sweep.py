@@ -1,4 +1,4 @@
-"""Compare the visibility of seams by steps, jump length, resamplings and guidance, for `jobs/sweep_seams.py`."""
+"""Compare seam visibility across steps, jump lengths, resamplings and guidance, for `jobs/sweep_seams.py`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.reporting.report import Picture, Pictures, Section, Table, Text, 
 
 
 def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
-    """Return the number of objects except vegetation per hectare of the area of the scenes."""
+    """Return the number of objects per hectare in the scenes; vegetation is not counted."""
     objects, area_m2 = 0, 0.0
     for scene in scenes:
         objects += int((~np.isin(scene.category, VEGETATION)).sum())
@@ -26,7 +26,7 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 def make_seam_row(
     repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
 ) -> dict:
-    """Make the row of one setting: options, cost per block, and each ratio with its interval; None if unknown."""
+    """Make the row of one setting: options, cost per block, and ratios with intervals. Unknown values are None."""
     row = {
         "steps": repaint.num_inference_steps,
         "jump_length": repaint.jump_length,
@@ -70,7 +70,7 @@ def build_seam_table(rows: Sequence[Mapping]) -> Table:
 
 
 def render_seam_sweep_html(rows: Sequence[Mapping], pictures: Sequence[Picture], how: Sequence[str]) -> str:
-    """Render the page. `pictures` are the first scene of each row."""
+    """Render the page. `pictures` show the first scene of each row."""
     meanings = [f"{name.replace('_', ' ').capitalize()}: {words}." for name, words in MEANINGS.items()]
     sections: list[Section] = [build_seam_table(rows), Pictures("Generated scenes", pictures, columns=3)]
     sections.append(Text("Method", [*how, *meanings]))

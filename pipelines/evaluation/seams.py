@@ -1,4 +1,4 @@
-"""Measure the seams of a source's scenes with Ray, and render the page."""
+"""Measure the seams in the scenes of a source with Ray, and render the page."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from pipelines.schema.tables import Shard
 
 BLOCK_M = 64.0  # Side of the middle block of an outpainted scene.
 MEANINGS = {
-    "class_changes": "share of pixel pairs across the line that differ in ground class",
-    "height_step": "mean height difference of the ground across the line",
-    "cut_objects": "share of objects at the line that end at the line",
-    "doubled_objects": "share of objects at the line that overlap an object of their category from the other side",
+    "class_changes": "share of pixel pairs across the line with different ground classes",
+    "height_step": "mean height difference of the ground at the line",
+    "cut_objects": "share of objects at the line that end there",
+    "doubled_objects": "share of objects at the line that overlap an object of the same category on the other side",
 }
 
 
 @dataclass(frozen=True)
 class SeamLines:
-    """Positions of seams; by default the edges of the middle block of a scene.
+    """Positions of seams; the default is the edges of the middle block of a scene.
 
     Attributes:
         rows_m: Distances of seams from the front edge of the scene (m).
@@ -55,14 +55,14 @@ class SeamLines:
 
 
 def find_middle_m(extent_m: float) -> tuple[float, ...]:
-    """Return the two edges of the middle block along an extent (m), or nothing if the extent is a single block."""
+    """Return the two edges of the middle block along an extent (m); return nothing if the extent is a single block."""
     margin_m = (extent_m - BLOCK_M) / 2
     return (margin_m, extent_m - margin_m) if margin_m > 0 else ()
 
 
 @dataclass(frozen=True, eq=False)
 class SeamMeasurement:
-    """Records of the seams of scenes.
+    """Records of the seams in scenes.
 
     Attributes:
         scene_ids: Scene ids.
@@ -76,7 +76,7 @@ class SeamMeasurement:
 
 
 def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines) -> list[dict]:
-    """Measure the seams of the selected scenes of one shard; return one row with a flat record per scene."""
+    """Measure the seams in the selected scenes of one shard; return one row with a flat record per scene."""
     shard, rows = parts[row["id"]]
     out = []
     for scene in shard.scenes(rows):
@@ -89,11 +89,11 @@ def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLi
 def measure_seams(
     selection: SceneSubset, lines: SeamLines, num_tasks: int, on_scene: Callable[[], None] = lambda: None
 ) -> SeamMeasurement:
-    """Measure the seams of a selection with one task per shard.
+    """Measure the seams in a selection of scenes, with one task per shard.
 
     Args:
         selection: Scenes.
-        lines: Positions of their seams.
+        lines: Positions of the seams.
         num_tasks: Maximum number of concurrent tasks.
         on_scene: Called after each scene.
 
@@ -121,7 +121,7 @@ def measure_seams(
 
 
 def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
-    """Return the ratios of each side per measure, and the numbers of scenes and seams of each side."""
+    """Return the ratio per measure, the number of scenes and the number of seams, each for both sides."""
     ratios = {side: estimate_seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
     return {
         "scenes": {side: len(found.scene_ids) for side, found in measured.items()},
@@ -131,7 +131,7 @@ def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
 
 
 def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
-    """Return a row per scene: side, scene_id, seams, and numerators and denominators of each measure."""
+    """Return one row per scene: side, scene_id, seams, and the numerator and denominator of each measure."""
     rows = []
     for side, found in measured.items():
         for scene_id, seams, record in zip(found.scene_ids, found.seams.tolist(), found.records.tolist(), strict=True):
@@ -144,7 +144,7 @@ def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
 
 
 def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
-    """Return the name of each measure and the formatted ratios of both sides."""
+    """Return, for each measure, its name and the formatted ratios of both sides."""
     return [
         (name.replace("_", " "), *(format_value(sides[side]) or "–" for side in ("generated", "real")))
         for name, sides in scores["ratios"].items()
@@ -152,7 +152,7 @@ def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
 
 
 def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray:
-    """Render the scene from above with marks at the ends of its seams: (H, W, 3) uint8."""
+    """Render the scene from above, with marks at the ends of the seams; return (H, W, 3) uint8."""
     picture = render_bev(scene, size_px, supersample=2).copy()
     scale = picture.shape[0] / scene.grid.rows
     tick = size_px // 24
@@ -165,7 +165,7 @@ def draw_lines(scene: Scene, lines: SeamLines, size_px: int = 512) -> np.ndarray
 
 
 def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines, count: int) -> str:
-    """Render the page: ratios with their meaning, and example scenes whose seams are marked at the edges."""
+    """Render the page: ratios and their meaning, and example scenes with marks at the ends of the seams."""
     parts = selection.shards()
     total = sum(len(rows) for _, rows in parts)
     scenes = load_scenes(parts, select_evenly(total, min(count, total)))

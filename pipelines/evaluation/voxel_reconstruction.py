@@ -1,7 +1,7 @@
-"""Score the reconstructed voxels of any method against true voxels on the full grid (paper, Sec. 4.1, Tab. 1) with Ray.
+"""Score reconstructed voxels of any method against true voxels on the full grid (paper, Sec. 4.1, Tab. 1) with Ray.
 
-True voxels come from voxel files, or from scenes of a dataset, which this module voxelises. Scores come from one
-confusion matrix, summed over all voxels of all scenes.
+True voxels are read from voxel files or computed from the scenes of a dataset. Scores are computed from one confusion
+matrix, which is summed over all voxels of all scenes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ SHOWN = 5  # Maximum number of names in an error message.
 SCENE_SCORES = pa.schema(
     [
         ("scene_id", pa.string()),
-        ("voxel_iou", pa.float64()),  # Null where both sides are empty.
+        ("voxel_iou", pa.float64()),  # Null if both sides are empty.
         ("voxel_miou", pa.float64()),
-        ("rebuilt_bytes", pa.int64()),  # Size of the file of the reconstruction.
-        ("stored_bytes", pa.int64()),  # Size of the method's stored representation; null if not given.
+        ("rebuilt_bytes", pa.int64()),  # Size of the reconstruction file.
+        ("stored_bytes", pa.int64()),  # Size of the representation that the method stores; null if it is not given.
     ]
 )
 
@@ -53,7 +53,7 @@ class VoxelPair:
         name: Scene id.
         truth: Location of the true voxels.
         rebuilt: URI of the reconstruction.
-        stored: URI of the method's stored representation; "" if not given.
+        stored: URI of the representation that the method stores; "" if it is not given.
     """
 
     name: str
@@ -63,7 +63,7 @@ class VoxelPair:
 
 
 def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]:
-    """Locate the scenes of a dataset directory (one split, or all), or the .npz files of a directory, by name."""
+    """Return the location of each scene by name, in a dataset (one split, or all) or in a directory of .npz files."""
     if storage.list_files(storage.join_uri(root, "scenes"), ".parquet"):
         shards = find_shards(root, split=split or None)
         ids = [shard.read("scenes", ["scene_id"])["scene_id"].to_pylist() for shard in shards]
@@ -81,7 +81,7 @@ def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]
 
 
 def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
-    """Return the URI by scene id of the files in a directory or of a pattern."""
+    """Return the URI of each file in a directory or of a pattern, by scene id."""
     base, files = find_files(pattern, suffix)
     return {make_scene_id(file): storage.join_uri(base, file) for file in files}
 
@@ -89,19 +89,20 @@ def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
 def pair_files(
     truth: dict[str, GroundTruthVoxels], rebuilt: dict[str, str], stored: dict[str, str] | None, partial: bool
 ) -> list[VoxelPair]:
-    """Pair the scenes that all sides have, by name.
+    """Pair the scenes that all sides contain, by scene id.
 
     Args:
         truth: True voxels by scene id.
         rebuilt: Files of the reconstructions by scene id.
-        stored: Files of the method's stored representation by scene id, if any.
-        partial: Whether scenes may be missing on some sides.
+        stored: Files of the representation that the method stores, by scene id, if there are such files.
+        partial: Whether scenes may be missing from some sides.
 
     Returns:
         Pairs in the order of the scene ids.
 
     Raises:
-        ValueError: No scene is common, or scenes are missing and `partial` is false. The message lists them.
+        ValueError: The sides have no common scene, or scenes are missing and `partial` is false. The message lists the
+            missing scenes.
     """
     sides = {"truth": truth, "reconstructions": rebuilt} | ({} if stored is None else {"stored files": stored})
     every, common = set().union(*sides.values()), set(truth).intersection(*sides.values())
@@ -116,7 +117,7 @@ def pair_files(
 
 
 def split_chunks(pairs: list[VoxelPair]) -> list[list[VoxelPair]]:
-    """Split pairs into chunks of at most CHUNK_SCENES. The true scenes of a chunk are in one shard."""
+    """Split pairs into chunks of at most CHUNK_SCENES; the true scenes of a chunk are in the same shard."""
     by_shard: dict[Shard | None, list[VoxelPair]] = {}
     for pair in pairs:
         by_shard.setdefault(pair.truth.shard, []).append(pair)
@@ -132,7 +133,7 @@ def load_true_voxels(chunk: list[VoxelPair], grid: VoxelGrid, axes: Axes) -> lis
 
 
 def score_chunk(row: dict, chunks: list[list[VoxelPair]], grid: VoxelGrid, axes: Axes, truth_axes: Axes) -> list[dict]:
-    """Compute, for each scene of a chunk, its flat confusion matrix and its bytes on disk."""
+    """Compute the flat confusion matrix and the bytes on disk of each scene of a chunk."""
     chunk = chunks[row["id"]]
     return [
         {
@@ -152,7 +153,7 @@ def score_voxels(
     truth_axes: Axes,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[dict, pa.Table]:
-    """Return the scores over all scenes as nested plain numbers, and a table with a row per scene, by name."""
+    """Return the scores over all scenes as a nested dictionary of numbers, and a table with one row per scene."""
     chunks = split_chunks(pairs)
     graph = flat_map_dataset(
         ray.data.range(len(chunks), override_num_blocks=len(chunks)),
@@ -185,7 +186,7 @@ def score_voxels(
 
 
 def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
-    """Return the voxel scores of one scene; None if both sides are empty."""
+    """Return the voxel scores of one scene, or None if both sides are empty."""
     if confusion.sum() == confusion[EMPTY, EMPTY]:
         return {"voxel_iou": None, "voxel_miou": None}
     scores = compute_voxel_scores(confusion)
@@ -193,5 +194,5 @@ def compute_scene_scores(confusion: np.ndarray) -> dict[str, float | None]:
 
 
 def spread_evenly(sizes: list[int]) -> dict[str, float]:
-    """Return mean, standard deviation, minimum and maximum of sizes (bytes)."""
+    """Return the mean, standard deviation, minimum and maximum of sizes (bytes)."""
     return {name: float(getattr(np, name)(sizes)) for name in ("mean", "std", "min", "max")}

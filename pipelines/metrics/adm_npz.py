@@ -1,9 +1,9 @@
 """Read and write pictures in ADM's .npz sample batches, and read the moments of its reference batches.
 
 ADM (guided-diffusion, evaluations/) keeps N pictures as array `arr_0`, uint8 (N, height, width, 3). Its reference
-batches also hold the moments of the whole dataset: `mu` and `sigma` of pool3 features, `mu_s` and `sigma_s` of spatial
-features. ADM's evaluator reads the files of `write_npz`. Pictures are read and written in batches, so that one batch is
-in memory at a time.
+batches also hold the moments of the whole dataset. `mu` and `sigma` belong to the pool3 features; `mu_s` and `sigma_s`
+belong to the spatial features. ADM's evaluator can read the files that `write_npz` writes. Pictures are read and
+written in batches. Only one batch is in memory at a time.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class ReferenceMoments(NamedTuple):
     """Mean and covariance of the features of an ADM reference batch.
 
     Attributes:
-        pool3: Moments of the pool3 features, 2048-d.
-        spatial: Moments of the spatial features, 2023-d. Other evaluators store `mu` and `sigma` only; then it is None.
+        pool3: Moments of the pool3 features (2048 dimensions).
+        spatial: Moments of the spatial features (2023 dimensions). None: the file holds only `mu` and `sigma`, as those
+            of other evaluators do.
     """
 
     pool3: StoredGaussian
@@ -43,7 +44,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; raise ValueError with the path for a missing, truncated or damaged file, also during reading."""
+    """Open an archive; if it is missing, truncated or damaged, raise ValueError with its path, also while reading."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
@@ -56,10 +57,10 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Open a C-ordered array: yield its stream at the first number, its shape and its type.
+    """Open a C-ordered array; yield a stream positioned at its first number, the shape and the type.
 
     Raises:
-        ValueError: The array is missing, pickled, in Fortran order or of the wrong size.
+        ValueError: The array is missing, is pickled, is in Fortran order or has the wrong size.
     """
     if f"{name}.npy" not in archive.namelist():
         raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
@@ -92,7 +93,7 @@ def read_picture_shape(path: str) -> tuple[int, int, int, int]:
         (N, height, width, 3).
 
     Raises:
-        ValueError: The file is missing, damaged or of another type. The message names the file.
+        ValueError: The file is missing, is damaged or has another type. The message names the file.
     """
     with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (_, shape, dtype):
         if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3:
@@ -113,11 +114,11 @@ def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
         Iterator of uint8 arrays (batch, height, width, 3); the last one may be shorter.
 
     Raises:
-        ValueError: The file is missing, truncated, of another type or pickled (raised immediately), or its checksum is
-            wrong (raised during reading). The message names the file.
+        ValueError: The file is missing, is truncated, has another type or is pickled (raised immediately), or its
+            checksum is wrong (raised while it is read). The message names the file.
     """
     if batch < 1:
-        raise ValueError(f"a batch holds at least 1 picture, got {batch}")
+        raise ValueError(f"a batch must hold at least 1 picture, got {batch}")
     return _iterate_batches(path, read_picture_shape(path), batch)
 
 
@@ -139,10 +140,10 @@ def read_reference_moments(path: str) -> ReferenceMoments | None:
         path: Local path or URI of the archive.
 
     Returns:
-        Moments, or None if the file holds pictures only.
+        Moments. None: the file holds only pictures.
 
     Raises:
-        ValueError: The moments are incomplete, of other sizes or not finite. The message names the file.
+        ValueError: The moments are incomplete, have unexpected sizes or are not finite. The message names the file.
     """
     with _open_npz(path) as archive:
         held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if f"{name}.npy" in archive.namelist()}
@@ -180,15 +181,15 @@ def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], p
 def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
     """Write an ADM sample batch, with one batch of pictures in memory at a time.
 
-    The file appears only when it is complete.
+    The file appears at its path only after it is complete.
 
     Args:
         path: Local path or URI of the new archive.
-        batches: uint8 arrays (n, height, width, 3) of one picture size.
+        batches: uint8 arrays (n, height, width, 3); all pictures have the same size.
         count: Total number of pictures.
 
     Raises:
-        ValueError: The batches differ in picture size, hold no pictures, or do not add up to `count` pictures.
+        ValueError: The pictures differ in size, there are no pictures, or their number is not `count`.
     """
     batches = iter(batches)
     first = next(batches, None)
@@ -198,8 +199,8 @@ def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
 
     def write(file) -> None:
         written = 0
-        # Compression reduces pictures in flat colours to a thirtieth of their size. zip64 must be chosen before the
-        # size of the entry is known, and an entry may exceed 2 GiB.
+        # Compression reduces pictures in flat colours to a thirtieth of their size. An entry may exceed 2 GiB and its
+        # size is not known at the start. The zip64 format is therefore always used.
         with (
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
             archive.open(f"{PICTURES}.npy", "w", force_zip64=True) as stream,
@@ -209,8 +210,8 @@ def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
             for pictures in chain([first], batches):
                 if pictures.dtype != np.uint8 or pictures.shape[1:] != size or len(size) != 3 or size[2] != 3:
                     raise ValueError(
-                        f"{path}: pictures must be uint8 (n, height, width, 3) of one size, got {pictures.dtype}"
-                        f" {pictures.shape} after {written} of {size}"
+                        f"{path}: expected uint8 pictures of shape (n, height, width, 3) and equal size, got"
+                        f" {pictures.dtype} {pictures.shape}; the {written} pictures before have size {size}"
                     )
                 written += len(pictures)
                 stream.write(np.ascontiguousarray(pictures).data)

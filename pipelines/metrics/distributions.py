@@ -1,9 +1,10 @@
-"""Describe layouts by histograms per scene, and measure the distance of two sources without pictures or weights.
+"""Describe each layout by histograms and measure the distance between two sources from them.
 
-A scene gives a vector of counts over fixed bins. The sum over the scenes of a source is the histogram of the source.
-Sums over resampled scenes give the confidence interval. Two histograms are compared by the Wasserstein distance in the
-unit of the histogram. If the bins have no order, the Jensen-Shannon divergence in bits replaces it. The bin width
-limits the resolution, so bins are narrow where objects are small.
+No pictures and no network weights are needed. Each scene is described by a vector of counts over fixed bins. The sum
+over the scenes of a source is the histogram of the source. The confidence interval is computed from sums over resampled
+scenes. Two histograms are compared by the Wasserstein distance, in the unit of the histogram. Histograms whose bins
+have no order are compared by the Jensen-Shannon divergence, in bits. The bin width limits the resolution, so bins are
+narrow where objects are small.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ PAIR_EDGES_M = np.geomspace(0.25, 100, 33)
 ROAD_DISTANCE_EDGES_M = np.linspace(0, 40, 41)
 ROAD_WIDTH_EDGES_M = np.linspace(0, 40, 81)
 NO_GROUND = "none"
-MIN_ROAD_WIDTH_M = 2.0  # Narrower widths come from rough borders of the road.
+MIN_ROAD_WIDTH_M = 2.0  # Smaller widths are artefacts of rough road borders.
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +33,8 @@ class Histogram:
 
     Attributes:
         name: Name of the histogram, such as pole.height_m.
-        edges: Edges of the bins (m). The end bins also count values beyond the outer edges. None for named bins.
-        bins: Names of the bins, if the bins have no order.
+        edges: Edges of the bins (m). The end bins also count values beyond the outer edges. None: the bins are named.
+        bins: Names of the bins, for bins that have no order.
     """
 
     name: str
@@ -45,7 +46,7 @@ class Histogram:
 
     @property
     def unit(self) -> str:
-        """Return the unit of distances between two such histograms."""
+        """Return the unit of the distance between two histograms of this type."""
         return "bits" if self.edges is None else "m"
 
     def count(self, values: np.ndarray) -> np.ndarray:
@@ -79,9 +80,9 @@ ENDS = np.cumsum([len(histogram) for histogram in HISTOGRAMS])
 def compute_scene_histograms(scene: Scene) -> np.ndarray:
     """Count the values of one scene over the bins of HISTOGRAMS.
 
-    Each category has four kinds of values: extents of the primitives, ground class under the centre, distance of the
-    centre from the nearest road pixel, and horizontal distance between the centres of each pair. A scene without road
-    has no distances to the road. The last histogram holds the widths of the road.
+    Each category has four kinds of values: the extents of the primitives, the ground class under each centre, the
+    distance of each centre from the nearest road pixel, and the horizontal distance between the two centres of each
+    pair. A scene without road has no distances to the road. The last histogram holds the widths of the road.
 
     Args:
         scene: Scene to describe.
@@ -120,16 +121,17 @@ def compute_pair_distances(xy_m: np.ndarray) -> np.ndarray:
 
 
 def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
-    """Measure the widths of the road along its middle.
+    """Measure the width of the road along its middle line.
 
-    The middle is the local maxima of the distance from the border of the road, and the width is twice that distance.
-    The edge of the scene is not a border.
+    The middle line consists of the local maxima of the distance from the border of the road. The width is twice that
+    distance. The edge of the scene does not count as a border.
 
     Args:
         scene: Scene with rasters of its ground classes.
 
     Returns:
-        (p,) widths (m), and (H, W) distance of each pixel from the road (m). The latter is None without road.
+        (p,) widths (m), and (H, W) distance of each pixel from the road (m). The distance is None if the scene has no
+        road.
     """
     road = np.zeros(scene.occupied.shape[1:], bool)
     if "road" in scene.ground_classes:
@@ -156,7 +158,8 @@ def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict
         generated: (m, bins) counts of generated scenes.
 
     Returns:
-        Distance by name of the histogram, in its unit. A histogram that is empty on either side has no entry.
+        Dictionary from the name of a histogram to the distance in the unit of the histogram. Histograms that are empty
+        in one of the sources have no entry.
     """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
@@ -173,14 +176,14 @@ def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict
 
 
 def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
-    """Compute the Wasserstein distance of the number of objects per scene, for each category.
+    """Compute the Wasserstein distance between the distributions of the number of objects per scene, for each category.
 
     Args:
-        real: (n, 11) objects of each category in real scenes.
-        generated: (m, 11) objects of each category in generated scenes.
+        real: (n, 11) number of objects of each category in real scenes.
+        generated: (m, 11) number of objects of each category in generated scenes.
 
     Returns:
-        Distance by category (objects).
+        Distance per category (number of objects).
     """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
@@ -193,20 +196,20 @@ def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str
 
 
 def normalize_histogram(counts: np.ndarray) -> np.ndarray:
-    """Scale each histogram to sum 1.
+    """Scale each histogram to a sum of 1.
 
     Args:
-        counts: (b, bins) histograms in rows.
+        counts: (b, bins) histograms, one per row.
 
     Returns:
-        (b, bins) rows of sum 1; NaN for a row of zeros.
+        (b, bins) rows with sum 1; a row of zeros becomes NaN.
     """
     total = counts.sum(axis=1, keepdims=True)
     return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
 
 
 def compute_wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Compute the Wasserstein-1 distance of distributions, with the mass of a bin at its middle.
+    """Compute the Wasserstein-1 distance of pairs of distributions; the mass of each bin lies at its middle.
 
     Args:
         p: (b, bins) distributions.
@@ -221,7 +224,7 @@ def compute_wasserstein(p: np.ndarray, q: np.ndarray, edges: np.ndarray) -> np.n
 
 
 def compute_jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Compute the Jensen-Shannon divergence of distributions.
+    """Compute the Jensen-Shannon divergence of pairs of distributions.
 
     Args:
         p: (b, bins) distributions.
@@ -236,7 +239,7 @@ def compute_jensen_shannon(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def compute_entropy_bits(p: np.ndarray) -> np.ndarray:
-    """Compute the entropy of distributions over the last axis; 0 log 0 is 0.
+    """Compute the entropy of distributions over the last axis; 0 log 0 counts as 0.
 
     Args:
         p: (..., bins) distributions.

@@ -1,7 +1,7 @@
-"""Compute the Frechet distance of two sets of features (paper, Sec. 4.1) from moments that can be added over parts.
+"""Compute the Frechet distance of two sets of features from their moments (paper, Sec. 4.1).
 
-All numbers are float64. Any features may be used, but only the distance of Inception's pool3 features may be called
-FID.
+The moments of parts of a set can be added. All numbers are float64. Any features may be used, but only the distance of
+Inception's pool3 features may be called FID.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 BLOCK_ROWS = 4096
-NEGLIGIBLE = 1e-6  # Singular values below this share of the largest one are rounding errors without influence.
+NEGLIGIBLE = 1e-6  # Singular values below this fraction of the largest one count as 0.
 
 
 def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray:
-    """Check features and convert them to floats; float32 is kept.
+    """Check features and convert them to floats; float32 features are not converted.
 
     Args:
         features: (n, d) features.
@@ -29,7 +29,7 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
         (n, d) features, float32 or float64.
 
     Raises:
-        ValueError: Features are not 2-d, have fewer than `at_least` rows, or are not finite.
+        ValueError: The features are not 2-d, have fewer than `at_least` rows, or are not finite.
     """
     features = np.asarray(features)
     features = features if features.dtype == np.float32 else features.astype(np.float64)
@@ -44,7 +44,7 @@ def check_features(features: np.ndarray, name: str, at_least: int) -> np.ndarray
 
 
 class StoredGaussian(NamedTuple):
-    """Mean and covariance of a set of features, as a file stores them.
+    """Mean and covariance of a set of features, read from a file.
 
     Attributes:
         mean: (d,) float64.
@@ -57,7 +57,7 @@ class StoredGaussian(NamedTuple):
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and scatter of a set of features. Moments of two sets add up to those of the union.
+    """Count, mean and scatter of a set of features. Moments can be added; the sum describes the union of the sets.
 
     Attributes:
         count: Number of samples.
@@ -82,7 +82,7 @@ class Moments:
 
     def __add__(self, other: Moments) -> Moments:
         if self.mean.shape != other.mean.shape:
-            raise ValueError(f"moments of {len(self.mean)} and {len(other.mean)} dimensions cannot be added")
+            raise ValueError(f"cannot add moments with different dimensions: {len(self.mean)} and {len(other.mean)}")
         count = self.count + other.count
         step = other.mean - self.mean
         mean = self.mean + step * (other.count / count)
@@ -90,7 +90,7 @@ class Moments:
         return Moments(count, mean, self.scatter + other.scatter + between)
 
 
-Gaussian = Moments | StoredGaussian  # Both have a mean (d,) and a covariance (d, d) of features.
+Gaussian = Moments | StoredGaussian  # Both types hold a mean (d,) and a covariance (d, d).
 
 
 def compute_moments(features: np.ndarray) -> Moments:
@@ -103,7 +103,7 @@ def compute_moments(features: np.ndarray) -> Moments:
         Moments of all samples.
 
     Raises:
-        ValueError: Features are empty, not 2-d or not finite.
+        ValueError: The features are empty, are not 2-d or are not finite.
     """
     features = check_features(features, "moment", at_least=1)
     starts = range(0, len(features), BLOCK_ROWS)
@@ -126,7 +126,7 @@ def compute_block_moments(features: np.ndarray) -> Moments:
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """Decomposition that gives the distance of two Gaussians with covariances A and B.
+    """Decomposition from which the distance of two Gaussians with covariances A and B is computed.
 
     With A = F F^T, AB has the eigenvalues s^2 of the symmetric matrix F^T B F = U s^2 U^T. Two symmetric eigenproblems
     replace a general matrix square root, whose result may be complex. Rank-deficient covariances are allowed.
@@ -148,10 +148,10 @@ def compute_transport(a: Gaussian, b: Gaussian) -> Transport:
         b: Gaussian with covariance B.
 
     Returns:
-        The decomposition that `Transport` describes.
+        Decomposition, as defined in `Transport`.
 
     Raises:
-        ValueError: The dimensions differ, or a side has fewer than 2 samples.
+        ValueError: The dimensions differ, or a set has fewer than 2 samples.
     """
     if a.mean.shape != b.mean.shape:
         raise ValueError(f"features have {len(a.mean)} and {len(b.mean)} dimensions; both sides need the same")
@@ -168,7 +168,7 @@ def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None
     Args:
         a: Gaussian with covariance A.
         b: Gaussian with covariance B.
-        between: Decomposition of A and B, if it is known already.
+        between: Decomposition of A and B. None: it is computed.
 
     Returns:
         Squared distance, at least 0.
@@ -179,17 +179,18 @@ def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None
 
 
 def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
-    """Return a matrix W (d, r) per side: the distance's derivative by the covariance of that side is I - W W^T.
+    """Return a matrix W (d, r) for each of the two sets, from which sample influences are computed.
 
-    With M = F^T B F = U s^2 U^T, the side of A has W W^T = (B F U) s^-3 (B F U)^T. The side of B has
-    W W^T = (F U) s^-1 (F U)^T, which equals A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
+    The derivative of the squared distance with respect to the covariance of a set is I - W W^T. Let
+    M = F^T B F = U s^2 U^T. W of A satisfies W W^T = (B F U) s^-3 (B F U)^T. W of B satisfies
+    W W^T = (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
 
     Args:
         b: Moments with covariance B.
         between: Decomposition of A and B.
 
     Returns:
-        W of A and W of B, each (d, r) with r the rank.
+        W of A and W of B, each (d, r), where r is the rank.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]
@@ -199,16 +200,16 @@ def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, 
 def compute_frechet_influence(
     features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray
 ) -> np.ndarray:
-    """Compute the first-order influence of each sample of one side on the Frechet distance.
+    """Compute the first-order influence of each sample of one set on the Frechet distance.
 
-    The mean influence over a resample approximates the change of the distance without bias. The Frechet distance of the
-    resample itself is biased upwards, like each Frechet distance of few samples.
+    The mean influence over a resample is an unbiased estimate of the change of the distance. The Frechet distance of
+    the resample itself is biased upwards, because few samples always cause this bias.
 
     Args:
-        features: (n, d) features of the side.
-        own: Moments of the side.
-        other_mean: (d,) mean of the other side.
-        through: (d, r) matrix W of the side, from `compute_influence_maps`.
+        features: (n, d) features of the set.
+        own: Moments of the set.
+        other_mean: (d,) mean of the other set.
+        through: (d, r) matrix W of the set, from `compute_influence_maps`.
 
     Returns:
         (n,) influences with mean 0.

@@ -1,8 +1,8 @@
-"""Compute Inception features with weights from a local file, and features of a random network without weights.
+"""Compute features of pictures with the Inception network or with a network with random weights.
 
-The network is TensorFlow's graph of 2015-12-05 (1008 classes) in plain torch; FID is defined by this network. The
-parameter names equal those of the converted weights of pytorch-fid and torch-fidelity, so that both files load. Nothing
-is downloaded: the user downloads the file once and passes its path.
+The Inception network is TensorFlow's graph of 2015-12-05 (1008 classes), written in PyTorch. FID is defined by this
+network. The parameters have the same names as in the weight files of pytorch-fid and torch-fidelity. Both files can
+therefore be loaded. The code downloads no weights: download the file once and pass its path.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's rele
 # The file of pytorch-fid has the same sha256.
 KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
 
-# A branch is a chain of convolutions (output channels, kernel height, kernel width). SPLIT ends a chain with two
-# parallel convolutions, 1x3 and 3x1. A chain of one step has the name of its branch; the steps of longer chains are
-# called name_1, name_2 and so on.
+# A branch is a chain of convolutions (output channels, kernel height, kernel width). A chain that ends in SPLIT has two
+# parallel convolutions at its end, 1x3 and 3x1. If a chain has only one step, the step is called like the branch. The
+# steps of longer chains are called name_1, name_2 and so on.
 SPLIT = "split"
 Chain = tuple[tuple[int, int, int] | str, ...]
 
@@ -63,12 +63,13 @@ CHAINS_7 = {
 
 
 class InceptionFeatures(NamedTuple):
-    """Features of n pictures: tensors from the network, float32 arrays from `compute_inception_features`.
+    """Features of n pictures. The network returns tensors; `compute_inception_features` returns float32 arrays.
 
     Attributes:
         pool3: (n, 2048) features for FID, precision and recall.
-        spatial: (n, 2023) features for ADM's sFID: the first 7 channels of mixed_6/conv, in order row, column, channel.
-        logits: (n, 1008) logits without the bias, as ADM's Inception score uses them.
+        spatial: (n, 2023) features for ADM's sFID: the first 7 channels of mixed_6/conv, in the order row, column,
+            channel.
+        logits: (n, 1008) logits without bias, as in ADM's Inception score.
     """
 
     pool3: Tensor | np.ndarray
@@ -79,8 +80,8 @@ class InceptionFeatures(NamedTuple):
 class Conv(nn.Module):
     """Convolution without bias, batch norm (eps 1e-3) and ReLU.
 
-    The output has the size of the input. With `reduce`, the convolution has stride 2 and no padding. Without `pad`, it
-    has stride 1 and no padding.
+    By default, the output has the same size as the input. With `reduce`, the convolution has stride 2 and no padding.
+    Without `pad`, it has stride 1 and no padding.
     """
 
     def __init__(self, inputs: int, outputs: int, height: int, width: int, reduce: bool = False, pad: bool = True):
@@ -102,16 +103,16 @@ class Conv(nn.Module):
 
 
 class Mixed(nn.Module):
-    """Inception block: parallel chains of convolutions and a pooled branch, concatenated along the channels.
+    """Inception block: parallel chains of convolutions and a pooling branch, concatenated along the channels.
 
-    With `pool_channels`, the pooling keeps the size and a 1x1 convolution follows. Without `pool_channels`, all
-    branches end in stride 2. Average pooling leaves out the padding, and block 7c pools by maximum. Both rules follow
-    the TensorFlow graph.
+    With `pool_channels`, the pooling keeps the size and is followed by a 1x1 convolution. Without `pool_channels`, the
+    last layer of each branch has stride 2. Average pooling ignores the padding, and block 7c uses maximum pooling. Both
+    rules follow the TensorFlow graph.
     """
 
     def __init__(self, inputs: int, chains: dict[str, Chain], pool_channels: int | None, max_pool: bool = False):
         super().__init__()
-        self.chains: list[list[list[str]]] = []  # Names of the parallel modules, per branch and step.
+        self.chains: list[list[list[str]]] = []  # Names of the parallel modules for each branch and step.
         self.reduce, self.max_pool = pool_channels is None, max_pool
         self.outputs = 0
         for branch, chain in chains.items():
@@ -160,10 +161,10 @@ class Mixed(nn.Module):
 
 
 class Inception(nn.Module):
-    """FID's Inception network: uint8 pictures (n, height, width, 3) to InceptionFeatures.
+    """Inception network of FID, which maps uint8 pictures (n, height, width, 3) to InceptionFeatures.
 
     Attributes:
-        weights_sha256: Hexadecimal sha256 of the weight file, or None before `load_inception` sets it.
+        weights_sha256: Hexadecimal sha256 of the weight file. None: `load_inception` has not set it.
     """
 
     weights_sha256: str | None = None
@@ -199,10 +200,11 @@ class Inception(nn.Module):
             Features as tensors.
 
         Raises:
-            ValueError: Pictures have another type or shape.
+            ValueError: The pictures have another type or shape.
         """
         if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[-1] != 3:
-            raise ValueError(f"Inception takes uint8 (n, height, width, 3), got {images.dtype} {tuple(images.shape)}")
+            found = f"{images.dtype} {tuple(images.shape)}"
+            raise ValueError(f"Inception needs uint8 pictures (n, height, width, 3), got {found}")
         x = images.permute(0, 3, 1, 2).to(self.fc.weight.dtype)
         x = (resize_like_tensorflow1(x, INPUT_SIZE) - 128) / 128  # n 3 299 299
         x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))  # n 64 147 147
@@ -211,7 +213,8 @@ class Inception(nn.Module):
         x = F.max_pool2d(x, 3, stride=2)  # n 192 35 35
         x = self.Mixed_5d(self.Mixed_5c(self.Mixed_5b(x)))  # n 288 35 35
         x = self.Mixed_6d(self.Mixed_6c(self.Mixed_6b(self.Mixed_6a(x))))  # n 768 17 17
-        # TensorFlow's mixed_6 is Mixed_6d here. Its first channels are branch1x1: TensorFlow's mixed_6/conv after ReLU.
+        # TensorFlow's mixed_6 is Mixed_6d here. The first channels are the output of branch1x1, which is TensorFlow's
+        # mixed_6/conv after ReLU.
         spatial = x[:, :SPATIAL_CHANNELS].permute(0, 2, 3, 1).flatten(1)
         x = self.Mixed_7c(self.Mixed_7b(self.Mixed_7a(self.Mixed_6e(x))))  # n 2048 8 8
         pool3 = x.mean(dim=(2, 3))
@@ -219,11 +222,11 @@ class Inception(nn.Module):
 
 
 def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
-    """Resize pictures bilinearly like TensorFlow 1's ResizeBilinear: without aligned corners, without half-pixel shift.
+    """Resize pictures bilinearly, like ResizeBilinear of TensorFlow 1.
 
-    Output pixel i reads input position i * (in / out). An enlarged picture is therefore shifted by half a pixel up and
-    left against torch's own resizing. Columns are resized before rows, as in TensorFlow, so that the rounding is the
-    same.
+    Corners are not aligned, and pixel centres have no half-pixel offset: output pixel i reads input position i * (in /
+    out). Compared with torch's resizing, an enlarged picture is shifted by half a pixel, up and to the left. Columns
+    are resized before rows to reproduce the rounding of TensorFlow.
 
     Args:
         x: (n, c, h, w) pictures.
@@ -246,8 +249,8 @@ def resize_like_tensorflow1(x: Tensor, size: int) -> Tensor:
 def load_inception(path: str | Path) -> Inception:
     """Load the Inception network with the weights of a local state dict.
 
-    A name such as that of KNOWN_FILE ends in the start of the file's sha256, which is checked. Weights other than the
-    published ones cause a warning.
+    A file name such as KNOWN_FILE contains the first digits of the sha256, and these digits are checked. A warning is
+    given if the weights are not the published weights.
 
     Args:
         path: File of type .pth, .pt or .safetensors.
@@ -256,7 +259,7 @@ def load_inception(path: str | Path) -> Inception:
         The network in evaluation mode.
 
     Raises:
-        ValueError: The file is missing or corrupted, or holds the weights of another network. The message names the
+        ValueError: The file is missing, is corrupted or holds the weights of another network. The message names the
             file.
     """
     path = Path(path)
@@ -280,7 +283,7 @@ def load_inception(path: str | Path) -> Inception:
 
 
 def hash_weights(path: str | Path) -> str:
-    """Return the sha256 of a weight file, hexadecimal.
+    """Return the hexadecimal sha256 of a weight file.
 
     Args:
         path: Weight file.
@@ -289,7 +292,7 @@ def hash_weights(path: str | Path) -> str:
         64 hexadecimal digits.
 
     Raises:
-        ValueError: The file is missing, or its name states another sha256.
+        ValueError: The file is missing, or its name contains a different sha256.
     """
     path = Path(path)
     if not path.is_file():
@@ -298,7 +301,7 @@ def hash_weights(path: str | Path) -> str:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     if claimed and not sha256.startswith(claimed[1]):
-        raise ValueError(f"{path}: corrupted, its sha256 starts with {sha256[:8]} instead of {claimed[1]}")
+        raise ValueError(f"{path}: file is corrupted; its sha256 starts with {sha256[:8]}, expected {claimed[1]}")
     return sha256
 
 
@@ -312,7 +315,7 @@ def describe_weights(path: str | Path) -> str:
         One sentence.
 
     Raises:
-        ValueError: The file is missing, or its name states another sha256.
+        ValueError: The file is missing, or its name contains a different sha256.
     """
     sha256 = hash_weights(path)
     known = sha256 == KNOWN_SHA256
@@ -333,7 +336,7 @@ def compute_inception_features(network: Inception, images: np.ndarray, batch_siz
         Features as float32 arrays: pool3 (n, 2048), spatial (n, 2023) and logits (n, 1008).
     """
     device = network.fc.weight.device
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 keeps 10 of 23 bits.
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 keeps only 10 of the 23 mantissa bits.
         parts = [network(batch.to(device)) for batch in _iterate_batches(images, batch_size)]
     if not parts:
         return InceptionFeatures(*(np.empty((0, size), np.float32) for size in (FEATURES, SPATIAL_FEATURES, CLASSES)))
@@ -341,10 +344,11 @@ def compute_inception_features(network: Inception, images: np.ndarray, batch_siz
 
 
 def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128, 256)) -> nn.Sequential:
-    """Build a small untrained convolutional network with fixed weights: stride-2 3x3 convolutions (He) and ReLU.
+    """Build a small convolutional network with random weights that depend only on the seed.
 
-    The network serves tests and comparisons of sources without Inception weights. Distances of its features have names
-    such as `random_frechet`, never FID. Weights come from numpy's legacy generator, whose random stream never changes.
+    The network consists of 3x3 convolutions with stride 2 (He initialisation) and ReLU. Use it in tests, and to compare
+    sources if Inception weights are not available. Distances between its features have names such as `random_frechet`,
+    never FID. Weights come from numpy's legacy generator, whose random stream never changes.
 
     Args:
         seed: Seed of the weights.
@@ -368,8 +372,8 @@ def make_random_network(seed: int = 0, channels: tuple[int, ...] = (32, 64, 128,
 def compute_random_features(images: np.ndarray, seed: int = 0, batch_size: int = 32) -> np.ndarray:
     """Compute the features of pictures under `make_random_network(seed)`.
 
-    The features are the means over the picture after each convolution (32 + 64 + 128 + 256 channels). They cover coarse
-    and fine structure.
+    The features are the channel means over the picture after each convolution (32 + 64 + 128 + 256 channels). They
+    describe both coarse and fine structure.
 
     Args:
         images: (n, height, width, 3) uint8 pictures.

@@ -11,19 +11,19 @@ SPLIT_SAMPLES = 5000  # Samples per split, as in ADM's evaluator.
 
 
 def compute_inception_score(logits: np.ndarray) -> Estimate:
-    """Compute exp of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
+    """Compute the exponential of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
 
-    The mean divergence is the entropy of the mean minus the mean entropy. A resample therefore costs one product of its
-    weights with p.
+    The mean divergence is the entropy of the mean distribution minus the mean entropy. The score of a resample
+    therefore needs only one product of its weights with p.
 
     Args:
-        logits: (n, classes) logits pool3 @ W **without the bias**, as in ADM.
+        logits: (n, classes) logits pool3 @ W **without bias**, as in ADM.
 
     Returns:
         Score with its 95 % interval.
 
     Raises:
-        ValueError: Logits are empty, not 2-d or not finite.
+        ValueError: The logits are empty, are not 2-d or are not finite.
     """
     logits = check_features(logits, "logit", at_least=1).astype(np.float64)
     logits -= logits.max(axis=1, keepdims=True)
@@ -38,7 +38,7 @@ def compute_inception_score(logits: np.ndarray) -> Estimate:
 
 
 def compute_entropy(p: np.ndarray) -> np.ndarray:
-    """Compute the entropy of the distributions in the last axis; 0 log 0 is 0.
+    """Compute the entropy of distributions over the last axis; 0 log 0 counts as 0.
 
     Args:
         p: (..., classes) distributions.

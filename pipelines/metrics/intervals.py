@@ -1,8 +1,9 @@
 """Compute 95 % confidence intervals by the bootstrap: resample scenes with replacement and recompute the score.
 
-A draw (one resample) is the number of times that each scene is sampled. A score that is a sum over scenes is therefore
-one matrix product for all draws. Row 0 is the original sample. Its score is the value, and the scores of the other rows
-give the interval. The same number of scenes and the same key give the same draws.
+One resample is called a draw. It is stored as a row that counts how often each scene is sampled. If a score is a sum
+over scenes, one matrix product computes the score of all draws. Row 0 is the original sample, and its score is the
+value of the estimate. The interval is computed from the scores of the other rows. The draws depend only on the number
+of scenes and the key.
 """
 
 from __future__ import annotations
@@ -35,11 +36,10 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
 
     Args:
         count: Number of scenes.
-        key: Part of the seed. Each side of a comparison has its own key, so that the draws of both sides are
-            independent.
+        key: Part of the seed. The two sides of a comparison use different keys to make their draws independent.
 
     Returns:
-        (1 + DRAWS, count) float64 number of times each scene is sampled: ones in row 0, then the draws.
+        (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 holds ones; the draws follow.
     """
     random = np.random.default_rng([count, key])
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
@@ -49,7 +49,7 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
 
 
 def compute_weights(count: int, key: int = 0) -> np.ndarray:
-    """Return `draw_resamples` scaled to rows of sum 1.
+    """Return the rows of `draw_resamples`, scaled to a sum of 1.
 
     Args:
         count: Number of scenes.
@@ -62,10 +62,11 @@ def compute_weights(count: int, key: int = 0) -> np.ndarray:
 
 
 def make_estimate(scores: np.ndarray) -> Estimate:
-    """Make an estimate from the scores of all rows of draws.
+    """Make an estimate from the score of the original sample and the scores of all draws.
 
     Args:
-        scores: (1 + DRAWS,) scores. The first is that of the original sample; draws with score NaN are ignored.
+        scores: (1 + DRAWS,) scores. The first score belongs to the original sample. Draws whose score is NaN are
+            ignored.
 
     Returns:
         Score with its 95 % interval.
@@ -89,10 +90,10 @@ def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
 
 
 def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
-    """Estimate the ratio of the column sums of two arrays with a row per scene.
+    """Estimate the ratio of the column sums of two arrays that have one row per scene.
 
-    A ratio can be a share of objects: objects at fault over all objects. A ratio can be a mean over the scenes that
-    have a value: sum of values over their number.
+    One use is a share of objects: the number of faulty objects divided by the number of all objects. Another use is the
+        mean over those scenes that have a value: the sum of the values divided by their number.
 
     Args:
         numerators: (n, m) numerators.
@@ -100,7 +101,7 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
         key: Part of the seed.
 
     Returns:
-        m ratios with 95 % intervals; None where the denominators sum to 0.
+        m ratios with 95 % intervals. None: the denominators sum to 0.
     """
     drawn = draw_resamples(len(numerators), key)
     above, below = (drawn @ np.asarray(part, np.float64) for part in (numerators, denominators))
@@ -111,11 +112,11 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
 def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> Estimate:
     """Estimate a score from the influences of all samples on it.
 
-    The first-order change of the score under a resample is the mean influence of the resample, summed over the sides.
+    To first order, a resample changes the score by the mean influence of its samples, summed over the sides.
 
     Args:
         value: Score of the original sample.
-        influences: (n,) influence of each sample, per side.
+        influences: (n,) influences of the samples, one array for each side.
 
     Returns:
         Score with its 95 % interval.

@@ -1,4 +1,4 @@
-"""Compute the kernel distance of two sets of features: unbiased squared MMD, cubic kernel (Binkowski et al. 2018).
+"""Compute the kernel distance: the unbiased squared MMD with a cubic kernel (Binkowski et al. 2018).
 
 Only the kernel distance of Inception's pool3 features may be called KID.
 """
@@ -14,11 +14,11 @@ GROUP_SAMPLES = 1000  # Samples per group; published KIDs usually use subsets of
 
 
 def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    """Estimate the squared MMD with k(x, y) = (x . y / d + 1)^3, averaged over groups of about 1000 samples per side.
+    """Estimate the squared MMD with kernel (x . y / d + 1)^3, averaged over groups of about 1000 samples per side.
 
-    Each sample belongs to one group. The common estimate uses 50 or 100 random subsets of 1000 samples; the expectation
-    is the same. Bootstrap draws are made within groups. Two draws of the same sample are not a pair, because the kernel
-    of a sample with itself would bias the estimate.
+    Each sample belongs to one group. The common estimate uses 50 or 100 random subsets of 1000 samples. Both estimates
+    have the same expectation. Bootstrap draws are made within groups. A sample that is drawn twice is not paired with
+    itself, because such a pair would bias the estimate.
 
     Args:
         real: (n, d) features, n >= 2.
@@ -28,13 +28,13 @@ def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate
         Distance with its 95 % interval.
 
     Raises:
-        ValueError: Features have unequal dimensions, fewer than 2 samples or infinite numbers.
+        ValueError: The features have different dimensions, fewer than 2 samples or numbers that are not finite.
     """
     real, generated = require_comparable(real, generated, at_least=2)
     groups = max(1, min(len(real), len(generated)) // GROUP_SAMPLES)
     scores = []
     for group in range(groups):
-        # A stride of `groups` puts neighbouring samples of a drive into different groups.
+        # Neighbouring samples of a drive fall into different groups, because the stride is `groups`.
         x, y = (side[group::groups].astype(np.float64) for side in (real, generated))
         drawn = [compute_weights(len(z), key=2 * group + k) for k, z in enumerate((x, y))]
         within = [sum_pairs(w, compute_kernel(z, z)) for w, z in zip(drawn, (x, y), strict=True)]
@@ -44,7 +44,7 @@ def compute_kernel_distance(real: np.ndarray, generated: np.ndarray) -> Estimate
 
 
 def compute_kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the cubic kernel of all pairs of samples.
+    """Compute the cubic kernel for all pairs of samples.
 
     Args:
         x: (n, d) features.
@@ -64,7 +64,7 @@ def sum_pairs(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
         gram: (n, n) kernel matrix.
 
     Returns:
-        (b,) means; NaN if a draw holds one sample only.
+        (b,) means; NaN if a draw holds only one distinct sample.
     """
     own = np.square(weights)
     total = ((weights @ gram) * weights).sum(axis=1) - own @ np.diag(gram)

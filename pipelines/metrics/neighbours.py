@@ -1,10 +1,10 @@
-"""Compute precision, recall, density and coverage from nearest neighbours of features, exactly and fast.
+"""Compute exact precision, recall, density and coverage from the nearest neighbours of features.
 
-The method filters pairs by a bound and verifies the remaining pairs. A short vector holds the first principal
-coordinates of a feature vector and the length of its residual. The distance of short vectors is a lower bound of the
-true distance, and a float32 matrix product computes it. Only undecided pairs need the true distance, which is computed
-in float64 by differences. The results equal those of the full float64 distance matrix, including ties, in a fraction of
-its time and memory.
+The method first discards pairs by a bound on their distance, then verifies the remaining pairs. Each feature vector has
+a short vector, which holds its first principal coordinates and the length of the residual. The distance of two short
+vectors is a lower bound of the true distance. A float32 matrix product computes this bound. Only undecided pairs need
+the true distance, which is computed from differences in float64. The results, including ties, are the same as with the
+full float64 distance matrix. Time and memory are a fraction.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from torch import Tensor
 from pipelines.metrics.frechet import check_features
 
 BLOCK_ROWS = 1024  # Rows per block of the distance matrix; a block takes 4 kB per column.
-SPARE_NEIGHBOURS = 8  # Additional candidates, whose upper bounds limit the distance of the k-th neighbour.
+SPARE_NEIGHBOURS = 8  # Additional candidates; their upper bounds limit the k-th distance.
 PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances: 2 MB at 2048-d, which fits into a processor cache.
-BASIS_SAMPLES = 512  # Samples from which the principal axes are computed.
-KEPT_VARIANCE = 0.997  # Share of the variance in the axes. More axes slow the filter; fewer leave more pairs to verify.
-MOST_LEFT_OVER = 0.02  # Maximum share of the total variance in the residual; above it, the filter uses whole features.
+BASIS_SAMPLES = 512  # Number of samples from which the principal axes are computed.
+KEPT_VARIANCE = 0.997  # Share of the variance that the axes hold. With more axes, fewer pairs are verified.
+MOST_LEFT_OVER = 0.02  # Maximum share of variance in the residual; otherwise, whole features are used.
 FLOAT32_ROUNDING = 2.0**-24
 
 
 @dataclass(frozen=True)
 class NeighbourhoodScores:
-    """Precision, recall, density and coverage at one neighbourhood size.
+    """Precision, recall, density and coverage for one neighbourhood size.
 
-    The ball of a sample is centred at the sample and extends to its k-th nearest other sample of the same side.
-    Precision and recall follow Kynkaanniemi et al. 2019 and the supplement of the paper. Density and coverage follow
-    Naeem et al. 2020.
+    The ball of a sample is centred at the sample. Its radius is the distance to the k-th nearest other sample of the
+    same side. Precision and recall follow Kynkaanniemi et al. 2019 and the supplement of the paper. Density and
+    coverage follow Naeem et al. 2020.
 
     Attributes:
         k: Neighbourhood size.
@@ -59,7 +59,7 @@ class NeighbourhoodScores:
 
     @property
     def density(self) -> float:
-        """Return the mean number of balls of real samples that contain a generated sample, over k. It may exceed 1."""
+        """Return 1 / k times the mean number of real balls that contain a generated sample; it may exceed 1."""
         return float(self.in_real.mean() / self.k)
 
     @property
@@ -70,11 +70,11 @@ class NeighbourhoodScores:
 
 @dataclass(frozen=True, eq=False)
 class PrincipalBasis:
-    """Principal axes of samples of both sides.
+    """Principal axes of the samples of both sides together.
 
     Attributes:
         mean: (d,) float64 mean of the samples.
-        axes: (p, d) float64 orthonormal rows. None means all axes of the features themselves.
+        axes: (p, d) float64 orthonormal rows. None: the features themselves are used.
     """
 
     mean: np.ndarray
@@ -87,11 +87,13 @@ class FeatureSet:
 
     Attributes:
         features: (n, d) features.
-        left: (n, p + 3) float32. left[i] . right[j] is the squared distance of the short vectors of i and j.
-        right: (n, p + 3) float32.
+        left: (n, p + 3) float32 left factors. left[i] . right[j] is the squared distance of the short vectors of i and
+            j.
+        right: (n, p + 3) float32 right factors.
         length: (n,) length of the short vector of each sample.
-        rest: (n,) length of the residual, which the axes do not represent.
-        slack: (n,) bound of the rounding error of a product. The bounds of both samples of a pair are added.
+        rest: (n,) length of the residual, the part outside the axes.
+        slack: (n,) contribution of each sample to the rounding error of a product. The error of a pair is at most the
+            sum of two contributions.
     """
 
     features: np.ndarray
@@ -117,7 +119,7 @@ def prepare_features(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) 
         Feature sets of the real and the generated side.
 
     Raises:
-        ValueError: Features are not finite or of unequal width, or a side has max(k) samples or fewer.
+        ValueError: The features are not finite or differ in width, or a side has at most max(k) samples.
     """
     real, generated = require_comparable(real, generated, at_least=check_k(k) + 1)
     basis = compute_principal_axes(real, generated)
@@ -135,8 +137,8 @@ def compute_neighbourhoods(
 ) -> list[NeighbourhoodScores]:
     """Compute NeighbourhoodScores for each neighbourhood size (paper, supplement, Evaluation).
 
-    The paper's protocol has n = m; other sizes are allowed. The memory besides the features is BLOCK_ROWS x max(n, m)
-    float32.
+    The paper's protocol has n = m; other sizes are allowed. In addition to the features, memory for BLOCK_ROWS x max(n,
+    m) float32 numbers is needed.
 
     Args:
         real: (n, d) features.
@@ -147,7 +149,7 @@ def compute_neighbourhoods(
         Scores in the order of k.
 
     Raises:
-        ValueError: Features are not finite or of unequal width, or a side has max(k) samples or fewer.
+        ValueError: The features are not finite or differ in width, or a side has at most max(k) samples.
     """
     sides = prepare_features(real, generated, k)
     radii = [compute_ball_radii(side, range(len(side)), k) for side in sides]
@@ -157,7 +159,7 @@ def compute_neighbourhoods(
 def judge_neighbours(
     k: Sequence[int], parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> list[NeighbourhoodScores]:
-    """Compute NeighbourhoodScores for each k from the results of `find_within` for all parts of the real samples.
+    """Merge the results of `find_within` for all parts of the real samples into NeighbourhoodScores for each k.
 
     Args:
         k: Neighbourhood sizes.
@@ -179,10 +181,10 @@ def check_k(k: Sequence[int]) -> int:
         k: Neighbourhood sizes.
 
     Returns:
-        Maximum of k.
+        Largest element of k.
 
     Raises:
-        ValueError: There is no size, or a size is below 1.
+        ValueError: k is empty, or a neighbourhood size is less than 1.
     """
     if not k or min(k) < 1:
         raise ValueError(f"k must name neighbourhood sizes of at least 1, got {list(k)}")
@@ -198,14 +200,16 @@ def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -
         at_least: Minimum number of samples per side.
 
     Returns:
-        Both sides, float32 or float64.
+        Features of both sides, float32 or float64.
 
     Raises:
-        ValueError: Features are not 2-d, not finite or of unequal width, or a side has too few samples.
+        ValueError: The features are not 2-d, are not finite or differ in width, or a side has too few samples.
     """
     real, generated = check_features(real, "real", at_least), check_features(generated, "generated", at_least)
     if real.shape[1] != generated.shape[1]:
-        raise ValueError(f"real features have {real.shape[1]} dimensions, generated {generated.shape[1]}")
+        raise ValueError(
+            f"real features have {real.shape[1]} dimensions, but generated features have {generated.shape[1]}"
+        )
     return real, generated
 
 
@@ -213,7 +217,7 @@ def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -
 
 
 def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> PrincipalBasis:
-    """Compute the principal axes that hold KEPT_VARIANCE of evenly spaced samples of both sides.
+    """Compute principal axes of evenly spaced samples of both sides, which hold KEPT_VARIANCE of the variance.
 
     Args:
         real: (n, d) features.
@@ -227,7 +231,8 @@ def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> Principal
     some = some.astype(np.float64)
     mean = some.mean(axis=0)
     centred = some - mean
-    # The eigenproblem of samples x samples is far smaller than a decomposition of `centred`. Values are ascending.
+    # The eigenproblem of the samples x samples matrix is much smaller than a decomposition of `centred`. The
+    # eigenvalues are ascending.
     strength, vectors = np.linalg.eigh(centred @ centred.T)
     held = np.cumsum(strength[::-1].clip(0))
     count = 1 + int(np.searchsorted(held, KEPT_VARIANCE * held[-1]))
@@ -239,8 +244,8 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
     """Compute the short vectors of features for the filter.
 
     For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2. The length |r - r'| lies between the difference
-    and the sum of |r| and |r'|. With v = (c, |r|), one product gives the bound: (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v
-    - v'|^2.
+    and the sum of |r| and |r'|. With v = (c, |r|), one product of vectors gives the bound:
+    (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2.
 
     Args:
         features: (n, d) features.
@@ -263,7 +268,7 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
         left[rows, :-2], right[rows, :-2] = -2 * short, short
     left[:, -2], left[:, -1], right[:, -2], right[:, -1] = norm, 1, 1, norm
     # For a product of t terms, |rounding| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2) with unit rounding u. The bound
-    # uses t + 4 instead of t to include the rounding of the terms themselves.
+    # uses t + 4 instead of t, because the terms themselves are rounded too.
     slack = 2 * (width + 6) * FLOAT32_ROUNDING * norm
     return FeatureSet(features, left, right, np.sqrt(norm), rest, slack)
 
@@ -272,18 +277,18 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
 
 
 def compute_ball_radii(side: FeatureSet, rows: range, k: Sequence[int]) -> np.ndarray:
-    """Compute the squared distance of samples to their k-th nearest other sample of the same side.
+    """Compute the squared distance of samples to the k-th nearest other sample of the same side.
 
     Args:
         side: Samples of one side.
-        rows: Samples to compute.
+        rows: Samples whose radii are computed.
         k: Neighbourhood sizes.
 
     Returns:
         (len(k), len(rows)) squared radii.
 
     Raises:
-        ValueError: There is no size, or a size is below 1.
+        ValueError: k is empty, or a neighbourhood size is less than 1.
     """
     radii = np.empty((len(k), len(rows)))
     for block in iterate_blocks(rows):
@@ -296,14 +301,14 @@ def compute_ball_radii(side: FeatureSet, rows: range, k: Sequence[int]) -> np.nd
 def find_nearest(
     side: FeatureSet, others: FeatureSet, rows: range, count: int, themselves: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbours of samples in another set. Of equal distances, the lower index comes first.
+    """Find the nearest neighbours of samples in another set. If distances are equal, the lower index comes first.
 
     Args:
-        side: Set of the samples.
-        others: Set of the neighbours.
+        side: Set that contains the samples.
+        others: Set that contains the neighbours.
         rows: Samples of `side`.
         count: Number of neighbours per sample.
-        themselves: Whether both sets are the same; then no sample is its own neighbour.
+        themselves: Whether both sets are the same. If so, a sample is not its own neighbour.
 
     Returns:
         (rows, count) squared distances, ascending, and (rows, count) indices of the neighbours.
@@ -327,18 +332,18 @@ def find_nearest(
 def find_within(
     real: FeatureSet, generated: FeatureSet, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the samples that lie within the balls of the other side, for some of the real samples.
+    """Find the samples that lie within balls of the other side, restricted to some of the real samples.
 
     Args:
         real: Real samples.
         generated: Generated samples.
         real_radii: (len(k), n) squared radii.
         generated_radii: (len(k), m) squared radii.
-        rows: Real samples to judge.
+        rows: Real samples to consider.
 
     Returns:
-        in_real (len(k), m): number of balls of `rows` that contain each generated sample, to be summed over parts;
-        in_generated and covered (len(k), len(rows)).
+        in_real (len(k), m), in_generated and covered (both (len(k), len(rows))). in_real counts the balls of `rows`
+        that contain each generated sample; sum it over the parts.
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))
@@ -365,7 +370,7 @@ def find_within(
 
 
 def compute_squared_distances(a: np.ndarray, i: np.ndarray, b: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Compute squared distances in float64 by differences. The result is bit-identical if the sides are swapped.
+    """Compute squared distances in float64 from differences. Swapping the sides does not change any bit of the result.
 
     Args:
         a: (n, d) features.
@@ -391,7 +396,7 @@ def round_up_float32(values: np.ndarray) -> Tensor:
         values: float64 values.
 
     Returns:
-        Smallest float32 values that are not below the given ones.
+        The smallest float32 values that are not less than the input values.
     """
     rounded = values.astype(np.float32)
     return torch.from_numpy(np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded))
@@ -404,6 +409,6 @@ def iterate_blocks(rows: range) -> list[range]:
         rows: Rows.
 
     Returns:
-        Consecutive ranges; the last may be shorter.
+        Consecutive ranges; the last range may be shorter.
     """
     return [range(start, min(start + BLOCK_ROWS, rows.stop)) for start in range(rows.start, rows.stop, BLOCK_ROWS)]

@@ -1,7 +1,7 @@
-"""Score reconstructions: ground, AP3D, IoU3D of matched primitives, voxels and memory (paper, Sec. 4.1, Tab. 1 and 2).
+"""Score reconstructed scenes by ground, AP3D, IoU3D of matches, voxels and memory (paper, Sec. 4.1, Tab. 1 and 2).
 
-Each scene gives one record, and records can be added in any grouping. For each kind of score, one function computes the
-scores from the sum of the records. Each ratio is therefore a ratio of sums over the whole dataset.
+Each scene is summarised by one record, and records can be added in any order. For each kind of score, one function
+computes the scores from the sum of all records. Each ratio is therefore a ratio of sums over the whole dataset.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper
 
 @dataclass(frozen=True)
 class GroundSums:
-    """Sums over scenes from which ground scores are computed. Each array is (G,), with one entry per ground class.
+    """Sums over scenes, from which ground scores are computed. Each array is (G,), with one entry per ground class.
 
     Attributes:
         intersection: Number of pixels that are occupied in both scenes.
-        union: Number of pixels that are occupied in either scene.
+        union: Number of pixels that are occupied in at least one of the two scenes.
         pixels: Number of pixels that are occupied in the true scene.
         absolute_m: Sum of |height error| over the pixels that are occupied in the true scene (m).
         squared_m2: Sum of squared height errors over the pixels that are occupied in the true scene (m^2).
@@ -55,9 +55,9 @@ def sum_ground(
 ) -> GroundSums:
     """Sum the ground errors of one scene or of a stack of scenes.
 
-    Heights are compared where the true mask is occupied, as in the paper's loss, regardless of the predicted mask. Pass
-    the heights of the decoder for this reason. A Scene holds 0 m at unoccupied pixels, and that 0 would count as a
-    prediction.
+    Heights are compared on the pixels of the true mask, as in the paper's loss. The predicted mask has no influence.
+    Therefore pass the heights of the decoder instead of the heights of a Scene. A Scene holds 0 m at unoccupied pixels,
+    and this 0 would count as a prediction.
 
     Args:
         true_occupied: (..., G, H, W) bool true mask.
@@ -84,18 +84,19 @@ def sum_ground(
 
 @dataclass(frozen=True)
 class GroundScores:
-    """Ground scores of a dataset. A class that neither side ever occupies has no entry.
+    """Ground scores of a dataset. A class that does not occur in any true or predicted scene has no entry.
 
     Attributes:
-        iou: Intersection over union of the pixels of all classes together, in [0, 1].
+        iou: Intersection over union, summed over the pixels of all classes, in [0, 1].
         mean_iou: Mean over the classes of `class_iou`.
         class_iou: IoU per ground class.
         height_mae_m: Mean absolute height error (m).
         height_rmse_m: Root mean squared height error (m).
-        height_mse: Mean squared error of heights that the bounds normalise to [0, 1], as in the paper.
-        class_height_mae_m: Mean absolute height error per class that the true scenes contain (m).
-        class_height_rmse_m: Root mean squared height error per class that the true scenes contain (m).
-        class_height_mse: Normalised mean squared height error per class that the true scenes contain.
+        height_mse: Mean squared error of the heights after normalisation to [0, 1] by the height bounds, as in the
+            paper.
+        class_height_mae_m: Mean absolute height error for each class of the true scenes (m).
+        class_height_rmse_m: Root mean squared height error for each class of the true scenes (m).
+        class_height_mse: Normalised mean squared height error for each class of the true scenes.
     """
 
     iou: float
@@ -112,7 +113,7 @@ class GroundScores:
 def compute_ground_scores(
     sums: GroundSums, ground_classes: Sequence[str], height_bounds_m: np.ndarray | Sequence[Any]
 ) -> GroundScores:
-    """Compute ground scores from summed scenes.
+    """Compute the ground scores of a dataset from the sums over its scenes.
 
     Args:
         sums: Sums over all scenes.
@@ -123,7 +124,7 @@ def compute_ground_scores(
         Scores of the dataset.
 
     Raises:
-        ValueError: No true pixel is occupied, or a lower bound is not below its upper bound.
+        ValueError: No true pixel is occupied, or a lower bound is not less than its upper bound.
     """
     low, high = np.broadcast_to(np.asarray(height_bounds_m, np.float64), (len(ground_classes), 2)).T
     if not (high > low).all():
@@ -158,15 +159,15 @@ def compute_ground_scores(
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched detections of one or more scenes, sorted by score within each category of a scene.
+    """Detections of one or more scenes after matching, sorted by score within each scene and category.
 
-    Greedy matching handles detections in order of score. Selecting the k highest scores therefore gives the same result
-    before and after matching. The same holds for a minimum score.
+    Greedy matching processes detections in order of score. It is therefore correct to select the k highest scores after
+    matching. A minimum score can also be applied after matching.
 
     Attributes:
         category: (d,) int8 category of each detection.
         score: (d,) float32 score of each detection.
-        rank: (d,) int32 position among the detections of its scene and category; 0 has the highest score.
+        rank: (d,) int32 rank of each detection within its scene and category; rank 0 has the highest score.
         hit: (d, 10) bool, whether the detection is a true positive at each of THRESHOLDS.
         truths: (11,) int64 number of true primitives per category.
     """
@@ -181,7 +182,7 @@ class Matches:
 def join_matches(parts: Sequence[Matches]) -> Matches:
     """Join the matches of all scenes into one record.
 
-    The order of the scenes decides between equal scores, as in COCO. Pass the scenes in a fixed order.
+    Detections with equal scores are ranked in the order of the scenes, as in COCO. Pass the scenes in a fixed order.
 
     Args:
         parts: Matches per scene.
@@ -193,17 +194,17 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
         ValueError: `parts` is empty.
     """
     if not parts:
-        raise ValueError("AP3D needs at least one scene's matches, got none")
+        raise ValueError("AP3D needs the matches of at least one scene, got none")
     joined = [np.concatenate([getattr(p, name) for p in parts]) for name in ("category", "score", "rank", "hit")]
     return Matches(*joined, truths=np.sum([p.truths for p in parts], axis=0))
 
 
 def match_scene(truth: Scene, prediction: Scene) -> Matches:
-    """Match the primitives of a predicted scene with those of its true scene, for each category in SCORED.
+    """Match the primitives of a predicted scene with the primitives of the true scene, for each category in SCORED.
 
     Args:
         truth: True scene.
-        prediction: Predicted scene; `existence` is the score of its primitives.
+        prediction: Predicted scene; its `existence` holds the scores of the primitives.
 
     Returns:
         Matches of the scene.
@@ -232,12 +233,12 @@ def match_scene(truth: Scene, prediction: Scene) -> Matches:
 def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.ndarray:
     """Decide for each detection and threshold whether the detection is a true positive.
 
-    Each threshold is matched separately. Detections take turns in order of score. A detection takes the unmatched true
-    primitive of highest IoU3D, if the IoU3D reaches the threshold. Of equal IoU3D, the later true primitive is taken,
-    as in COCO.
+    Each threshold is matched separately. Detections are processed in order of score. A detection is matched with the
+    unmatched true primitive of highest IoU3D, if the IoU3D reaches the threshold. If several true primitives have this
+    IoU3D, the last is matched, as in COCO.
 
     Args:
-        iou: (d, truths) IoU3D, detections in order of decreasing score.
+        iou: (d, truths) IoU3D; the rows are in order of decreasing score.
         thresholds: (t,) minimum IoU3D of a true positive.
 
     Returns:
@@ -247,7 +248,7 @@ def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.n
     hit = np.zeros((num_detections, len(thresholds)), bool)
     if num_truths == 0:
         return hit
-    backwards = iou[:, ::-1]  # argmax returns the first of equal values.
+    backwards = iou[:, ::-1]  # argmax returns the first maximum, but the last is needed.
     free = np.ones((len(thresholds), num_truths), bool)
     rows = np.arange(len(thresholds))
     for i in np.flatnonzero(iou.max(axis=1) >= thresholds.min()):
@@ -264,9 +265,9 @@ class DetectionScores:
 
     Attributes:
         ap3d: Mean over categories and thresholds.
-        ap3d_50: Mean over categories at IoU3D 0.50.
+        ap3d_50: Mean over categories at the threshold IoU3D = 0.50.
         category_ap3d: Mean over thresholds, per category.
-        category_ap3d_50: Average precision at IoU3D 0.50, per category.
+        category_ap3d_50: Average precision per category at the threshold IoU3D = 0.50.
         table: (10,) average precision at each of THRESHOLDS, per category.
     """
 
@@ -278,7 +279,7 @@ class DetectionScores:
 
     @property
     def at_threshold(self) -> dict[str, float]:
-        """Return the mean over categories at each of THRESHOLDS; keys have two decimals."""
+        """Return the mean over categories at each threshold; keys are the thresholds with two decimals."""
         means = np.mean(list(self.table.values()), axis=0)
         return {f"{threshold:.2f}": float(mean) for threshold, mean in zip(THRESHOLDS, means, strict=True)}
 
@@ -290,9 +291,9 @@ def compute_detection_scores(
 
     Args:
         matches: Matches of all scenes.
-        max_detections: Number of detections of highest score to keep per scene and category (Omni3D: 100; default:
-            all).
-        min_score: Only detections with a higher score count.
+        max_detections: Number of highest-scoring detections that are kept per scene and category (Omni3D: 100). None:
+            all are kept.
+        min_score: Only detections with a score above this value count.
 
     Returns:
         Scores of the dataset.
@@ -324,8 +325,8 @@ def compute_detection_scores(
 def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
     """Compute the mean of the interpolated precision over 101 recall points.
 
-    The interpolated precision at a recall is the highest precision at this recall or a greater one. It is 0 for a
-    recall that the detections never reach.
+    The interpolated precision at a recall is the highest precision at this recall or a greater one. At a recall that
+    the detections do not reach, the precision is 0.
 
     Args:
         hit: (d, t) bool true positives, in order of decreasing score.
@@ -353,7 +354,7 @@ def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PairSums:
-    """Sums over scenes from which the mean IoU3D is computed. Each array is (11,), with one entry per category.
+    """Sums over scenes, from which the mean IoU3D is computed. Each array is (11,), with one entry per category.
 
     Attributes:
         truths: Number of true primitives.
@@ -372,11 +373,11 @@ class PairSums:
 
 
 def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
-    """Match the primitives of one scene with their predictions and sum the pairs.
+    """Match the true and predicted primitives of one scene and sum the IoU3D of the pairs.
 
-    Matching is one-to-one within each category and maximises the sum of IoU3D. Two primitives that do not overlap are
-    not a pair. The IoU3D of boxes is exact, and the IoU3D of ellipsoids is sampled (iou3d.py). Each prediction counts,
-    regardless of its existence probability. Remove improbable predictions before the call.
+    Matching is one-to-one within each category and maximises the sum of IoU3D. Primitives that do not overlap are not
+    matched. The IoU3D of boxes is exact, and the IoU3D of ellipsoids is sampled (iou3d.py). All predictions count, and
+    existence probabilities are ignored. Remove improbable predictions before the call.
 
     Args:
         truth: True scene.
@@ -400,14 +401,14 @@ def sum_pairs(truth: Scene, prediction: Scene) -> PairSums:
 class PairScores:
     """IoU3D of matched primitives in [0, 1].
 
-    Scores over all categories use SCORED, while scores per category include VE. Where a share or mean is 0 / 0, the
-    category has no entry.
+    Scores over all categories use the categories in SCORED; scores per category also include VE. A category whose score
+    would be 0 / 0 has no entry.
 
     Attributes:
-        mean_iou3d: Mean over matched pairs, None without pairs.
+        mean_iou3d: Mean over matched pairs. None: there are no pairs.
         truth_iou3d: Mean over true primitives; a true primitive without a partner counts as 0.
-        found: Share of true primitives with a partner.
-        right: Share of predictions with a partner, None without predictions.
+        found: Share of true primitives that are matched.
+        right: Share of predictions that are matched. None: there are no predictions.
         category_mean_iou3d: `mean_iou3d` per category.
         category_truth_iou3d: `truth_iou3d` per category.
         category_found: `found` per category.
@@ -425,7 +426,7 @@ class PairScores:
 
 
 def compute_pair_scores(sums: PairSums) -> PairScores:
-    """Compute the IoU3D of matched primitives from summed scenes.
+    """Compute the IoU3D scores of a dataset from the sums over its scenes.
 
     Args:
         sums: Sums over all scenes.
@@ -464,7 +465,7 @@ def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.nda
 
     Args:
         truth: Class ids of the true voxel grid.
-        prediction: Class ids of the predicted voxel grid, of equal shape.
+        prediction: Class ids of the predicted voxel grid, which has the same shape.
 
     Returns:
         (classes, classes) int64 voxels, true class in rows.
@@ -474,7 +475,8 @@ def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.nda
     """
     if truth.shape != prediction.shape:
         raise ValueError(f"voxel grids differ in shape: {truth.shape} and {prediction.shape}")
-    filled = np.flatnonzero((truth | prediction).reshape(-1) != EMPTY)  # At least half of a scene is empty.
+    # Only filled voxels are counted here, because at least half of a scene is empty.
+    filled = np.flatnonzero((truth | prediction).reshape(-1) != EMPTY)
     pair = truth.reshape(-1).take(filled).astype(np.int16) * np.int16(NUM_CLASSES) + prediction.reshape(-1).take(filled)
     confusion = np.bincount(pair, minlength=NUM_CLASSES**2).reshape(NUM_CLASSES, NUM_CLASSES)
     confusion[EMPTY, EMPTY] = truth.size - len(filled)
@@ -483,10 +485,10 @@ def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class VoxelScores:
-    """Voxel scores of a dataset (paper, Tab. 1). A class that occurs on neither side has no entry.
+    """Voxel scores of a dataset (paper, Tab. 1). A class that occurs in no true or predicted voxel has no entry.
 
     Attributes:
-        iou: IoU of occupancy: any class against empty.
+        iou: IoU of occupied voxels, regardless of their class.
         miou: Mean of `class_iou`.
         class_iou: IoU per class, without the empty class.
     """
@@ -506,7 +508,7 @@ def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
         Scores of the dataset.
 
     Raises:
-        ValueError: No voxel is filled on either side.
+        ValueError: All voxels are empty, both true and predicted.
     """
     hit, either = np.diag(confusion), confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion)
     class_iou = {name: float(hit[k] / either[k]) for name, k in CLASS_ID.items() if either[k]}
@@ -525,17 +527,17 @@ def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
 
 
 MEMORY = (
-    "rasters",  # Height and mask as float32, as the paper counts them; 1 MB in the paper is 2^20 bytes.
-    "vectors",  # Features as float32 and flags of all slots, as the paper counts them.
+    "rasters",  # Height and mask, both float32, as in the paper. The paper's 1 MB is 2^20 bytes.
+    "vectors",  # Features (float32) and flags of all slots, as in the paper.
     "vectors_filled",  # Features of the filled slots only.
     "latent",
     "voxels",  # One byte per voxel.
-    "voxels_32_bit",  # Four bytes per voxel, as the paper counts them for SemCity.
+    "voxels_32_bit",  # Four bytes per voxel, as in the paper for SemCity.
 )
 
 
 def measure_memory_bytes(layout: LayoutBatch, latent: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """Measure the memory of one scene in each of the representations MEMORY (paper, Tab. 1).
+    """Measure the memory of one scene in each representation of MEMORY (paper, Tab. 1).
 
     Args:
         layout: Batch of one scene.

@@ -1,12 +1,13 @@
-"""Measure the visibility of seams between given and generated parts of a scene, relative to nearby lines.
+"""Measure the visibility of seams between the known and generated parts of a scene, relative to nearby lines.
 
 A score is the rate across seams divided by the rate across nearby lines. A score of 1 means that seams are invisible.
-A line runs between two rows, or two columns, of pixels. A seam is compared with its neighbouring lines. These are
-parallel to the seam, NEAR_M to FAR_M away from it, and at least NEAR_M away from all seams. They are far enough to be
-independent of the seam, and near enough to cross similar streets.
+A line is the border between two adjacent pixel rows or pixel columns. Each seam is compared with its neighbouring
+lines. These lines are parallel to the seam, at a distance of NEAR_M to FAR_M from it, and at least NEAR_M from all
+other seams. At this distance, lines do not depend on the seam but cross similar streets.
 
-Each scene gives a record (measures, 2, 2) float64. The second axis is seams, then neighbouring lines. The last axis is
-numerator, then denominator. Records can be added, and a stack of records can be resampled for confidence intervals.
+Each scene is summarised by a float64 record of shape (measures, 2, 2). Along the second axis, seams come first, then
+neighbouring lines. Along the last axis, the numerator comes first, then the denominator. Records can be added, and a
+stack of records can be resampled for confidence intervals.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from models.scene import Scene
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 MEASURES = (
-    "class_changes",  # Share of pixel pairs across the line that differ in ground class, if at least one is ground.
-    "height_step",  # Mean height difference of pixel pairs across the line (m), if both are ground.
-    "cut_objects",  # Share of objects at the line that end at the line instead of crossing it.
-    "doubled_objects",  # Share of objects at the line that overlap an object of their category from the other side.
+    "class_changes",  # Share of pixel pairs across the line with different classes, if a pixel has ground.
+    "height_step",  # Mean height difference of pixel pairs across the line (m), if both pixels have ground.
+    "cut_objects",  # Share of the objects at the line that end there instead of crossing the line.
+    "doubled_objects",  # Share of the objects at the line that overlap an object beyond the line.
 )
 NEAR_M, FAR_M = 4.0, 16.0
 END_M = 0.25  # An object ends at a line if its end is at most this far from the line (m).
@@ -35,11 +36,11 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
 
     Args:
         scene: Scene with seams.
-        rows: Pixel rows; a seam lies before each.
-        cols: Pixel columns; a seam lies before each.
+        rows: Pixel rows; a seam lies before each of these rows.
+        cols: Pixel columns; a seam lies before each of these columns.
 
     Returns:
-        (4, 2, 2) record: MEASURES, seams or neighbouring lines, numerator and denominator.
+        (4, 2, 2) record with the axes MEASURES, (seams, neighbouring lines), (numerator, denominator).
 
     Raises:
         ValueError: A seam lies on or beyond the edge of the scene.
@@ -51,9 +52,12 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
     doubles = find_doubled_objects(scene)
     for axis, seams, count in ((0, rows, grid.rows), (1, cols, grid.cols)):
         if bad := [line for line in seams if not 0 < line < count]:
-            raise ValueError(f"scene {scene.scene_id}: seam before pixel {bad[0]}, expected 1 to {count - 1}")
+            raise ValueError(
+                f"scene {scene.scene_id}: there is a seam before pixel {bad[0]}, but seams must lie before pixels"
+                f" 1 to {count - 1}"
+            )
         edge_m = grid.front_m if axis == 0 else grid.left_m
-        # Positions are distances from the front or left edge of the scene, so that they grow with the pixel index.
+        # Positions are measured from the front or left edge of the scene. They therefore grow with the pixel index.
         low_m, high_m = edge_m - corners_m[:, axis, 1], edge_m - corners_m[:, axis, 0]
         center_m = edge_m - scene.center_m[:, axis]
         pixels = ground_class.swapaxes(0, axis), height_m.swapaxes(0, axis)
@@ -71,12 +75,12 @@ def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -
     """List the lines with which each seam is compared.
 
     Args:
-        seams: Seams, as indices of the pixel after the line.
+        seams: Index of the pixel after each seam.
         count: Number of pixel rows or columns.
         resolution_m: Pixel size (m).
 
     Returns:
-        Indices of the neighbouring lines, by seam.
+        Indices of the neighbouring lines, for each seam.
     """
     lines = np.arange(1, count)
     nearest_m = np.abs(lines[:, None] - np.array(seams, int).reshape(1, -1)).min(axis=1, initial=count) * resolution_m
@@ -88,12 +92,12 @@ def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> n
     """Count class changes and sum height steps across a line.
 
     Args:
-        ground_class: (H, W) index of the ground class, -1 without ground.
+        ground_class: (H, W) index of the ground class; -1 means no ground.
         height_m: (H, W) height of the ground (m).
-        line: Row after the line.
+        line: Index of the row after the line.
 
     Returns:
-        (2, 2): class changes and height steps, each with numerator and denominator.
+        (2, 2) numerator and denominator of class changes and of height steps.
     """
     before, after = ground_class[line - 1], ground_class[line]
     either, both = (before >= 0) | (after >= 0), (before >= 0) & (after >= 0)
@@ -104,17 +108,17 @@ def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> n
 def measure_objects(
     at_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, center_m: np.ndarray, doubles: np.ndarray
 ) -> np.ndarray:
-    """Count cut and doubled objects at lines. Positions are measured along the normal of the lines.
+    """Count the cut objects and the doubled objects at lines. Positions are measured along the normal of the lines.
 
     Args:
         at_m: (l,) positions of the lines (m).
         low_m: (n,) lower ends of the objects (m).
         high_m: (n,) upper ends of the objects (m).
         center_m: (n,) centres of the objects (m).
-        doubles: (p, 2) indices of overlapping objects of one category.
+        doubles: (p, 2) pairs of indices of overlapping objects of the same category.
 
     Returns:
-        (l, 2, 2): cut and doubled objects, each with numerator and denominator.
+        (l, 2, 2) numerator and denominator of cut objects and of doubled objects.
     """
     at = at_m[:, None]
     ends = (np.abs(low_m - at) <= END_M) | (np.abs(high_m - at) <= END_M)
@@ -133,26 +137,26 @@ def measure_objects(
 
 
 def compute_footprint_ranges(scene: Scene) -> np.ndarray:
-    """Compute the range of x and of y that the box of each primitive covers.
+    """Compute the ranges of x and y that the box of each primitive covers.
 
     Args:
         scene: Scene with n primitives.
 
     Returns:
-        (n, 2, 2): x and y, each with minimum and maximum (m, scene frame).
+        (n, 2, 2) minimum and maximum of x and of y (m, scene frame).
     """
     reach = 0.5 * (np.abs(scene.rotation) * scene.size_m[:, None, :]).sum(axis=2)[:, :2]
     return np.stack([scene.center_m[:, :2] - reach, scene.center_m[:, :2] + reach], axis=2)
 
 
 def find_doubled_objects(scene: Scene) -> np.ndarray:
-    """Find pairs of objects of one category whose IoU3D is above DOUBLE_IOU3D.
+    """Find pairs of objects that have the same category and an IoU3D above DOUBLE_IOU3D.
 
     Args:
         scene: Scene.
 
     Returns:
-        (p, 2) indices of the objects.
+        (p, 2) indices of the two objects of each pair.
     """
     boxes = extract_boxes(scene)
     iou = np.triu(compute_iou3d_matrix(boxes, boxes), 1)
@@ -161,14 +165,14 @@ def find_doubled_objects(scene: Scene) -> np.ndarray:
 
 
 def estimate_seam_ratios(records: np.ndarray, key: int = 0) -> dict[str, Estimate | None]:
-    """Estimate the rate across seams divided by the rate across neighbouring lines.
+    """Estimate the ratio of the rate across seams to the rate across neighbouring lines.
 
     Args:
         records: (scenes, 4, 2, 2) records of `measure_scene_seams`.
         key: Part of the seed of the bootstrap.
 
     Returns:
-        Ratio with its 95 % interval by measure. None where the ratio is undefined because a denominator is 0.
+        Ratio with its 95 % interval, for each measure. None: the ratio is undefined because a denominator is 0.
     """
     drawn = np.tensordot(compute_weights(len(records), key), records, axes=1)  # Shape (1 + draws, 4, 2, 2).
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -12,7 +12,7 @@ EXTENTS = ("length_m", "width_m", "height_m")
 
 
 def list_statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
-    """Return the column names of `compute_layout_statistics`: num_<category>, <category>_<extent>_m, <class>_share.
+    """Return the column names of `compute_layout_statistics`: num_<category>, <category>_<extent>_m and <class>_share.
 
     Args:
         ground_classes: Names of the ground classes.
@@ -28,14 +28,14 @@ def list_statistic_names(ground_classes: Sequence[str]) -> tuple[str, ...]:
 def compute_layout_statistics(scene: Scene) -> np.ndarray:
     """Compute the layout statistics of one scene: object counts, mean extents and shares of ground classes.
 
-    Ground classes may overlap, so that their shares may sum to more than 1.
+    The sum of the shares may exceed 1, because ground classes may overlap.
 
     Args:
         scene: Scene with G ground classes.
 
     Returns:
-        (11 + 33 + G,) float64: objects per category, mean extents per category (m, NaN without objects), share of
-        pixels per ground class.
+        (11 + 33 + G,) float64: number of objects per category, mean extents per category (m; NaN if there are no
+        objects), share of pixels per ground class.
     """
     counts = scene.counts()
     totals = np.zeros((len(CATEGORIES), 3))
@@ -46,17 +46,17 @@ def compute_layout_statistics(scene: Scene) -> np.ndarray:
 
 
 def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shift and scale layout statistics by the reference's mean and standard deviation.
+    """Shift and scale layout statistics by the mean and standard deviation of the reference.
 
-    Distances are then without unit, and all columns have about the same weight. A constant column is only shifted. NaN,
-    the size of an absent category, becomes the reference's mean.
+    Afterwards, distances have no unit, and all columns have about the same weight. A constant column is only shifted.
+    NaN marks the size of an absent category and is replaced by the mean of the reference.
 
     Args:
-        reference: (n, s) statistics that define mean and standard deviation.
+        reference: (n, s) statistics that define the mean and the standard deviation.
         other: (m, s) statistics.
 
     Returns:
-        Both sides, standardised.
+        Standardised statistics of both sides.
 
     Raises:
         ValueError: A side has fewer than 2 scenes, or the columns differ.
@@ -64,7 +64,7 @@ def standardize_statistics(reference: np.ndarray, other: np.ndarray) -> tuple[np
     reference, other = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if reference.ndim != 2 or other.ndim != 2 or reference.shape[1] != other.shape[1]:
         raise ValueError(
-            f"layout statistics must be (scenes, columns) with equal columns, got {reference.shape} and {other.shape}"
+            f"layout statistics (scenes, columns) need equal columns, got {reference.shape} and {other.shape}"
         )
     if min(len(reference), len(other)) < 2:
         raise ValueError(f"layout statistics need at least 2 scenes per side, got {len(reference)} and {len(other)}")

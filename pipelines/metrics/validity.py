@@ -1,9 +1,9 @@
-"""Compute the validity of scenes: shares of implausible primitives, connectivity of the road and label fidelity.
+"""Compute validity measures: shares of implausible primitives, road connectivity and label fidelity.
 
-Each scene gives one record (measures, 2) float64 with a numerator and a denominator per measure. Records can be added,
-and a stack of records can be resampled for confidence intervals. Each measure is a share. Lower is better, except for
-`road_connectivity` and label fidelity. Compare the shares with those of real scenes, because real scenes do not reach
-0.
+Each scene is summarised by a float64 record of shape (measures, 2): a numerator and a denominator per measure. Records
+can be added, and a stack of records can be resampled for confidence intervals. Each measure is a share. Lower is
+better, except for `road_connectivity` and label fidelity. Real scenes do not reach 0. Therefore, compare the shares
+with the shares of real scenes.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 MEASURES = (
     "overlapping",  # Solid primitives whose IoU3D with another solid primitive exceeds 0.05.
-    "floating",  # Standing primitives with known ground whose lowest point is more than 0.5 m above the surface.
-    "sunken",  # Standing primitives with known ground whose lowest point is more than 0.5 m below the surface.
-    "over_unknown_ground",  # Standing primitives inside the grid without any ground under their centre.
-    "off_road_vehicles",  # Vehicles with known ground whose centre lies on no drivable class.
-    "buildings_on_road",  # Buildings with known ground whose centre lies on the road.
+    "floating",  # Standing primitives whose lowest point is more than 0.5 m above the surface.
+    "sunken",  # Standing primitives whose lowest point is more than 0.5 m below the surface.
+    "over_unknown_ground",  # Standing primitives inside the grid that have no ground under their centre.
+    "off_road_vehicles",  # Vehicles on the ground whose centre does not lie on a drivable class.
+    "buildings_on_road",  # Buildings whose centre lies on the road.
     "road_connectivity",  # Share of road pixels in the largest 4-connected component, averaged over scenes with road.
 )
 LABEL_MEASURES = ("vegetation_fidelity", "vehicle_fidelity", "joint_fidelity")
 
 OVERLAP_IOU3D = 0.05
 TOLERANCE_M = 0.5
-SLAB_OFFSET_M = 0.3  # For ground heights that are slab tops (KITTI-360, town); 0 for surface heights (Argoverse 2).
+SLAB_OFFSET_M = 0.3  # Used if ground heights are slab tops (KITTI-360, town). Otherwise 0 (Argoverse 2).
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
-# Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of their primitives float and 7 %
-# are sunken. The other categories are excluded because annotators place them differently in the same drive:
-# traffic_control (100 % float), vegetation_ellipsoid (29 % float), vegetation_cuboid (37 % sunken) and
-# construction_small (28 % sunken).
+# Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of the primitives in these
+# categories float and 7 % are sunken. The other categories are excluded because many of their primitives are not
+# annotated on the ground in this drive:  traffic_control (100 % float), vegetation_ellipsoid (29 % float),
+# vegetation_cuboid (37 % sunken) and  construction_small (28 % sunken).
 STANDING = tuple(
     CATEGORY_INDEX[name]
     for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole", "object")
@@ -45,7 +45,7 @@ BUILDING = CATEGORY_INDEX["construction_big"]
 
 
 def find_slab_offset_m(surface: str) -> float:
-    """Return the height of a dataset's ground raster above the surface on which its objects stand.
+    """Return the height of the ground raster above the surface on which the objects of a dataset stand (m).
 
     Args:
         surface: Attribute `surface` of the dataset's LayoutSpec.
@@ -59,7 +59,7 @@ def find_slab_offset_m(surface: str) -> float:
 def find_faults(
     scene: Scene, slab_offset_m: float, tolerance_m: float = TOLERANCE_M
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Find the primitives at fault, for each of MEASURES except `road_connectivity`.
+    """Find the implausible primitives, for each of MEASURES except `road_connectivity`.
 
     Args:
         scene: Scene with n primitives.
@@ -67,7 +67,8 @@ def find_faults(
         tolerance_m: Maximum distance of an object from the surface (m).
 
     Returns:
-        By measure: (n,) bool primitives at fault, and (n,) bool primitives to which the measure applies.
+        For each measure: (n,) bool, whether a primitive is implausible, and (n,) bool, whether the measure applies to
+            it.
     """
     category = scene.category
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
@@ -106,9 +107,9 @@ def compute_scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
 
 
 def compute_label_fidelity(scene: Scene, vegetation: DensityThresholds, vehicle: DensityThresholds) -> np.ndarray:
-    """Compare the density computed from a scene with its density label, the requested one.
+    """Compare the density of a scene with the requested density label.
 
-    A missing label is not judged.
+    A missing label is not compared.
 
     Args:
         scene: Scene with at least one density label.
@@ -145,7 +146,7 @@ def compute_validity_rates(
         names: Names of the measures.
 
     Returns:
-        Share in [0, 1] by measure, None if its denominators sum to 0.
+        Share in [0, 1], for each measure. None: the denominators of the measure sum to 0.
     """
     records = np.asarray(records, np.float64).reshape(-1, len(names), 2)
     numerator, denominator = records.sum(axis=0).T
@@ -153,7 +154,7 @@ def compute_validity_rates(
 
 
 def _find_overlapping(scene: Scene) -> np.ndarray:
-    """Return (n,) bool: whether a solid primitive overlaps another solid primitive with IoU3D above OVERLAP_IOU3D."""
+    """Return (n,) bool: whether a solid primitive has an IoU3D above OVERLAP_IOU3D with another solid primitive."""
     solid = np.flatnonzero(np.isin(scene.category, SOLID))
     boxes = extract_boxes(scene).take(solid)
     iou = compute_iou3d_matrix(boxes, boxes)
@@ -164,13 +165,13 @@ def _find_overlapping(scene: Scene) -> np.ndarray:
 
 
 def _make_mask(scene: Scene, classes: Iterable[str]) -> np.ndarray:
-    """Return (H, W) bool: whether any of the classes occupies the pixel. Classes may overlap."""
+    """Return (H, W) bool: whether a pixel is occupied by at least one of the classes. Classes may overlap."""
     index = [scene.ground_classes.index(name) for name in classes if name in scene.ground_classes]
     return np.any(scene.occupied[index], axis=0)
 
 
 def _find_largest_component(mask: np.ndarray) -> tuple[float, int]:
-    """Return the share of the mask's pixels in its largest 4-connected component, and 1; (0, 0) for an empty mask."""
+    """Return (share of the mask's pixels in the largest 4-connected component, 1), or (0, 0) for an empty mask."""
     components, _ = label_parts(mask)
     sizes = np.bincount(components.ravel())[1:]
     return (float(sizes.max() / sizes.sum()), 1) if len(sizes) else (0.0, 0)

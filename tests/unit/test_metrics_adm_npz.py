@@ -119,7 +119,7 @@ def test_npz_writer_rejects_bad_images_and_leaves_no_file(tmp_path):
     for batches, count, match in (
         ([make_pictures()], 8, "got 7 pictures, expected 8"),
         ([make_pictures(), make_pictures()], 7, "got 14 pictures, expected 7"),
-        ([make_pictures(), make_pictures(1, 4, 6)], 8, r"one size, got uint8 \(1, 4, 6, 3\) after 7"),
+        ([make_pictures(), make_pictures(1, 4, 6)], 8, r"equal size, got uint8 \(1, 4, 6, 3\); the 7 "),
         ([make_pictures().astype(np.float32)], 7, "got float32"),
         ([make_pictures()[..., :1]], 7, r"got uint8 \(7, 5, 6, 1\)"),
         ([], 0, "no pictures to write"),

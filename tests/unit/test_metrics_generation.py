@@ -323,7 +323,7 @@ def test_scores_reject_invalid_features():
         compute_neighbourhoods(x[:3], x, k=[3])
     with pytest.raises(ValueError, match=r"generated features hold NaN .* first 3"):
         compute_neighbourhoods(x, broken)
-    with pytest.raises(ValueError, match="real features have 4 dimensions, generated 3"):
+    with pytest.raises(ValueError, match="real features have 4 dimensions, but generated features have 3"):
         compute_neighbourhoods(x, x[:, :3])
     with pytest.raises(ValueError, match="k must name"):
         compute_neighbourhoods(x, x, k=[0])
@@ -333,7 +333,7 @@ def test_scores_reject_invalid_features():
         compute_moments(broken)
     with pytest.raises(ValueError, match="4 and 3 dimensions"):
         compute_frechet_distance(compute_moments(x), compute_moments(x[:, :3]))
-    with pytest.raises(ValueError, match="4 and 3 dimensions"):
+    with pytest.raises(ValueError, match="different dimensions: 4 and 3"):
         compute_moments(x) + compute_moments(x[:, :3])
     with pytest.raises(ValueError, match="at least 2 samples"):
         compute_frechet_distance(compute_moments(x), compute_moments(x[:1]))

@@ -327,7 +327,7 @@ def test_inception_rejects_missing_corrupted_or_foreign_file(tmp_path):
         load_inception(tmp_path / "absent.pth")
     known = tmp_path / "weights-inception-2015-12-05-6726825d.pth"
     known.write_bytes(b"half a download")
-    with pytest.raises(ValueError, match=r"6726825d\.pth: corrupted, its sha256 starts with"):
+    with pytest.raises(ValueError, match=r"6726825d\.pth: file is corrupted; its sha256 starts with"):
         load_inception(known)
     for name in ("broken.pth", "broken.safetensors"):
         (tmp_path / name).write_bytes(b"half a download")

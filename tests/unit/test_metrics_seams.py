@@ -129,7 +129,7 @@ def test_reference_lines_avoid_every_seam():
 
 
 def test_seam_scores_reject_edge_seam_and_skip_empty_scene():
-    with pytest.raises(ValueError, match="seam before pixel 256, expected 1 to 255"):
+    with pytest.raises(ValueError, match="a seam before pixel 256, but seams must lie before pixels 1 to 255"):
         measure_scene_seams(make_random_ground(0), rows=[256])
     empty = replace(make_random_ground(0), occupied=np.zeros((5, 256, 256), bool))
     assert set(estimate_seam_ratios(measure_scene_seams(empty, rows=[128])[None]).values()) == {None}
