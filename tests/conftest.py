@@ -7,18 +7,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-# Some virtual machines report AMX but stop oneDNN, which uses it for bfloat16, with an illegal instruction.
+# Some virtual machines report AMX but do not support it. There oneDNN fails with an illegal instruction in bfloat16.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-UNCHECKED = "pipelines.preprocess.sources.town.land"  # type checks would slow millions of calls of a short function
+UNCHECKED = "pipelines.preprocess.sources.town.land"  # it calls a short function millions of times
 
 
 def list_checked_modules() -> list[str]:
     """Return the modules of models and pipelines whose annotations are checked.
 
-    Modules that import Ray are left out: Ray pickles their local functions by value, and checked functions cannot be
+    The list excludes modules that import Ray, because Ray pickles their local functions. Checked functions cannot be
     pickled.
     """
     paths = [path for package in ("models", "pipelines") for path in sorted((ROOT / package).rglob("[!_]*.py"))]
@@ -68,7 +68,7 @@ SLOW_MODULES = ("test_faults", "test_train_jobs", "test_commands", "test_ablatio
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests by their folder and sort slow modules first.
 
-    Otherwise one process may run a slow module at the end while the other processes are idle.
+    Without this order, one process may run a slow module at the end while the other processes are idle.
     """
     for item in items:
         folder, module = item.path.parent.name, item.path.stem
@@ -113,7 +113,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cluster(tmp_path_factory):
-    """One small local Ray cluster for all tests, with an unused $PRITTI_HOME."""
+    """One small local Ray cluster for all tests, with an empty $PRITTI_HOME."""
     from jobs.support.cli import RAY_ENVIRONMENT
 
     settings = {
@@ -121,7 +121,7 @@ def cluster(tmp_path_factory):
         "RAY_AUTH_MODE": "disabled",
         "RAY_DATA_USE_DATASOURCE_V2": "0",
         "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.2",
-        "RAY_worker_niceness": "0",  # workers must not starve next to the tests of another process
+        "RAY_worker_niceness": "0",  # workers need CPU time while another process runs tests
         "DO_NOT_TRACK": "true",
     }
     os.environ.update(RAY_ENVIRONMENT | settings)
@@ -159,7 +159,7 @@ def home(tmp_path_factory, cluster) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory, cluster) -> Path:
-    """A $PRITTI_HOME like `home`, but with models that this process trains without Ray Train."""
+    """A $PRITTI_HOME with the same content as `home`, but this process trains the models without Ray Train."""
     path = tmp_path_factory.mktemp("smoke")
     os.environ["PRITTI_HOME"] = str(path)
     import torch
@@ -235,7 +235,7 @@ def town_dataset(tmp_path_factory) -> str:
 
 @pytest.fixture(scope="session")
 def reconstruction_dataset(tmp_path_factory) -> Path:
-    """Two shards of 7 and 4 scenes, and an LVAE that predicts only their means."""
+    """Two shards of 7 and 4 scenes, and an LVAE that predicts only the means of the scenes."""
     import torch
 
     from models.lvae import LayoutVAE

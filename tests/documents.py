@@ -25,8 +25,8 @@ class Block:
         page: Path of the document in the repository.
         language: Info string of the fence.
         code: Text of the block as readers see it.
-        needs: Why tests do not run the block, or an empty string. A shell block says so in its first line
-            ("# Needs: ..."), any other in a comment before the fence.
+        needs: Reason why tests do not run the block, or an empty string. A shell block states the reason in its first
+            line ("# Needs: ..."). Other blocks state it in a comment before the fence.
         replacements: Pairs (text, smaller text) that a test applies before it runs the block.
     """
 
@@ -38,10 +38,10 @@ class Block:
 
     @property
     def code_to_run(self) -> str:
-        """The block with the replacements.
+        """The block after the replacements.
 
         Raises:
-            ValueError: The block does not contain a text to replace.
+            ValueError: The block does not contain one of the texts to replace.
         """
         code = self.code
         for old, new in self.replacements:
@@ -57,7 +57,7 @@ def read_page(page: str) -> str:
 
 
 def list_blocks(page: str, *languages: str) -> list[Block]:
-    """Return the code blocks of a document in order, of some languages or all."""
+    """Return the code blocks of a document in order, for the given languages or for all languages."""
     blocks = []
     for match in BLOCK.finditer(read_page(page)):
         needs = match["text"] if match["marker"] == "needs" else ""

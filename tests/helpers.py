@@ -41,7 +41,7 @@ REJECT_REASON = "heights <beyond> 327 m"
 
 
 def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) -> np.ndarray:
-    """Return n random rotations (n, 3, 3): any yaw and a pitch of at most tilt_rad."""
+    """Return n random rotations (n, 3, 3) with any yaw and with a pitch of at most tilt_rad."""
     yaw, pitch = rng.uniform(-np.pi, np.pi, n), rng.uniform(-tilt_rad, tilt_rad, n)
     cos, sin, zero, one = np.cos(pitch), np.sin(pitch), np.zeros(n), np.ones(n)
     tilt = np.stack([np.stack(r, -1) for r in ([cos, zero, sin], [zero, one, zero], [-sin, zero, cos])], -2)
@@ -49,14 +49,14 @@ def random_rotations(rng: np.random.Generator, n: int, tilt_rad: float = np.pi) 
 
 
 def random_scene(seed: int = 0, n: int = 40, grid: Grid | None = None, tilt_rad: float = 0.2, **fields) -> Scene:
-    """Return a scene with n primitives of random categories on half planes of ground."""
+    """Return a scene with n primitives of random categories, in which ground fills half planes."""
     rng = np.random.default_rng(seed)
     grid = grid or Grid()
     size = rng.uniform(0.3, 5.0, (n, 3))
     rotation, size = canonicalize_boxes(random_rotations(rng, n, tilt_rad), size)
     classes = KITTI_GROUND_CLASSES
     angle, offset = rng.uniform(-np.pi, np.pi, (2, len(classes), 1, 1)) * [[[[1]]], [[[5]]]]
-    occupied = np.cos(angle) * (grid.x_m()[:, None] - 32) + np.sin(angle) * grid.y_m() > offset  # half planes of ground
+    occupied = np.cos(angle) * (grid.x_m()[:, None] - 32) + np.sin(angle) * grid.y_m() > offset  # half planes
     slope = 0.01 * grid.x_m()[:, None] - 0.02 * grid.y_m()[None, :]
     height = np.where(occupied, slope[None] - 0.6 + 0.1 * np.arange(len(classes))[:, None, None], 0)
     defaults = {
@@ -162,7 +162,7 @@ def run_command(*words: str, **environment: str) -> subprocess.CompletedProcess:
 
 def kill_ray_workers(title: str) -> list[int]:
     """Kill all Ray workers of this process whose title contains `title` and return their process ids."""
-    import psutil  # bundled with Ray, importable after ray
+    import psutil  # Ray bundles this module; import ray first
 
     killed = []
     for process in psutil.Process().children(recursive=True):
@@ -206,13 +206,13 @@ class Page(HTMLParser):
 
 
 def assert_same_primitives(got: Scene, want: Scene, but: tuple[str, ...] = ()) -> None:
-    """Assert that all fields of the primitives are equal, except the fields in `but`."""
+    """Assert that all fields of the primitives are equal; ignore the fields in `but`."""
     for name in set(PER_PRIMITIVE) - set(but):
         assert np.array_equal(getattr(got, name), getattr(want, name), equal_nan=name == "heading_rad"), name
 
 
 class SvgPage(Page):
-    """A page whose SVG shapes contain titles: only `meta` and `img` have no closing tag."""
+    """A page with titles in its SVG shapes. Only the elements `meta` and `img` have no closing tag."""
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
@@ -221,7 +221,7 @@ class SvgPage(Page):
 
 
 def street_class_ids(rows: int = 44, cols: int = 60) -> np.ndarray:
-    """Return class ids of a picture (rows, cols) with sky above a road with a car."""
+    """Return class ids of a picture (rows, cols) that shows the sky, a road and a car."""
     ids = np.full((rows, cols), EMPTY, np.uint8)
     ids[rows // 2 :], ids[rows // 2 : rows // 2 + 8, 20:40] = CLASS_ID["road"], CLASS_ID["vehicle_small"]
     return ids

@@ -3,7 +3,8 @@
 import numpy as np
 from beartype import BeartypeConf, BeartypeHintOverrides, beartype
 
-# A NumPy scalar is accepted where a Python scalar is annotated. An integer is accepted for a float, as in PEP 484.
+# If a Python scalar is annotated, a NumPy scalar is also accepted. If a float is annotated, an integer is also
+# accepted, as in PEP 484.
 check_types = beartype(
     conf=BeartypeConf(
         hint_overrides=BeartypeHintOverrides(

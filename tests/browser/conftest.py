@@ -30,7 +30,7 @@ class Browser(webdriver.Chrome):
 def browser() -> Iterator[Browser]:
     """A new headless Chromium.
 
-    Without Chromium or its driver, the test is skipped, or fails if $CI is true.
+    If Chromium or its driver is missing, the test is skipped. If $CI is true, the test fails.
     """
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if not (chromium and driver):

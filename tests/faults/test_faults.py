@@ -41,7 +41,7 @@ from pipelines.preprocess.sources.town import kitti360_writer
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import storage
 
-import psutil  # isort: skip  # bundled with Ray, importable after ray
+import psutil  # isort: skip # Ray bundles this module; import ray first
 
 CROP = Grid(front_m=16.0, left_m=8.0, resolution_m=0.5, rows=32, cols=32)
 TABLES = ("scenes", "primitives", "rasters", "rejects")
@@ -50,7 +50,7 @@ TOWN_WORDS = ("jobs/preprocess_scenes.py", "town", "--num-train", "48", "--num-t
 
 
 def read_directory(root: Path) -> dict[str, Any]:
-    """Return the content of all files of a directory by path: tables from Parquet files, values from JSON files."""
+    """Return the content of all files in a directory, by path: tables of Parquet files and values of JSON files."""
     files = {str(path.relative_to(root)): path for path in sorted(root.rglob("*")) if path.is_file()}
     return {
         name: pq.read_table(path, partitioning=None) if name.endswith(".parquet") else json.loads(path.read_text())
@@ -65,7 +65,7 @@ def assert_same(root: Path, undisturbed: Path) -> None:
 
 
 def find_partial_shards(root: Path, seen: set[tuple[str, int]]) -> list[str]:
-    """Return the faults that a query over the tables finds at this moment, for files that are not in `seen`."""
+    """Return the faults that a query over the tables finds now; skip files that are in `seen`."""
     wrong = []
     for path in [path for table in TABLES for path in (root / table).rglob("*.parquet")]:
         with suppress(FileNotFoundError):
@@ -116,7 +116,7 @@ def town(cluster, tmp_path_factory) -> Path:
 def shards(cluster, tmp_path_factory) -> tuple[list[ShardTask], Path]:
     """Tasks for eleven shards of one drive, and the output of a run without faults.
 
-    One separate Ray task reads the drive once for all shards.
+    A separate Ray task reads the drive once for all shards.
     """
     root = tmp_path_factory.mktemp("shards")
     write_kitti360(generate_town(7).at(np.arange(40, 84), CROP), root / "raw")
@@ -132,7 +132,7 @@ def shards(cluster, tmp_path_factory) -> tuple[list[ShardTask], Path]:
 def kill_workers(quota: dict[str, int], seed: int) -> Iterator[list[str]]:
     """Kill Ray workers while the body runs and yield the names of the killed tasks.
 
-    `quota` is the number of kills per task name.
+    The dictionary `quota` contains the number of kills for each task name.
     """
     rng, killed, stop = np.random.default_rng(seed), [], threading.Event()
 
@@ -163,7 +163,7 @@ def add_delay(function: Callable, seconds: float) -> Callable:
         time.sleep(seconds)
         return result
 
-    run_with_delay.__qualname__ = function.__name__  # Ray names the task by this attribute
+    run_with_delay.__qualname__ = function.__name__  # Ray uses this attribute as the name of the task
     return run_with_delay
 
 
@@ -187,7 +187,7 @@ def test_ingest_is_unchanged_by_random_worker_kills(shards, tmp_path, monkeypatc
 
 
 def test_ingest_is_unchanged_by_worker_kill_during_write(shards, tmp_path, monkeypatch):
-    """The test kills the first writer of a staged table, of a manifest and of a published table."""
+    """The test kills the first writer of each kind of file: staged table, manifest and published table."""
     (tasks, undisturbed), root, died = shards, tmp_path / "out", tmp_path / "died"
     died.mkdir()
     doomed = (
@@ -250,7 +250,7 @@ def run_and_kill_job(root: Path, log: Path, when: Callable[[], bool]) -> None:
             assert job.poll() is None, log.read_text()
             time.sleep(0.01)
     finally:
-        with suppress(psutil.NoSuchProcess):  # the process ended before the kill; the assertion above reports its log
+        with suppress(psutil.NoSuchProcess):  # the process ended before the kill
             family = psutil.Process(job.pid).children(recursive=True)
             job.kill()
             job.wait()
@@ -404,7 +404,7 @@ def test_write_shard_rewrites_staged_shard_of_another_plan(raw, tmp_path):
         assert frames == [int(line.split()[0]) for line in kept]
 
 
-# --------------------------------------------------------------------- broken files read by write_shard without Ray
+# --------------------------------------------------------------------- broken files in write_shard without Ray
 
 CASE_SECONDS = 5.0  # processor time
 Tables = dict[str, list[dict]]
@@ -465,10 +465,10 @@ def find_changed_rows(before: list[dict], after: list[dict]) -> list[dict]:
 
 
 def classify_outcome(source: str, root: Path, path: Path, staging: Path, whole: Tables, touches: Touches) -> str:
-    """Return the effect of a broken file on the tables and assert that the effect is allowed.
+    """Assert that the effect of a broken file on the tables is allowed, and return the effect.
 
-    Returns:
-        "refused" if a reason names the file, "same" if all rows are equal, "changed" if only affected rows differ.
+    Returns: "refused" if a reason names the file, "same" if all rows are equal, or "changed" if only affected rows
+    differ.
     """
     try:
         tables, manifests = write_all_shards(source, root, staging)
@@ -631,8 +631,8 @@ def break_xml(rng: np.random.Generator, whole: bytes) -> bytes:
 def find_rows_of_xml(whole: bytes, broken: bytes) -> Touches:
     """Return the rows that a broken XML file may change.
 
-    These are the primitives of changed objects and of their copies in other windows. They include rasters if a changed
-    object is or was ground.
+    These are the primitives of changed objects and of their copies in other windows. They also include the rasters if a
+    changed object is ground before or after the change.
     """
     before, after = ([" ".join(b.replace("><", "> <").split()) for b in find_objects(xml)] for xml in (whole, broken))
     places = {read_field(block, "transform") for block in set(before) - set(after)}
@@ -669,7 +669,7 @@ def find_rows_of_poses(whole: bytes, broken: bytes) -> Touches:
 
 # ----------------------------------------------------------------------------------------------- Argoverse 2 files
 
-AV2_LOGS = ("broken", "intact")  # two logs of one shard: faults of the first must not affect the second
+AV2_LOGS = ("broken", "intact")  # two logs of one shard: faults of the first log must not affect the second log
 SWEEPS = 315969904359876000 + 100_000_000 * np.arange(3)
 
 
@@ -773,9 +773,9 @@ def break_feather(rng: np.random.Generator, whole: bytes) -> bytes:
 
 
 def find_differing_rows(read: Callable[[bytes], list[dict]], whole: bytes, broken: bytes) -> list[dict]:
-    """Return the rows that only one of two files contains, or no rows if one file is unreadable.
+    """Return the rows that only one of two files contains; return no rows if one file is unreadable.
 
-    An unreadable file must be refused, so none of its rows may differ.
+    The reader must refuse an unreadable file, so no row may differ.
     """
     try:
         return find_changed_rows(read(whole), read(broken))
@@ -792,7 +792,7 @@ def parse_frame(row: dict) -> int:
 
 
 def make_instance_id(given: Any) -> Any:
-    """Return an instance id as tables store it: a text is replaced by its hash."""
+    """Return an instance id in the form that tables store: the hash of a text, or the number itself."""
     if not isinstance(given, str):
         return -1 if given is None else given
     return int.from_bytes(hashlib.blake2b(given.encode(errors="replace"), digest_size=8).digest(), "big") >> 1
@@ -806,7 +806,7 @@ def find_rows_of_annotations(whole: bytes, broken: bytes) -> Touches:
     rows = find_differing_rows(read_feather_rows, whole, broken)
     ids = [make_instance_id(row.get("track_uuid")) for row in rows]
     sweeps = [{row["timestamp_ns"] for row in read_feather_rows(c)} for c in (whole, broken)] if ids else [set(), set()]
-    alone = sweeps[0] ^ sweeps[1]  # sweeps with boxes in only one of the files; the other file yields no scene
+    alone = sweeps[0] ^ sweeps[1]  # only one file contains boxes for these sweeps
     return lambda table, row: (
         is_of_broken_log(row) and (row["instance_id"] in ids if table == "primitives" else parse_frame(row) in alone)
     )
@@ -932,7 +932,7 @@ def find_rows_of_map(whole: bytes, broken: bytes) -> Touches:
 
 
 def write_custom(root: Path, suffix: str) -> None:
-    """Write two drives of three poses, each with four polygons and twenty boxes, of which six move."""
+    """Write two drives of three poses, each with four polygons and twenty boxes; six of the boxes move."""
     rng = np.random.default_rng(1)
     x0, y0, z0 = 456_789.0, 5_432_100.0, 115.0
     for name in AV2_LOGS:

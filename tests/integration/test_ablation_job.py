@@ -21,7 +21,7 @@ from pipelines.evaluation.ablation import (
 
 @pytest.fixture(scope="module")
 def empty_home(cluster, tmp_path_factory):
-    """An empty $PRITTI_HOME: the encoding study needs no data, and the smoke preset creates its dataset."""
+    """An empty $PRITTI_HOME. The encoding study needs no data, and the smoke preset creates its dataset."""
     with pytest.MonkeyPatch.context() as patch:
         path = tmp_path_factory.mktemp("ablation")
         patch.setenv("PRITTI_HOME", str(path))

@@ -15,7 +15,7 @@ JOBS = sorted(p.name for p in (ROOT / "jobs").glob("*.py") if os.access(p, os.X_
 def test_job_help_describes_job(job):
     done = run_command(f"jobs/{job}", "--help")
     assert done.returncode == 0 and job.removesuffix(".py") in done.stdout and len(done.stdout) > 300
-    assert not re.search(r"\(default: (None|''|)\)", done.stdout)  # options state in words what is used instead
+    assert not re.search(r"\(default: (None|''|)\)", done.stdout)  # the help states these defaults in words
 
 
 MISTAKES = {

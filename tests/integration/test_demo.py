@@ -30,7 +30,7 @@ def run_demo(output: Path) -> str:
 
 
 def read_times(output: Path) -> dict[str, int]:
-    """Return the modification times of all checkpoints and Parquet files in ns, by path."""
+    """Return the modification time of each checkpoint and Parquet file by path (ns)."""
     paths = [path for folder in ("runs", "datasets", "generated") for path in (output / folder).rglob("*")]
     return {str(path): path.stat().st_mtime_ns for path in paths if path.suffix in (".safetensors", ".parquet")}
 

@@ -1,4 +1,4 @@
-"""Every command block and every Python block of README and docs runs, or is marked with what it needs."""
+"""Tests that run every command block and Python block of README and docs, except blocks marked with a reason."""
 
 import os
 import re
@@ -16,7 +16,7 @@ TESTED_ELSEWHERE = {
     "docs/reference/tables.md": "tests/unit/test_tables_docs.py",
     "CONTRIBUTING.md": "only targets of make",
 }
-# Commands that a reader of a page has run before: pages of one topic assume scenes under $PRITTI_HOME/generated.
+# Commands that a reader runs before the page, because some pages assume scenes under $PRITTI_HOME/generated.
 SAMPLE = "jobs/sample_scenes.py --model town --num-scenes 2 --sampler dpm++ --num-inference-steps 10"
 BEFORE = dict.fromkeys(
     ("docs/how_to/edit_scenes.md", "docs/how_to/street_views.md", "docs/how_to/import_scenes.md"), SAMPLE
@@ -29,7 +29,7 @@ RUN_PAGES = [
 
 
 def run_words(words: list[str]) -> None:
-    """Run one command of a shell block: a job in this process, a target of make as a dry run."""
+    """Run one command of a shell block: run a job in this process, and run a target of make as a dry run."""
     from jobs.support.cli import run
 
     if words[0] == "export":
@@ -45,7 +45,7 @@ def run_words(words: list[str]) -> None:
 
 
 def run_shell(code: str) -> None:
-    """Run the commands of a shell block in order, with variables of the environment expanded."""
+    """Run the commands of a shell block in order, after the expansion of environment variables."""
     for line in code.replace("\\\n", " ").splitlines():
         if words := shlex.split(os.path.expandvars(line), comments=True):
             run_words(words)
@@ -60,7 +60,7 @@ def run_block(block: Block, names: dict) -> None:
 
 @pytest.mark.parametrize("page", RUN_PAGES)
 def test_document_blocks_run(page, tmp_path, monkeypatch, cluster):
-    for name in ("models", "docs"):  # commands name released weights relative to the repository
+    for name in ("models", "docs"):  # commands contain the path of the released weights relative to the repository
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PRITTI_HOME", str(tmp_path / "home"))

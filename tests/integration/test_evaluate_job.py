@@ -31,7 +31,8 @@ def weights(tmp_path_factory) -> str:
 
 
 def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_path):
-    """The test scores training scenes against test scenes twice: from tables and from ADM's .npz of their images."""
+    """The test compares training scenes with test scenes twice: first from tables, then from ADM's .npz files of
+    images."""
     data = str(smoke / "datasets/smoke")
     test = load_scenes(SceneSubset(data, "town", "test", SAMPLES).shards(), np.arange(SAMPLES))
     write_npz(str(tmp_path / "test.npz"), (np.stack([render_bev(scene)]) for scene in test), SAMPLES)
@@ -46,7 +47,7 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
     for name in ("fid", "sfid", "kid", "inception_score", "precision_k1", "recall_k3", "density_k3", "coverage_k1"):
         assert as_pictures[name]["value"] == pytest.approx(as_tables[name]["value"], rel=1e-5), (
             name
-        )  # rounding depends on the batch
+        )  # rounding errors depend on the composition of the batch
         assert as_tables[name]["low"] <= as_tables[name]["high"]
     assert as_tables["fid"]["value"] > 0 and as_tables["inception_score"]["value"] >= 1
     assert "validity" in as_tables and "validity" not in as_pictures
@@ -59,7 +60,7 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
 
 def test_evaluate_rejects_images_of_another_size(smoke, tmp_path):
     write_npz(str(tmp_path / "small.npz"), [np.zeros((4, 64, 64, 3), np.uint8)], 4)
-    with pytest.raises(ValueError, match=r"real pictures have \[256, 256\] pixels, generated pictures have \[64, 64\] pixels"):
+    with pytest.raises(ValueError, match=r"real pictures have \[256, 256\] pixels, generated pictures have \[64, 64\]"):
         evaluate(
             Config(real=str(smoke / "datasets/smoke"), generated=str(tmp_path / "small.npz"), output=str(tmp_path))
         )

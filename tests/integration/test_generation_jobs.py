@@ -291,7 +291,7 @@ def test_inpaint_writes_variants_and_resumes(smoke, samples, tmp_path):
         inpaint(replace(config, seed=1))
     with pytest.raises(ValueError, match="the region contains no pixel"):
         inpaint(replace(config, half_plane=(1.0, 0.0, 99.0), run="other"))
-    Path(find_shards(str(samples))[0].path("scenes")).touch()  # the file may contain other scenes after this change
+    Path(find_shards(str(samples))[0].path("scenes")).touch()  # the file may have different scenes after this change
     with pytest.raises(ValueError, match="holds a run 'inpainted' with other scenes; choose another --run"):
         inpaint(config)
 
@@ -315,7 +315,7 @@ def test_run_guard_keeps_noise_scaling_of_guided_run(smoke, tmp_path):
 
 
 def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
-    """The scores of training scenes against themselves are the noise floor of the evaluator."""
+    """The evaluator compares training scenes with the same scenes, so the scores show its noise floor."""
     from pipelines.evaluation.evaluate import compare_datasets
     from pipelines.evaluation.features import FeatureConfig, compute_scene_features
     from pipelines.schema.dataset import Dataset
@@ -334,7 +334,8 @@ def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
 
 
 def test_scene_features_resume_interrupted_run(smoke, tmp_path, monkeypatch):
-    """The second call keeps existing parts and computes missing parts. With other options, all parts are recomputed."""
+    """The second call keeps existing parts and computes missing parts. If the options change, the call recomputes all
+    parts."""
     from pipelines.evaluation import features as module
     from pipelines.schema.dataset import Dataset
     from pipelines.schema.scene_subset import SceneSubset

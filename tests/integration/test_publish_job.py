@@ -1,4 +1,4 @@
-"""Tests of jobs/publish_model.py: required evaluation and training records, and names of published models."""
+"""Tests of jobs/publish_model.py: the records that it requires, and the names of published models."""
 
 import json
 from pathlib import Path
@@ -163,7 +163,7 @@ def test_train_dit_starts_from_weights_and_records_both_runs(smoke, tmp_path):
     sampling = load_pipeline(complete(str(more))).config
     assert (
         sampling["noise_scaling"] == 1.01 and sampling["existence_threshold"] == 0.25
-    )  # both settings equal those of the initial pipeline
+    )  # both settings have the values of the initial pipeline
     with pytest.raises(ValueError, match=r"its label is vegetation, but that of this run is vehicle"):
         prepare(Config(preset="smoke", name="other", start_from=start, label_kind="vehicle"))
     with pytest.raises(ValueError, match=r"--start-from town: .* another layout VAE"):

@@ -16,6 +16,6 @@ def test_reference_sweep_has_row_per_reference_and_k(cluster):
     assert len(done) == 2 and all(0 < row["precision"] <= 1 for row in rows)
     assert all(
         a["precision"] <= b["precision"] for a, b in zip(rows[::2], rows[1::2], strict=True)
-    )  # a larger k has larger balls
+    )  # a larger k gives larger balls
     assert draw_sweep_charts(rows)[1].series["precision, k = 3"][0] == [20, 200]
     assert "farthest" in render_sweep_html(rows, ["how"])

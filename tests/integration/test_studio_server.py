@@ -1,4 +1,4 @@
-"""Tests of the HTTP interface of the studio on Ray Serve, with a model of random weights."""
+"""Tests of the HTTP interface of the studio on Ray Serve, with a model that has random weights."""
 
 import socket
 import time

@@ -1,4 +1,5 @@
-"""Tests of the training jobs on Ray with the smoke presets: job order, resuming, two workers and bad input."""
+"""Tests of the training jobs on Ray with the smoke presets: order of the jobs, resuming, two workers, and invalid
+input."""
 
 import json
 import os
@@ -196,7 +197,7 @@ def test_train_lvae_names_truncated_shard(home, tmp_path):
 
 
 def test_encode_reports_worker_error_in_one_line(home, tmp_path):
-    """For a truncated shard that an actor reads, the job prints no traceback and exits with code 2."""
+    """If an actor reads a truncated shard, the job exits with code 2 and prints no traceback."""
     shutil.copytree(home / "datasets/smoke", tmp_path / "data")
     (tmp_path / "data/latents.json").unlink()
     path = Path(find_shards(str(tmp_path / "data"))[-1].path("rasters"))

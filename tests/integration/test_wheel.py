@@ -24,7 +24,7 @@ PACKAGES = ("pritti", "models", "pipelines", "jobs")
 
 
 def run_program(*words: str | Path, cwd: Path, **environment: str) -> str:
-    """Run a command without the Python path and settings of this process and return its output."""
+    """Run a command without the Python path and the settings of this process, and return the output."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PRITTI"))}
     done = subprocess.run(words, cwd=cwd, env=kept | environment, text=True, capture_output=True, timeout=1500)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
@@ -61,7 +61,7 @@ def test_wheel_generates_scene_outside_repository(wheel, tmp_path):
     site = tmp_path / "site"
     words = ("install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-compile", "--target", site, wheel)
     run_program(sys.executable, "-m", "pip", *words, cwd=tmp_path)
-    python = (sys.executable, "-P")  # -P keeps the working directory off sys.path
+    python = (sys.executable, "-P")  # with -P, sys.path does not contain the working directory
     assert re.search(
         r"\d+ primitives",
         run_program(*python, "-c", GENERATE.format(site=str(site)), cwd=tmp_path, PYTHONPATH=str(site)),
@@ -72,7 +72,7 @@ def test_wheel_generates_scene_outside_repository(wheel, tmp_path):
 
 @pytest.mark.slow
 def test_wheel_with_dependencies_runs_console_script(wheel, tmp_path):
-    """The test uses an empty environment, so pyproject.toml must list each dependency."""
+    """The environment of the test is empty, so the test fails if pyproject.toml lacks a dependency."""
     bin_ = tmp_path / "venv/bin"
     run_program(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     words = ("install", "--quiet", "--disable-pip-version-check", "--no-compile", wheel)

@@ -1,4 +1,4 @@
-"""Tests of the ablations: box encodings, the small autoencoder and the switches of the layout VAE."""
+"""Tests of the ablations: box encodings, the small autoencoder and the optional components of the layout VAE."""
 
 import itertools
 import re
@@ -53,7 +53,7 @@ def compute_corners(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 
 
 def compute_box_distance(a: tuple, b: tuple) -> np.ndarray:
-    """Return the Hausdorff distance (...) of the corners: 0 for two descriptions of the same box."""
+    """Return the Hausdorff distance (...) of the corners, which is 0 for two descriptions of the same box."""
     gaps = np.linalg.norm(compute_corners(*a)[..., :, None, :] - compute_corners(*b)[..., None, :, :], axis=-1)
     return np.maximum(gaps.min(axis=-1).max(axis=-1), gaps.min(axis=-2).max(axis=-1))
 
@@ -61,7 +61,7 @@ def compute_box_distance(a: tuple, b: tuple) -> np.ndarray:
 def draw_boxes_of_any_size(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return n boxes with random rotations and sizes.
 
-    A third of the boxes has three different extents, a third has two equal extents, and a third are cubes.
+    One third of the boxes have three different extents, one third have two equal extents, and one third are cubes.
     """
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.3, 5.0, (n, 3))
@@ -99,7 +99,7 @@ def test_encoding_is_unique_per_box_except_quaternion():
 
 
 def test_encoding_is_bi_lipschitz_only_if_octahedral():
-    """For near and far pairs, the test bounds the ratio of code change to corner distance from both sides."""
+    """The test checks a lower and an upper bound of code change divided by corner distance, for near and far pairs."""
     rng = np.random.default_rng(1)
     rotation, size = draw_boxes_of_any_size(6000)
     step = 10 ** rng.uniform(-4, 0, (6000, 1))
@@ -113,12 +113,12 @@ def test_encoding_is_bi_lipschitz_only_if_octahedral():
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
     assert ratio["cholesky"].min() < 1e-6  # The rotation of a cube does not change its code.
-    assert ratio["quaternion"].max() > 1000  # Length and width swap, or yaw jumps between -pi/2 and pi/2.
+    assert ratio["quaternion"].max() > 1000  # Length and width are swapped, or yaw jumps between -pi/2 and pi/2.
 
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
 def test_encoding_is_continuous_where_length_equals_width(name):
-    """On a path of boxes through length = width, finer steps change the code by smaller amounts.
+    """Along a path of boxes that passes length = width, smaller steps cause smaller changes of the code.
 
     The path turns the box by 180 degrees, tilts it and returns to the same box.
     """
@@ -189,7 +189,7 @@ def test_autoencoder_bodies_are_equal_and_small():
         bodies.append({n: p for n, p in model.state_dict().items() if not n.startswith(ends)})
     for body in bodies[1:]:
         assert body.keys() == bodies[0].keys()
-        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # the initial weights are equal, too
+        assert all(torch.equal(body[name], bodies[0][name]) for name in body)  # the initial weights are also equal
 
 
 def test_trial_training_sets_are_nested_and_differ_by_seed():
@@ -250,7 +250,7 @@ def test_layout_vae_switches_disable_their_branch(decoder, switch, channels):
         assert not any(len(scene) for scene in rebuilt)
     if (
         ground and objects
-    ):  # both decoders read both halves of the latent; the linear ground start reads only the ground half
+    ):  # both decoders read the whole latent; the linear start of the ground decoder reads only the ground half
         own, other = lvae.ground_decoder.shortcut.weight.split(16)
         assert (own != 0).any() and not other.any()
         assert (lvae.ground_decoder.shortcut.weight.grad[16:] != 0).any()

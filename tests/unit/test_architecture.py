@@ -1,4 +1,4 @@
-"""Tests of the imports: they point from pritti to jobs, pipelines and models and have no cycles."""
+"""Tests of the imports: each package imports only lower packages (pritti, jobs, pipelines, models), without cycles."""
 
 import ast
 import subprocess
@@ -67,13 +67,13 @@ def find_cycle(graph: dict[str, dict[str, str]]) -> list[str]:
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
-        nodes = error.args[1][::-1]  # CycleError lists predecessors first
+        nodes = error.args[1][::-1]  # CycleError lists a predecessor before its successor
         return [graph[here][there] for here, there in pairwise(nodes)]
     return []
 
 
 def find_cycles(root: Path) -> list[str]:
-    """Return the import cycles between modules and between the children of a package, as lines with imports."""
+    """Return the import cycles between modules and between the children of a package, one line of imports per cycle."""
     graph = find_imports(root)
     modules = {name: {target: f"{name} imports {target}" for target in targets} for name, targets in graph.items()}
     found = [find_cycle(modules)]
@@ -101,7 +101,7 @@ def test_architecture_names_edges_of_planted_cycles(tmp_path):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(source)
-    (folders,) = find_cycles(tmp_path)  # a cycle between folders, without a cycle between modules
+    (folders,) = find_cycles(tmp_path)  # the folders have a cycle, but the modules have none
     assert "pipelines.a.one imports pipelines.b.two" in folders
     assert "pipelines.b.three imports pipelines.a.four" in folders
     (tmp_path / "pipelines/b/two.py").write_text("import pipelines.a.one")
@@ -139,7 +139,7 @@ def test_models_import_without_ray_or_pyarrow():
 
 
 def test_architecture_has_no_pickle_or_unsafe_load():
-    """No module reads pickles: weights and data are safetensors, JSON and Parquet."""
+    """No module reads pickles, because weights and data are stored as safetensors, JSON and Parquet."""
     for path in [p for folder in ("models", "pipelines", "jobs") for p in (ROOT / folder).rglob("*.py")]:
         text = path.read_text()
         assert "import pickle" not in text and "allow_pickle=True" not in text, path

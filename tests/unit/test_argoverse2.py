@@ -1,4 +1,4 @@
-"""Tests of the Argoverse 2 reader: plausibility on two real logs, frames on a synthetic log, and broken files."""
+"""Tests of the Argoverse 2 reader: plausibility of two real logs, frames of a synthetic log, and broken files."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ def make_quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def make_pose_table() -> pa.Table:
-    """Return poses of an ego vehicle that drives 1 m per sweep straight ahead, with poses between the sweeps."""
+    """Return poses at and between the sweeps for an ego vehicle that drives straight ahead, 1 m per sweep."""
     time = np.sort(np.concatenate([SWEEPS, SWEEPS + 50_000_000]))
     ahead = np.array([np.cos(YAW), np.sin(YAW), 0.0])
     at = ORIGIN + ((time - SWEEPS[0]) / 1e8).round(1)[:, None] * ahead
@@ -58,7 +58,7 @@ def make_points(*xy: tuple[float, float]) -> list[dict]:
 
 
 def make_map_json() -> dict:
-    """Return a map with road within 40 m of the origin and a crossing of 3 x 10 m.
+    """Return a map with a road area up to 40 m from the origin and a crossing of 3 x 10 m.
 
     The two edges of the crossing have opposite directions.
     """
@@ -177,7 +177,7 @@ def real_drive(real_data, request):
 
 
 def sample_surface(drive, points_m: np.ndarray) -> np.ndarray:
-    """Return the heights of the raster at world points in m, NaN where unknown."""
+    """Return the raster heights at world points in m; an unknown height is NaN."""
     ground = drive.ground
     col, row = (points_m[:, :2] @ ground.raster_from_world[:2, :2].T + ground.raster_from_world[:2, 2]).astype(int).T
     rows, cols = ground.raster_m.shape
@@ -199,7 +199,7 @@ def test_argoverse2_real_cars_stand_on_ground(real_drive):
 
 
 def test_argoverse2_real_bollards_do_not_move(real_drive):
-    """Bollards are static only if the reader applies the pose of every sweep of the moving car."""
+    """Bollards are static only if the reader applies the ego pose of each sweep, because the ego vehicle moves."""
     bollards = real_drive.label == "BOLLARD"
     for track in np.unique(real_drive.instance_id[bollards]):
         places = real_drive.center_m[real_drive.instance_id == track]

@@ -1,4 +1,4 @@
-"""Tests of augmentation: scenes are mirrored or seen from a displaced vehicle."""
+"""Tests of augmentation, which mirrors scenes or displaces the ego vehicle."""
 
 from dataclasses import replace
 

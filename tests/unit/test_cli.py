@@ -78,7 +78,7 @@ def test_job_exits_with_code_2_for_renamed_option():
 
 
 def test_option_modules_import_nothing_heavy():
-    """The modules with options import no heavy packages because `--help` imports these modules."""
+    """The modules with options import no heavy packages, because `--help` must import these modules quickly."""
     names = ", ".join(f"jobs.{job}" for job in JOBS)
     done = run_python("-c", f"import sys, {names}, pritti.cli; print(*sorted(sys.modules))")
     heavy = {"torch", "ray", "numpy", "pyarrow", "mlflow", "diffusers", "trimesh", "models", "pipelines"}
@@ -142,7 +142,8 @@ def find_imported_names(path: Path) -> set[str]:
 
 
 def test_jobs_import_one_way():
-    """Executables import only jobs.support, which imports neither executables nor implementations."""
+    """Executables import only jobs.support. The modules of jobs.support import no executables and no
+    implementations."""
     support = tuple(f"jobs.support.{path.stem}" for path in (ROOT / "jobs/support").glob("*.py")) + ("jobs.support.",)
     for folder in ("jobs", "jobs/support"):
         for path in (ROOT / folder).glob("*.py"):

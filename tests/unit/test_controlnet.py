@@ -1,4 +1,4 @@
-"""Tests of the ControlNet step with a diffusers pipeline of small random weights."""
+"""Tests of the ControlNet step with a small diffusers pipeline that has random weights."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tests of custom drives: content of scenes, ground compared with shapely, and errors for wrong files."""
+"""Tests of custom drives: content of scenes, ground in comparison with shapely, and errors for invalid files."""
 
 import hashlib
 import json
@@ -49,7 +49,7 @@ def make_outline(*xy: tuple[float, float], z: float = -1.0) -> list[list[float]]
 def make_street() -> Tables:
     """Return the tables of a street with two poses that are 2 m apart.
 
-    The street contains a parked car, a tree, a pole, a house, a pedestrian and a truck that moves by 3 m.
+    The street contains a parked car, a tree, a pole, a house, a pedestrian and a truck. The truck moves by 3 m.
     """
     return {
         "boxes": [
@@ -113,7 +113,8 @@ def test_custom_source_reads_json_and_parquet_equally(tmp_path):
 
 
 def test_custom_source_reads_pandas_frame_with_gaps_and_index(tmp_path):
-    """pandas converts an integer column with gaps to floats and writes the index of a filtered frame."""
+    """pandas converts an integer column with gaps to floats. After filtering, pandas also writes the index as a
+    column."""
     a = write_and_read_drive(make_street(), tmp_path / "a")
     folder = write_drive(make_street(), tmp_path / "b", parquet=True) / "street"
     rows = make_street()["boxes"]
@@ -181,7 +182,7 @@ def test_custom_source_places_boxes_in_scene(tmp_path):
     expected = [[20, -6, 0], [30, 9, 3], [12, 8, 2], [40, 20, 4], [25, 0, 0.5]]
     assert np.allclose(scene.center_m, expected, atol=1e-5)
     assert np.allclose(drive.scene(1).center_m[:4], np.array(expected)[:4] - [2, 0, 0], atol=1e-5)
-    assert np.allclose(scene.size_m[3], [14, 8, 9])  # the longer side is the length
+    assert np.allclose(scene.size_m[3], [14, 8, 9])  # the length is the longer side
     assert np.allclose(scene.yaw_rad[[0, 4]], [3.0 - np.pi, 0.1], atol=1e-5)
     assert np.allclose(scene.heading_rad, [3.0, np.nan, np.nan, 0.0, 0.1], atol=1e-5, equal_nan=True)
     assert scene.label.tolist()[:2] == ["Parked", "vegetation_ellipsoid"]
@@ -374,7 +375,7 @@ def test_custom_source_drive_at_some_poses_has_same_scenes(tmp_path):
 def convert_drive(drive: Drive) -> Tables:
     """Convert a town to the custom format.
 
-    The result has quaternions, pose matrices with y left and z up, and the tops of ground slabs as polygons.
+    The result contains quaternions, pose matrices (y to the left, z up), and the tops of ground slabs as polygons.
     """
     quaternion = Rotation.from_matrix(drive.rotation).as_quat(scalar_first=True)
     columns = {
@@ -416,13 +417,13 @@ def test_custom_source_round_trips_town(tmp_path):
             assert np.allclose(getattr(a, name), getattr(b, name), atol=1e-4), name
         assert np.array_equal(np.isnan(a.heading_rad), np.isnan(b.heading_rad))
         turned = (a.heading_rad - b.heading_rad + np.pi) % (2 * np.pi) - np.pi
-        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # boxes of the town are tilted with the slope
+        assert np.nanmax(np.abs(turned), initial=0) < 0.01  # boxes of the town follow the slope of the ground
         assert np.isclose(a.world_yaw_rad, b.world_yaw_rad) and np.allclose(a.world_xyz_m, b.world_xyz_m)
         seen_moving += int(np.isin(town.timestamp, town.frame[k]).sum())
         common = [a.ground_classes.index(name) for name in b.ground_classes]
         assert (b.occupied | ~a.occupied[common]).all()  # the town drops slabs without a vertex in the crop
         difference = np.abs(a.height_m[common] - b.height_m)[a.occupied[common]]
-        assert difference.max() < 0.05 and np.median(difference) < 0.002  # the triangulations of the same points differ
+        assert difference.max() < 0.05 and np.median(difference) < 0.002  # the triangulations differ
     assert seen_moving > 3
 
 
@@ -435,7 +436,7 @@ def find_code_blocks(language: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def document_variables(tmp_path_factory) -> dict:
-    """Variables after all Python blocks of the document ran in an empty folder."""
+    """Variables that exist after all Python blocks of the document have run in an empty folder."""
     folder = tmp_path_factory.mktemp("example")
     names = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Tests of the stream of training samples: scenes per epoch, and independence of the number of workers."""
+"""Tests of the stream of training samples: the scenes of each epoch, with different numbers of workers."""
 
 import numpy as np
 import pytest

@@ -38,7 +38,7 @@ def test_find_duplicates_finds_known_object():
 
 def test_find_duplicates_finds_shifted_copy_but_no_neighbor():
     known = make_row_of_boxes([0], [0.9], "vegetation_cuboid")
-    # The IoU of boxes at 0 m and 2.5 m is 1.5 / 6.5. The box at 2.5 m is a copy of the known box unless another
+    # The IoU of boxes at 0 m and 2.5 m is 1.5 / 6.5. The box at 2.5 m is a copy of the known box, except if another
     # generated box is closer to the known box.
     far_copy, near_copy = [2.5, 7], [0.2, 2.5]
     for shift_m, again in ((far_copy, [True, False]), (near_copy, [True, False]), ([3.9, 7], [False, False])):
@@ -52,7 +52,7 @@ def test_find_duplicates_keeps_slightly_overlapping_neighbors():
     known = make_row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
     made = make_row_of_boxes(
         [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
-    )  # IoU 0.053 and 0.039 with the known boxes, 0.046 with the first box
+    )  # the IoU is 0.053 and 0.039 with the known boxes, and 0.046 with the first box
     overlaps = compute_iou3d_matrix(extract_boxes(made), extract_boxes(known))
     assert (
         overlaps[0, 0] > REGENERATED_IOU3D > overlaps[1, 0] > 0
@@ -65,7 +65,7 @@ def test_suppress_duplicates_keeps_higher_confidence():
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.6, 0.9])).tolist() == [
         True,
         False,
-    ]  # IoU 3 / 5
+    ]  # the IoU is 3 / 5
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 1], [0.7, 0.7])).tolist() == [
         False,
         True,
@@ -73,7 +73,7 @@ def test_suppress_duplicates_keeps_higher_confidence():
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [
         False,
         False,
-    ]  # IoU 1 / 7: the next part of a fence
+    ]  # the IoU of this next part of a fence is 1 / 7
 
 
 def test_suppress_duplicates_uses_threshold_of_category():
@@ -81,14 +81,14 @@ def test_suppress_duplicates_uses_threshold_of_category():
         assert find_lower_confidence_duplicates(make_row_of_boxes([0, 3], [0.9, 0.6], category)).tolist() == [
             False,
             not both_stay,
-        ]  # IoU 1 / 7
+        ]  # the IoU is 1 / 7
         assert not find_lower_confidence_duplicates(
             make_row_of_boxes([0, 3.9], [0.9, 0.6], category)
-        ).any()  # IoU 1 / 79
+        ).any()  # the IoU is 1 / 79
         assert find_lower_confidence_duplicates(make_row_of_boxes([0, 2], [0.9, 0.6], category)).tolist() == [
             False,
             True,
-        ]  # IoU 1 / 3
+        ]  # the IoU is 1 / 3
         made, known = make_row_of_boxes([0, 3], [0.9, 0.9], category), make_row_of_boxes([0], [0.6], category)
         assert find_regenerated_objects(made, known).tolist() == [True, not both_stay]
 

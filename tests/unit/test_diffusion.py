@@ -1,4 +1,4 @@
-"""Tests of the noise schedule, samplers, RePaint and the trainer, in part against diffusers and torch."""
+"""Tests of the noise schedule, samplers, RePaint and the trainer; some tests compare with diffusers and torch."""
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_add_noise_in_two_steps_has_variance_of_one():
 
 
 def test_velocity_converts_to_epsilon():
-    """A DiT with v-prediction converts a velocity of diffusers to the noise."""
+    """A DiT with v-prediction converts the velocity of diffusers to noise."""
     clean, noise, t = torch.randn(4, *LATENT_SHAPE), torch.randn(4, *LATENT_SHAPE), torch.tensor([0, 250, 600, 999])
     latent, velocity = (
         SchedulerConfig.ddpm().build().add_noise(clean, noise, t),
@@ -93,7 +93,7 @@ def test_velocity_dit_equals_weighted_epsilon_dit():
         velocity_dit.precompute_conditioning(t.tolist(), [0, 1, 2, 3])(latent, t, label), expected, atol=1e-5
     )
     assert (noise_dit.loss_weight(t) == 1).all()
-    other = torch.randn(4, *LATENT_SHAPE)  # the weighted epsilon error equals the velocity error
+    other = torch.randn(4, *LATENT_SHAPE)  # the weighted error of epsilon equals the error of the velocity
     wrong = (1 - alpha_bar).sqrt() * latent + alpha_bar.sqrt() * other
     weighted = velocity_dit.loss_weight(t) * ((wrong - expected) ** 2).mean((1, 2, 3))
     assert torch.allclose(weighted, ((other - velocity) ** 2).mean((1, 2, 3)), rtol=1e-3)
@@ -129,7 +129,7 @@ def test_guidance_at_scale_one_adds_no_evaluation():
 
 
 def test_repaint_timesteps_equal_diffusers():
-    """The timesteps equal those of diffusers, which contains code of the RePaint authors."""
+    """The timesteps equal the timesteps of diffusers, which contains code by the RePaint authors."""
     reference = RePaintScheduler(num_train_timesteps=250)
     for jump, resamplings in ((10, 10), (5, 3), (10, 1), (1, 2)):
         reference.set_timesteps(250, jump_length=jump, jump_n_sample=resamplings)
@@ -239,7 +239,7 @@ def test_trainer_resumes_exactly(tmp_path):
 
 
 def test_trainer_half_batches_have_losses_of_whole_batch():
-    """Two workers with four samples each compute the losses of one worker with eight samples."""
+    """Two workers with four samples each compute the same losses as one worker with eight samples."""
     batch = make_dit_batch()
     whole = float(make_trainer().step(batch, range(8))["loss"])
     halves = []
@@ -280,7 +280,7 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
         trainer.step(batch, range(8, 16))
     assert (
         caught.value.positions == [11] and len(calls) == 1
-    )  # the search for the sample does not call the wrapped model, which would wait for other workers
+    )  # the wrapped model would wait for other workers, so the search for the sample does not call it
     batch["mean"][:] = float("nan")
     with pytest.raises(NonFiniteLossError, match="for all samples, because the weights are invalid"):
         trainer.step(batch, range(8))
@@ -304,7 +304,7 @@ def test_trainer_drops_labels_of_a_tenth_of_samples():
 
 
 def test_learning_rate_is_one_cycle_without_warm_up():
-    """The learning rate equals CosineAnnealingLR of torch from 1e-4 to 1e-5: OneCycleLR without warm-up."""
+    """The learning rate equals that of torch's CosineAnnealingLR from 1e-4 to 1e-5, without warm-up."""
     settings = OptimizerConfig(100, 1e-4, 0.0, final_learning_rate=1e-5, cycle_momentum=(0.85, 0.95))
     rates, betas = zip(*(settings.at(k) for k in range(100)), strict=True)
     assert (

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers import ROOT
 
-DOCUMENTED = (  # files and folders of the public API; pipelines.evaluation, reporting and studio serve the jobs only
+DOCUMENTED = (  # files and folders of the public API; only the jobs use pipelines.evaluation, reporting and studio
     "models",
     "pipelines/editing",
     "pipelines/generation",
@@ -48,7 +48,7 @@ def list_entries(docstring: str, heading: str) -> list[str]:
 
 
 def list_raised(function: ast.FunctionDef) -> set[str]:
-    """List the exceptions that the function itself raises by name."""
+    """List the names of the exceptions that the function itself raises."""
     raised, nodes = set(), list(function.body)
     while nodes:
         node = nodes.pop()
@@ -60,7 +60,7 @@ def list_raised(function: ast.FunctionDef) -> set[str]:
 
 
 def find_gaps(function: ast.FunctionDef) -> list[str]:
-    """Describe what the docstring of a function lacks, or names without need."""
+    """List the entries that the docstring of a function lacks, and the entries that it must not have."""
     docstring = ast.get_docstring(function)
     if not docstring:
         return ["no docstring"]

@@ -1,4 +1,4 @@
-"""README and docs keep the rules of CONTRIBUTING: length, plain expressions, existing paths and links."""
+"""Tests that README and docs follow the rules of CONTRIBUTING: length, plain expressions, valid paths and links."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from helpers import ROOT
 
 WRITTEN = [page for page in PAGES if page not in GENERATED]
 MAX_README_WORDS, MAX_COLUMNS, MAX_TABLE_COLUMNS = 1300, 120, 8
-# Expressions that readers found unclear, with the plain ones.
+# Expressions that readers found unclear, and plain replacements.
 UNCLEAR = {
     r"\banew\b": "again",
     r"\bgoes? on\b": "continues",
@@ -39,7 +39,7 @@ def test_readme_is_short():
 
 @pytest.mark.parametrize("page", WRITTEN)
 def test_document_lines_fit(page):
-    """Rows of tables cannot be wrapped; their number of columns is limited instead."""
+    """A row of a table cannot be wrapped, so the test limits the number of columns."""
     lines = read_page(page).splitlines()
     rows = [line for line in lines if line.startswith("|")]
     wide = [line for line in lines if len(line) > MAX_COLUMNS and line not in rows]
@@ -60,7 +60,7 @@ def test_document_has_no_unclear_expression(page):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_document_paths_exist(page):
-    """A path of the repository in a code span exists, unless it is a pattern such as NAME or <name>."""
+    """Each repository path in a code span exists, except for patterns such as NAME or <name>."""
     pattern = r"`((?:pritti|models|pipelines|jobs|tests|docs|benchmarks|infra)/[\w/.*-]*)`"
     named = {match for match in re.findall(pattern, read_page(page)) if "NAME" not in match}
     missing = [path for path in named if not list(ROOT.glob(path.rstrip("/")))]
@@ -71,7 +71,7 @@ def test_document_paths_exist(page):
 def test_document_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", strip_code(read_page(page))):
         if re.match(r"https?:", target) or "reference/api/" in target or "reference/cli/" in target:
-            continue  # pages that `make docs` generates, which checks links to them
+            continue  # `make docs` generates these pages and checks links to them
         path, _, anchor = target.partition("#")
         file = Path(ROOT, page).parent / path if path else Path(ROOT, page)
         assert file.exists(), target
@@ -82,7 +82,7 @@ def test_document_links_lead_somewhere(page):
 
 
 def test_every_page_is_in_the_navigation():
-    """Experiments are listed by their index. Model cards and files of the repository root are not part of the site."""
+    """An index page lists the experiments. The site does not contain model cards and files of the repository root."""
     navigation, index = Path(ROOT, "mkdocs.yml").read_text(), read_page("docs/experiments/index.md")
     for page in PAGES:
         name = page.removeprefix("docs/")

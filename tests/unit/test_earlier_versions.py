@@ -1,4 +1,4 @@
-"""Tests of the pipelines and tables of version 0.1 in tests/golden/version_0_1."""
+"""Tests that read pipelines and tables written by version 0.1 (tests/golden/version_0_1)."""
 
 import json
 

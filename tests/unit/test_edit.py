@@ -120,8 +120,8 @@ def test_translate_moves_along_scene_or_own_axes(scene):
     length = scene.rotation[:, :, 0]
     heading = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1)
     known = ~np.isnan(scene.heading_rad)
-    assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # Moves are along the length.
-    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # Moves are in the direction of known headings.
+    assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # Objects move along their length.
+    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # Moves follow known headings.
     assert np.abs(way_m - length)[~known].max() < 1e-4
 
 
@@ -230,7 +230,7 @@ def make_two_cars(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) ->
 
 
 def test_repair_separates_overlap_by_shortest_move():
-    scene = make_two_cars(-0.4)  # the IoU3D is 0.0495 with the lateral offset and 0.4 / 7.6 = 0.0526 without
+    scene = make_two_cars(-0.4)  # the IoU3D is 0.0495, and it would be 0.4 / 7.6 = 0.0526 without the lateral offset
     scene = replace(scene, center_m=scene.center_m * np.array([1, 0, 1], np.float32))
     mended, (done,) = replay_edits(scene, [edit.Repair(ALL)])
     assert compute_overlap(scene) > 0.05 > compute_overlap(mended) and len(mended) == 2
@@ -278,7 +278,8 @@ def test_repair_shrinks_or_removes_unmovable_primitives():
 
 
 def test_repair_fixes_disturbed_town_and_keeps_valid_objects(town_scenes):
-    """The test moves a fifth of the objects up or down by 0.6 to 0.9 m and a fifth sideways by at most 1 m."""
+    """The test moves one fifth of the objects up or down by 0.6 to 0.9 m. It moves another fifth sideways by at most 1
+    m."""
     rng, overlapping = np.random.default_rng(1), []
     for scene in town_scenes:
         center_m = scene.center_m.copy()

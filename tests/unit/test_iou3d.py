@@ -1,4 +1,4 @@
-"""Tests of IoU3D against polytope volumes from manifold3d and from the intersection of half-spaces."""
+"""Tests of IoU3D against the volumes of polytopes from manifold3d and from intersections of half-spaces."""
 
 import manifold3d
 import numpy as np
@@ -25,7 +25,7 @@ def compute_manifold_iou(a: Boxes, b: Boxes) -> np.ndarray:
 
 
 def compute_halfspace_iou(a: Boxes, b: Boxes, i: int) -> float:
-    """Return the IoU of pair i from the vertices of the intersection of twelve half-spaces.
+    """Return the IoU of pair i. The intersection of the boxes is the intersection of twelve half-spaces.
 
     The IoU is 0 if the intersection contains no ball of radius 1e-9 m.
     """
@@ -58,7 +58,7 @@ def draw_boxes(rng, n, spread_m=1.0, low_m=0.05, high_m=20.0) -> Boxes:
 
 
 def disturb(rng, a: Boxes, noise: float) -> Boxes:
-    """Return the boxes with random errors: `noise` metres in centres and extents, `noise` radians in axes."""
+    """Return the boxes after random changes of centres and extents (`noise` in m) and of axes (`noise` in rad)."""
     turn = Rotation.from_rotvec(noise * rng.normal(size=(len(a.size_m), 3))).as_matrix()
     center_m = a.center_m + noise * rng.normal(size=a.center_m.shape)
     return make_boxes(center_m, turn @ a.rotation, np.maximum(a.size_m + noise * rng.normal(size=a.size_m.shape), 0.01))
@@ -70,7 +70,7 @@ def shift(a: Boxes, share: float, axis: int) -> Boxes:
 
 
 def permute_axes(a: Boxes, order: list[int]) -> Boxes:
-    """Return the same solids with permuted axes, that is, with rotations by 90 degrees."""
+    """Return the same solids with permuted axes; a permutation is a rotation by 90 degrees."""
     return make_boxes(a.center_m, a.rotation[:, :, order], a.size_m[:, order])
 
 
@@ -132,7 +132,7 @@ def test_iou3d_equals_hand_computed_cases():
     assert compute_iou3d_pairs(unit, shift(unit, 5.0, 2)) == 0
     assert compute_iou3d_pairs(unit, unit._replace(size_m=np.full((1, 3), 0.5))) == pytest.approx(1 / 8, abs=1e-8)
     diagonal = make_yaw_rotation(np.array([np.pi / 4]))
-    octagon = 2 * (np.sqrt(2) - 1)  # two unit squares at an angle of 45 degrees
+    octagon = 2 * (np.sqrt(2) - 1)  # two unit squares with an angle of 45 degrees between them
     assert compute_iou3d_pairs(unit, unit._replace(rotation=diagonal)) == pytest.approx(
         octagon / (2 - octagon), abs=1e-8
     )
@@ -178,7 +178,7 @@ def test_iou3d_rejects_invalid_boxes(part, value, message):
 
 
 def test_ellipsoid_iou3d_keeps_stated_error():
-    """The reference is the closed form for two spheres; a linear map of both spheres keeps the IoU."""
+    """The reference is the closed form for two spheres. A linear map of both spheres does not change the IoU."""
     rng = np.random.default_rng(4)
     n = 200
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)

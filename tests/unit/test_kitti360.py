@@ -1,4 +1,4 @@
-"""Tests of the KITTI-360 reader: geometry against the vertices in files, defective objects and broken files."""
+"""Tests of the KITTI-360 reader: comparison with the vertices in files, defective objects and broken files."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ CUBE = np.array(
     [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1], [-1, -1, 1]]
 ) / 2  # fmt: skip
 CUBE_FACES = "0 2 1 2 3 1 4 6 5 6 7 5 4 5 1 5 0 1 7 6 2 6 3 2 5 7 0 7 2 0 1 3 4 3 6 4"
-# A prism with an L-shaped outline of 64 m2: 6 corners of the top, then 6 corners of the bottom.
+# A prism with an L-shaped outline of 64 m2; the first 6 corners are the top, the last 6 corners the bottom.
 L_OUTLINE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], float)
 L_SLAB = np.concatenate([np.column_stack([L_OUTLINE, np.full(6, z)]) for z in (0.3, -0.3)])
 L_FACES = "0 1 2 0 2 3 0 3 4 0 4 5 8 7 6 9 8 6 10 9 6 11 10 6 " + " ".join(
@@ -173,7 +173,7 @@ def test_kitti360_real_cars_stand_half_a_slab_below_raster(real_drive):
         near = ground_class[248:, 124:132] == KITTI_GROUND_CLASSES.index("road")
         road_below += list(height[248:, 124:132][near])
     assert abs(np.median(depth) - 0.3) < 0.1
-    # the IMU is 0.93 m above the road, the raster 0.3 m above it
+    # the IMU is 0.93 m and the raster is 0.3 m above the road
     assert abs(np.median(road_below) + 0.63) < 0.1
 
 
@@ -313,10 +313,10 @@ def test_kitti360_removes_duplicate_objects(tmp_path):
         format_object(index=3, start_frame=90, end_frame=199),
         format_object(index=4, transform=shifted),
         format_slab(index=5),
-        format_object("truck", index=6),  # another object at the same place
+        format_object("truck", index=6),  # a second object at the same position
         format_object(
             index=7, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.3, 205.1, 117))
-        ),  # Copy from another annotation window.
+        ),  # A copy from another annotation window.
         format_object(index=8, transform=make_affine(np.diag([4.4, 2.0, 1.5]), (130.9, 205, 117))),  # A different car.
         format_object(index=9, transform=make_affine(np.diag([4.4, 2.01, 1.5]), (130, 205, 117))),  # A different size.
         format_object("smallPole", index=10, transform=make_affine(np.diag([0.3, 0.3, 4]), (140, 205, 117))),
@@ -357,7 +357,7 @@ def test_kitti360_is_independent_of_element_order(tmp_path):
 def test_kitti360_scene_axes_point_ahead_and_left(tmp_path):
     """The car faces east, so north is to its left.
 
-    World coordinates of many km keep millimetre precision.
+    World coordinates of many kilometres keep a precision of one millimetre.
     """
     far_pose = IDENTITY_POSE.replace("100", "41100").replace("200", "98200")
     far_box = format_object(transform=make_affine(np.eye(3), (41110.001, 98203.002, 118)))

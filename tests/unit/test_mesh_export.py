@@ -1,4 +1,4 @@
-"""Tests of the GLB export: nodes, corners, volumes and colours, as trimesh reads them."""
+"""Tests of the GLB export: trimesh reads nodes, corners, volumes and colours."""
 
 import io
 import json
@@ -49,7 +49,7 @@ def test_scene_glb_has_named_node_per_primitive_and_ground():
     loaded = load_glb(export_glb(scene))
     expected = {f"{CATEGORIES[c]}_{i:04d}" for i, c in enumerate(scene.category)} | {"ground"}
     assert set(loaded.graph.nodes_geometry) == expected
-    assert len(loaded.geometry) == len(CATEGORIES) + 1  # nodes of one category share a mesh
+    assert len(loaded.geometry) == len(CATEGORIES) + 1  # all nodes of a category use the same mesh
     extras = loaded.graph.transforms.edge_data[("scene", "human_0005")]["metadata"]
     assert extras["category"] == "human" and extras["class_id"] == 11 and extras["instance_id"] == 1005
     assert extras["kind"] == "cuboid" and extras["heading_rad"] is None and extras["existence"] == 1.0
@@ -167,7 +167,7 @@ def test_scene_glb_accepts_empty_scene():
 
 
 def test_scene_glb_passes_khronos_validator(tmp_path):
-    """The glTF validator reports no errors, warnings, infos or hints, and it finds every mesh."""
+    """The glTF validator finds every mesh and reports no errors, warnings, infos or hints."""
     modules = Path(sys.prefix) / "npm" / "node_modules"  # the Makefile installs the validator if npm exists
     if not (shutil.which("node") and modules.is_dir()):
         pytest.skip("no node, or no gltf-validator in .venv/npm")

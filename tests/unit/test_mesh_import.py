@@ -1,4 +1,4 @@
-"""Tests of the GLB import: exports of PrITTI on Ray, and files of the paper's authors.
+"""Tests of the GLB import for exports of PrITTI on Ray and for files in the format of the paper's authors.
 
 docs/how_to/import_scenes.md describes both formats.
 """
@@ -32,7 +32,7 @@ def compute_corners_m(scene: Scene) -> np.ndarray:
 
 
 def compute_scatter_m2(scene: Scene) -> np.ndarray:
-    """Return R diag(size)^2 R^T (n, 3, 3), the shape of an ellipsoid regardless of its axis order."""
+    """Return R diag(size)^2 R^T (n, 3, 3), which describes an ellipsoid independently of the order of the axes."""
     axes = scene.rotation.astype(float) * scene.size_m[:, None]
     return axes @ np.swapaxes(axes, 1, 2)
 
@@ -48,7 +48,7 @@ def assert_same_ground(got: Scene, want: Scene) -> None:
 
 
 def edit_glb(glb: bytes, change) -> bytes:
-    """Return the GLB after `change` edited its JSON."""
+    """Return the GLB file after the function `change` has edited its JSON."""
     size = int.from_bytes(glb[12:16], "little")
     tree = json.loads(glb[20 : 20 + size])
     change(tree)
@@ -216,7 +216,7 @@ def export_authors_glb(
 
 
 def assert_same_primitives(got: Scene, want: Scene) -> None:
-    """Assert that primitives match one to one in any order: boxes by corners, ellipsoids by shape."""
+    """Assert that the primitives match one to one in any order; compare corners of boxes and shapes of ellipsoids."""
     assert np.array_equal(got.counts(), want.counts())
     left = list(range(len(got)))
     for k, corners in enumerate(compute_corners_m(want)):
@@ -267,7 +267,7 @@ def test_scene_from_glb_reads_flat_shaded_files(town_scenes):
         assert_same_primitives(got, scene)
         isolated = got.occupied.any(axis=0) != scene.occupied.any(
             axis=0
-        )  # the file lacks pixels that belong to no triangle
+        )  # a pixel that belongs to no triangle is not in the file
         assert isolated.sum() < 50
 
 
@@ -389,7 +389,7 @@ def test_scene_from_glb_names_missing_file(tmp_path):
 
 
 def list_leaves(tree: dict | list) -> list[tuple]:
-    """Return (container, key) of every value in a JSON tree."""
+    """Return the pair (container, key) for every value in a JSON tree."""
     items = list(tree.items() if isinstance(tree, dict) else enumerate(tree))
     return [(tree, k) for k, _ in items] + [
         leaf for _, v in items if isinstance(v, dict | list) for leaf in list_leaves(v)

@@ -1,4 +1,4 @@
-"""Tests of ADM's .npz batches: exchange with numpy, memory, and errors for damaged files."""
+"""Tests of ADM's .npz batches: exchange with numpy, memory use, and errors for damaged files."""
 
 import tracemalloc
 import zipfile
@@ -42,7 +42,7 @@ def test_npz_writer_is_readable_by_numpy(tmp_path, grouping):
 
 
 def test_npz_memory_is_bounded_by_batch(tmp_path):
-    """Reading and writing 67 MB of images needs less than 8 MB of memory."""
+    """The functions read and write 67 MB of images with less than 8 MB of memory."""
     path = str(tmp_path / "many.npz")
     tracemalloc.start()
     try:

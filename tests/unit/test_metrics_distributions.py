@@ -55,7 +55,7 @@ def find_bin(name: str, value: float) -> int:
 
 
 def test_histograms_equal_hand_computed():
-    scene = make_street(24, [(10, 0), (10, 5), (13, 9)])  # one car is on the road of 6 m, two cars are next to it
+    scene = make_street(24, [(10, 0), (10, 5), (13, 9)])  # one car is on the road (6 m), two cars are next to it
     below = compute_histogram(scene, "vehicle_small.ground_below")
     names = next(one for one in HISTOGRAMS if one.name == "vehicle_small.ground_below").bins
     assert dict(zip(names, below.tolist(), strict=True)) | {"road": 1, "terrain": 2} == dict(

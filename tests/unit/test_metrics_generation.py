@@ -1,4 +1,4 @@
-"""Tests of generation scores against literal float64 definitions, and of the coverage of intervals."""
+"""Tests of generation scores against definitions in float64, and of the coverage of confidence intervals."""
 
 import warnings
 
@@ -33,7 +33,7 @@ from pipelines.metrics.neighbours import (
 
 
 def compute_literal_fid(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the FID of Heusel et al. 2017 from a general matrix square root."""
+    """Return the FID of Heusel et al. 2017, computed with a general matrix square root."""
     a, b = np.cov(x, rowvar=False), np.cov(y, rowvar=False)
     root = scipy.linalg.sqrtm(a @ b)
     return float(np.square(x.mean(0) - y.mean(0)).sum() + np.trace(a + b - 2 * np.real(root)))
@@ -56,7 +56,8 @@ def test_frechet_distance_equals_literal_version():
 
 
 def test_frechet_distance_equals_closed_form():
-    """For diagonal covariances, the distance is the sum of (mean difference)^2 + (deviation difference)^2."""
+    """For diagonal covariances, the distance is sum((m1 - m2)^2 + (s1 - s2)^2) with means m and standard deviations
+    s."""
     rng = np.random.default_rng(0)
     mean, other_mean = rng.normal(size=(2, 6))
     deviation, other_deviation = rng.uniform(0, 3, (2, 6))
@@ -117,7 +118,7 @@ def test_inception_score_of_certain_and_equal_predictions():
 
 
 def compute_by_brute_force(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float, float, float]:
-    """Return precision, recall, density and coverage from float64 differences, sorted distances and loops."""
+    """Compute precision, recall, density and coverage with loops over sorted float64 distances."""
     real, generated = real.astype(np.float64), generated.astype(np.float64)
 
     def distances(x, y):
@@ -141,9 +142,9 @@ def compute_scores(real, generated, k) -> list[tuple]:
 
 
 def draw_clustered_features(rng, n: int, d: int, shift: float) -> np.ndarray:
-    """Return features with few strong and many weak directions, as real features have.
+    """Return features with few strong and many weak directions, like real features.
 
-    For such features, the filter of nearest neighbours decides most pairs but not all.
+    For such features, the filter of nearest neighbours decides most pairs, but not all pairs.
     """
     strength = 0.85 ** np.arange(d)
     return (shift + rng.normal(size=(n, d)) + rng.integers(0, 3, (n, 1))) * strength
@@ -171,7 +172,8 @@ def test_neighborhood_scores_equal_brute_force(seed, monkeypatch):
 
 
 def test_neighborhood_scores_count_ties_as_within():
-    """Integer points far from the origin have many equal distances, which a matrix product does not compute exactly."""
+    """Integer points far from the origin have many equal distances. A matrix product does not compute these distances
+    exactly."""
     rng = np.random.default_rng(5)
     real, generated = rng.integers(0, 4, (2, 60, 3)).astype(float) + 1e6
     for k, got in zip((1, 2, 3), compute_scores(real, generated, (1, 2, 3)), strict=True):
@@ -179,7 +181,8 @@ def test_neighborhood_scores_count_ties_as_within():
 
 
 def test_neighborhood_scores_include_border_of_ball():
-    """generated[0] equals real[1], so it is on the border of each ball whose radius is the distance to real[1]."""
+    """generated[0] equals real[1]. Therefore it lies on the border of each ball that has the distance to real[1] as
+    radius."""
     rng = np.random.default_rng(6)
     base = rng.normal(size=(40, 512))
     generated = rng.normal(50, 1, size=(40, 512))
@@ -209,7 +212,7 @@ def test_neighborhood_of_constant_features_requires_equality():
 def test_nearest_returns_neighbors_in_order(monkeypatch):
     rng = np.random.default_rng(9)
     a, b = draw_clustered_features(rng, 50, 40, 0), draw_clustered_features(rng, 80, 40, 0)
-    b[30] = b[60]  # of two equal distances, the lower index is first
+    b[30] = b[60]  # if two distances are equal, the lower index is first
     basis = compute_principal_axes(a, b)
     squared, index = find_nearest(project_to_axes(a, basis), project_to_axes(b, basis), range(10, 50), 4)
     every = np.array([[np.square(p - q).sum() for q in b] for p in a[10:]])
@@ -221,7 +224,7 @@ def test_nearest_returns_neighbors_in_order(monkeypatch):
 
 
 def compute_literal_kernel_distance(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the kernel distance of Binkowski et al. 2018 from loops."""
+    """Compute the kernel distance of Binkowski et al. 2018 with loops."""
 
     def k(a, b):
         return (a @ b / len(a) + 1) ** 3
@@ -253,7 +256,8 @@ def test_kernel_distance_of_equal_sources_contains_zero():
 
 
 def test_intervals_have_stated_coverage():
-    """In 200 experiments with 150 scenes each, about 95 % of the intervals contain the true mean or share."""
+    """In 200 experiments with 150 scenes each, about 95 % of the intervals contain the true value (a mean or a
+    share)."""
     rng = np.random.default_rng(12)
     held = np.zeros(2)
     for _ in range(200):
@@ -294,7 +298,8 @@ def test_frechet_interval_matches_spread_of_distance():
 
 
 def test_influences_are_derivatives_of_frechet_distance():
-    """The reference is the finite difference after a small shift of the moments towards one sample."""
+    """The reference is a finite difference: the change of the score after a small shift of the moments towards one
+    sample."""
     rng = np.random.default_rng(14)
     real, generated = rng.normal(size=(600, 5)), rng.normal(0.5, 1.5, size=(700, 5))
     a, b = compute_moments(real), compute_moments(generated)

@@ -1,4 +1,4 @@
-"""Tests of the Inception network against published parameter names, plain torch layers and torch-fidelity."""
+"""Tests that compare the Inception network with published parameter names, plain torch layers and torch-fidelity."""
 
 import hashlib
 import warnings
@@ -25,7 +25,8 @@ from pipelines.metrics.inception import (
 
 @pytest.fixture(scope="module")
 def network() -> Inception:
-    """An Inception network with random weights, random batch norm statistics and activations in all layers."""
+    """An Inception network with random weights and batch norm statistics, in which no layer has only zero
+    activations."""
     torch.manual_seed(0)
     network = Inception()
     for module in network.modules():
@@ -46,8 +47,8 @@ def make_pictures(n=2, height=64, width=64, seed=0) -> np.ndarray:
 
 # ------------------------------------------------------------------------------------------ architecture
 
-# Shapes (output, input, kernel) of convolutions in the converted weight files of pytorch-fid and torch-fidelity.
-# An input of 0 stands for the number of inputs of the block.
+# Shapes (output, input, kernel) of the convolutions in converted weight files (pytorch-fid, torch-fidelity).
+# The value 0 for the input means the number of input channels of the block.
 A = {
     "branch1x1": (64, 0, 1, 1), "branch5x5_1": (48, 0, 1, 1), "branch5x5_2": (64, 48, 5, 5),
     "branch3x3dbl_1": (64, 0, 1, 1), "branch3x3dbl_2": (96, 64, 3, 3), "branch3x3dbl_3": (96, 96, 3, 3),
@@ -223,7 +224,7 @@ def test_inception_features_are_independent_of_batch(network):
 
 
 def test_inception_spatial_features_are_mixed_6_channels_last(network):
-    """Features have the order row, column, channel of TensorFlow, like the moments in ADM's reference batches."""
+    """Features have TensorFlow's order (row, column, channel), like the moments in ADM's reference batches."""
     maps = []
     hook = network.Mixed_6d.branch1x1.register_forward_hook(lambda module, inputs, output: maps.append(output))
     spatial = compute_inception_features(network, make_pictures()).spatial
@@ -248,7 +249,7 @@ def golden_network() -> Inception:
 
 
 def compute_golden_difference(network: Inception) -> dict[str, float]:
-    """Return the largest difference to torch-fidelity per layer, as a share of the largest feature of the layer."""
+    """Return the largest difference to torch-fidelity per layer, divided by the largest feature of the layer."""
     layers: dict[str, list[torch.Tensor]] = {"64": [], "192": [], "768": []}
     hooks = [
         getattr(network, module).register_forward_hook(lambda m, i, x, layer=layer: layers[layer].append(x))
@@ -270,7 +271,8 @@ def compute_golden_difference(network: Inception) -> dict[str, float]:
 
 
 def test_inception_features_equal_torch_fidelity(golden_network):
-    """Each layer of torch-fidelity agrees to 1e-5 of its largest feature, for enlarged and reduced images."""
+    """In each layer, the difference to torch-fidelity is at most 1e-5 of the largest feature, for enlarged and reduced
+    images."""
     difference = compute_golden_difference(golden_network)
     assert max(difference.values()) < 1e-5, difference
 
@@ -308,7 +310,7 @@ def test_inception_parity_detects_layer_variants(golden_network, monkeypatch, mi
 
 
 def test_inception_loads_pth_and_safetensors(network, tmp_path):
-    # Converted weight files contain no num_batches_tracked because they are older than this buffer.
+    # Converted weight files do not contain num_batches_tracked, because the files are older than this buffer.
     state = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
     torch.save(state, tmp_path / "weights.pth")
     safetensors.torch.save_file(state, tmp_path / "weights.safetensors")
@@ -382,7 +384,7 @@ def test_random_features_are_fixed_finite_and_discriminative():
     assert np.abs(features - compute_random_features(images, seed=1)).max() > 0.01
     black, white = np.zeros_like(images), np.full_like(images, 255)
     assert np.abs(compute_random_features(black) - compute_random_features(white)).max() > 0.1
-    # Fixed features keep results comparable with older reports.
+    # Results are comparable with older reports only if the features do not change.
     np.testing.assert_allclose(
         compute_random_features(white[:1])[0, [0, 100, 300, 479]], [2.72897, 0.675502, 0.103905, 1.17206], rtol=1e-4
     )

@@ -1,6 +1,6 @@
-"""Tests of scores of given features against ADM's formulas in float64 and against results of torch-fidelity.
+"""Tests that compute scores from features and compare them with ADM's formulas in float64 and with torch-fidelity.
 
-Tests measure the differences of definitions that docs/concepts/evaluation.md explains.
+The tests also measure the effect of different definitions (docs/concepts/evaluation.md).
 """
 
 import json
@@ -33,7 +33,7 @@ def compute_fid(real: np.ndarray, generated: np.ndarray) -> float:
 
 
 def compute_adm_frechet(real: np.ndarray, generated: np.ndarray) -> float:
-    """Return |m - n|^2 + tr A + tr B - 2 tr (A B)^1/2 from a general matrix square root.
+    """Return |m - n|^2 + tr A + tr B - 2 tr (A B)^1/2, computed with a general matrix square root.
 
     The covariances A and B divide by n - 1.
     """
@@ -43,7 +43,7 @@ def compute_adm_frechet(real: np.ndarray, generated: np.ndarray) -> float:
 
 
 def compute_adm_inception_score(scores: np.ndarray, chunk: int = 5000) -> float:
-    """Return the mean of exp(E KL(p(y|x) || p(y))) over consecutive chunks, with p(y) of each chunk."""
+    """Return the mean of exp(E KL(p(y|x) || p(y))) over consecutive chunks; p(y) is computed per chunk."""
     found = []
     for start in range(0, len(scores), chunk):
         p = scipy.special.softmax(scores[start : start + chunk], axis=1)
@@ -52,7 +52,7 @@ def compute_adm_inception_score(scores: np.ndarray, chunk: int = 5000) -> float:
 
 
 def compute_adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int) -> tuple[float, float]:
-    """Return precision and recall from full distance matrices.
+    """Compute precision and recall with full distance matrices.
 
     In a sorted row, entry 0 is the sample itself and entry k is its k-th neighbour.
     """
@@ -97,7 +97,7 @@ def test_inception_score_of_chunks_equals_adm(monkeypatch):
 
 
 def test_adm_half_precision_shifts_precision_recall_below_0_01():
-    """ADM multiplies matrices in float16, and PrITTI on Ray compares distances exactly.
+    """ADM multiplies matrices in float16, but PrITTI on Ray compares distances exactly.
 
     The test models the rounding of ADM and bounds its effect.
     """
@@ -131,9 +131,9 @@ def test_frechet_distance_equals_torch_fidelity(torch_fidelity):
 
 
 def test_inception_score_equals_torch_fidelity_on_same_splits(torch_fidelity, monkeypatch):
-    """With one split, the score equals ADM's score of at most 5000 samples.
+    """With one split, the score equals ADM's score for up to 5000 samples.
 
-    Ten shuffled splits, the default of torch-fidelity, give 5 % less for these 300 samples.
+    For these 300 samples, torch-fidelity's default of ten shuffled splits gives a score that is 5 % lower.
     """
     one, ten = (torch_fidelity[f"isc_{splits}.inception_score_mean"] for splits in (1, 10))
     assert compute_inception_score(logits()).value == pytest.approx(one, rel=1e-6)
@@ -171,7 +171,7 @@ def compute_polynomial_kid(x: np.ndarray, y: np.ndarray) -> float:
 def test_kid_of_all_samples_equals_torch_fidelity(torch_fidelity):
     """For one group, both scores are equal.
 
-    With several groups, torch-fidelity draws random subsets; PrITTI on Ray uses each sample once.
+    With several groups, torch-fidelity draws random subsets, but PrITTI on Ray uses each sample once.
     """
     real, generated = feature_sets()
     whole = torch_fidelity["kid_all.kernel_inception_distance_mean"]

@@ -1,4 +1,4 @@
-"""Tests of AP3D against a literal COCO evaluation, as Omni3D uses it, and of ground scores against loops."""
+"""Tests that compare AP3D with a COCO evaluation (as in Omni3D) and ground scores with loops."""
 
 import dataclasses
 from itertools import permutations
@@ -69,9 +69,9 @@ def compute_scores(truths: list[Scene], predictions: list[Scene], **options):
 def compute_literal_ap(
     truths: list[Scene], predictions: list[Scene], max_detections: int, threshold: float
 ) -> dict[str, float]:
-    """Return the AP per category from the steps of COCOeval.evaluateImg and COCOeval.accumulate.
+    """Compute the AP per category with the steps of COCOeval.evaluateImg and COCOeval.accumulate.
 
-    There is one IoU threshold, and no truth is ignored.
+    There is one IoU threshold, and every true object counts.
     """
     result = {}
     for c in SCORED:
@@ -177,7 +177,7 @@ def test_ap3d_of_half_the_truths_is_51_of_101_points():
 
 def test_ap3d_counts_shifted_box_up_to_its_iou():
     truth = make_scene([CAR], CENTERS[:1])
-    shifted = make_scene([CAR], [[0.5, 0, 0]])  # IoU3D 1/3: a hit at thresholds 0.05 to 0.30, a miss at 0.35 to 0.50
+    shifted = make_scene([CAR], [[0.5, 0, 0]])  # the IoU3D is 1/3, a hit at thresholds up to 0.30
     got = compute_scores([truth], [shifted])
     assert got.ap3d == pytest.approx(0.6)
     assert got.ap3d_50 == 0
@@ -199,7 +199,7 @@ def test_ap3d_truncates_per_scene_and_category():
 
 def test_ap3d_score_threshold_equals_dropping_detections():
     truths, predictions = draw_dataset(np.random.default_rng(3))
-    dropped = [p.select(p.existence > 0.375) for p in predictions]  # decode_layout drops these objects, too
+    dropped = [p.select(p.existence > 0.375) for p in predictions]  # decode_layout also drops these objects
     got = compute_scores(truths, predictions, min_score=0.375)
     assert got == compute_scores(truths, dropped)
     assert list(got.at_threshold) == [f"{t:.2f}" for t in THRESHOLDS]
@@ -296,7 +296,7 @@ def test_ground_scores_reject_missing_truth_bad_bounds_and_nan():
 
 
 def find_best_pairs(iou: np.ndarray) -> tuple[int, float]:
-    """Return the number and the total IoU of the best one-to-one pairs by exhaustive search."""
+    """Return the number of pairs and the total IoU of the best one-to-one assignment, found by exhaustive search."""
     if iou.shape[0] > iou.shape[1]:
         iou = iou.T
     ways = [iou[np.arange(iou.shape[0]), list(way)] for way in permutations(range(iou.shape[1]), iou.shape[0])]
@@ -326,7 +326,7 @@ def test_pairs_equal_best_assignment(seed):
 
 def test_pair_scores_equal_hand_computed():
     truth = make_scene([CAR, CAR, POLE, ELLIPSOID], CENTERS)
-    found = make_scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D with the truths: 1/3, 0, 1
+    found = make_scene([CAR, CAR, ELLIPSOID], [[0.5, 0, 0], [50, 0, 0], CENTERS[3]])  # IoU3D: 1/3, 0, 1
     sums = sum_pairs(truth, found)
     got = compute_pair_scores(sums + sums)
     assert got.mean_iou3d == pytest.approx(1 / 3) and got.truth_iou3d == pytest.approx(1 / 9)

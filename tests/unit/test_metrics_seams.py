@@ -27,7 +27,7 @@ GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
 
 def make_random_ground(seed: int, block_px: int = 8):
-    """Return random ground classes per square of pixels and random heights per pixel.
+    """Return a scene with a random ground class per square of pixels and a random height per pixel.
 
     All lines of such a scene have the same statistics.
     """

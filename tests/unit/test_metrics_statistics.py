@@ -75,7 +75,7 @@ def test_layout_frechet_is_independent_of_units():
 def test_layout_frechet_is_finite_for_constant_columns():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
-    a[:, 0], b[:, 0] = 2, 5  # the column is constant, with a difference of 3 units
+    a[:, 0], b[:, 0] = 2, 5  # the column is constant in each source, and the constants differ by 3 units
     a[::2, 1] = np.nan
     b[:, 2] = np.nan  # the other source lacks this column
     assert compute_layout_frechet(a, b) > 9 and np.isfinite(compute_layout_frechet(a, b))

@@ -1,4 +1,4 @@
-"""Tests of validity measures on scenes with known values, and of road connectivity against a flood fill."""
+"""Tests of validity measures on scenes with known values, and comparison of road connectivity with a flood fill."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def make_town_scene(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
     The last row has no ground. All primitives are cubes of 2 m, except houses, which are cubes of 4 m.
 
     Args:
-        primitives: (category, x, y, height of the bottom above the surface) of each primitive (m).
-        road: Mask of the road, which replaces all ground (default: the halves above).
+        primitives: Category, x, y, and height of the bottom above the surface for each primitive (m).
+        road: Mask of the road; it replaces all ground (None: road and sidewalk as above).
         heights_m: Height of the surface below the ground slabs.
         labels: Density labels of the scene.
     """
@@ -58,7 +58,7 @@ def measure(name: str, scene: Scene) -> tuple[float, float]:
 
 
 def test_validity_overlap_counts_both_solid_objects_of_a_pair():
-    apart, near = (CAR, 3.0, 4.0, 0), (CAR, 4.9, 4.0, 0)  # IoU3D 0.1 / 3.9 = 0.026
+    apart, near = (CAR, 3.0, 4.0, 0), (CAR, 4.9, 4.0, 0)  # the IoU3D is 0.1 / 3.9 = 0.026
     assert measure("overlapping", make_town_scene([apart, near])) == (0, 2)
     assert measure("overlapping", make_town_scene([apart, (CAR, 4.5, 4.0, 0)])) == (2, 2)  # 0.5 / 3.5 = 0.14
     assert measure("overlapping", make_town_scene([apart, (TREE, 3.0, 4.0, 0)])) == (0, 1)
@@ -151,7 +151,7 @@ def test_validity_rates_pool_scenes_and_skip_absent_categories():
 
 def test_label_fidelity_compares_measured_and_stated_label():
     many = DensityThresholds(count_p25=1.5, count_p75=2.5, volume_p25_m3=10, volume_p75_m3=20)
-    three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # 24 m3 of vegetation is high, no vehicle is low
+    three_trees = [(TREE, 3.0 * i, 2.0, 0) for i in range(3)]  # high for 24 m3 of vegetation, low for 0 vehicles
     right = make_town_scene(three_trees, vegetation_density="high", vehicle_density="low")
     wrong = make_town_scene(three_trees, vegetation_density="high", vehicle_density="medium")
     records = [compute_label_fidelity(scene, many, many) for scene in (right, wrong)]

@@ -66,7 +66,7 @@ def test_object_encoder_ignores_padding_and_order():
     batch = make_layout_batch([random_scene(0), random_scene(1, n=0)], spec)
     latent = lvae.object_encoder(batch.features, batch.real)
     assert torch.isfinite(latent).all()
-    assert torch.equal(latent[1], lvae.object_encoder.grid)  # the encoder maps an empty scene to its learnable grid
+    assert torch.equal(latent[1], lvae.object_encoder.grid)  # an empty scene gives the learnable grid
     noisy = torch.where(batch.real[..., None], batch.features, torch.rand_like(batch.features))
     assert torch.allclose(lvae.object_encoder(noisy, batch.real), latent, atol=1e-5)
     order = torch.cat([torch.randperm(6) + 6 * k for k in range(11)])
@@ -93,7 +93,7 @@ def test_layout_vae_ground_reads_first_half_of_latent():
 
 
 def compute_literal_cost(features, logit, truth, real, columns) -> float:
-    """Return the matching cost of the paper for one category, term by term."""
+    """Compute the matching cost of the paper for one category, term by term."""
     p = torch.sigmoid(logit.double())
     total = 0.0
     for i, j in enumerate(columns):
@@ -135,7 +135,7 @@ def test_matching_reaches_optimum_of_padded_square_problem():
 
 
 def test_matching_of_surplus_proposals_is_optimal():
-    """The cell decoder has more proposals than slots, so the reference is a search over the rectangular cost."""
+    """The reference is a search over a rectangular cost matrix, because there are more proposals than slots."""
     generator = torch.Generator().manual_seed(3)
     slots, proposals, weights = (3, 2), (7, 5), MatchWeights(1.0, 24.0, 3.0)
     features, truth = torch.rand(1, 12, 9, generator=generator), torch.rand(1, 5, 9, generator=generator)
@@ -175,7 +175,7 @@ def test_object_shortcut_is_equivariant_to_cell_shift():
     features = torch.full((2, sum(small_spec().slots), 9), 0.3)
     features[1, 0, :2] += torch.tensor(
         [2 / 8, -1 / 8]
-    )  # the object moves two cells ahead (to a lower row) and one cell to the right (to a higher column)
+    )  # the object moves two cells to the front (lower row) and one cell to the right (higher column)
     real = torch.zeros(features.shape[:2], dtype=torch.bool)
     real[:, 0] = True
     with torch.no_grad():
@@ -239,10 +239,10 @@ def test_linear_init_is_optimal_with_unit_variance_codes():
     )
     truth, ours = (part.double() for part in cells)
     centred = truth - truth.mean(dim=0)
-    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # minimum error of maps with rank 16 (Eckart-Young)
+    least = float((torch.linalg.svdvals(centred)[16:] ** 2).sum())  # minimum error for rank 16 (Eckart-Young)
     within = 0.02 * float(
         (centred**2).sum()
-    )  # tolerance, because the decoder has one bias per map instead of one per pixel
+    )  # a tolerance is necessary because the decoder has one bias per map, not per pixel
     assert least <= float(((ours - truth) ** 2).sum()) < least + within
     deviation = code.transpose(0, 1).flatten(1).std(dim=1)
     assert (deviation < 1.01).all() and deviation.max() > 0.99
@@ -346,7 +346,7 @@ def test_lvae_overfits_one_batch(decoder, steps, ground):
     [ExecutionConfig(precision="bf16"), ExecutionConfig(accumulate=2), ExecutionConfig(accumulate=4, precision="bf16")],
 )
 def test_lvae_step_is_equal_in_halves_and_bf16(execution):
-    """The test compares the loss at equal weights, then the decrease of the loss after 20 training steps."""
+    """The test compares the loss for the same weights, and the decrease of the loss after 20 training steps."""
     spec = small_spec()
     layouts = [encode_layout(random_scene(i, n=20), spec) for i in range(4)]
     arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}

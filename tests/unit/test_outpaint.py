@@ -1,4 +1,4 @@
-"""Tests of outpainting: block grids, composition of true blocks, and the pipeline."""
+"""Tests of outpainting: block grids, composition of blocks from true scenes, and the pipeline."""
 
 from dataclasses import replace
 from itertools import product
@@ -30,14 +30,14 @@ SIDES, CORNERS = [(1, 0), (-1, 0), (0, 1), (0, -1)], [(1, 1), (1, -1), (-1, 1), 
 
 
 def encode_occupancy(scenes) -> torch.Tensor:
-    """Encode scenes as the occupancy of 8 x 8 cells, which shows the known region of a block."""
+    """Encode a scene as the occupancy of 8 x 8 cells; this latent shows the known region of a block."""
     occupied = np.stack([s.occupied for s in scenes]).astype(np.float32)
     return torch.from_numpy(occupied.reshape(len(scenes), len(KITTI_GROUND_CLASSES), 8, 4, 8, 4).mean(axis=(3, 5)))
 
 
 @pytest.fixture
 def truth():
-    """A scene of 128 x 128 m on one slope, with block (0, 0) in the middle.
+    """A scene of 128 x 128 m on a constant slope, with block (0, 0) in the middle.
 
     Objects of the same category do not overlap.
     """
@@ -135,7 +135,7 @@ def test_block_composer_gives_blocks_their_known_neighbors(truth, mode):
 
 @pytest.mark.parametrize(("overlap", "rank"), [(0.5, rank_outward), (0.25, rank_outward), (0.25, rank_four_colors)])
 def test_block_composer_of_true_blocks_equals_truth_in_one_datum(truth, overlap, rank):
-    """Heights of a block are relative to its ground; heights of the composed scene have one datum."""
+    """Heights of a block are relative to the ground of the block. Heights of the composed scene have one datum."""
     last = (1, 1, 1, 1) if overlap == 0.5 else (0, 0, 0, 0)
     block_grid = BlockGrid.from_overlap(8, overlap, rank=rank, num_blocks=last if rank is rank_outward else None)
     composer = BlockComposer(block_grid, TRUTH_SPEC, encode_occupancy, find_ground_height(truth, 0.0, 0.0))
@@ -171,7 +171,8 @@ def test_block_composer_does_not_repeat_known_object(truth):
     middle = crop_truth(truth, (0, 0))
     blocks = {(0, 0): SceneBlock(middle, encode_occupancy([middle])[0])}
     condition = composer.condition_block((1, 0), blocks, EMPTY, "copy")
-    # A known object is just behind the seam. A copy just ahead of the seam is a duplicate; an object far ahead is not.
+    # A known object is directly behind the seam. A copy directly ahead of the seam is a duplicate. An object far ahead
+    # is no duplicate.
     car = {"size_m": np.float32([[4, 2, 1.5]]), "rotation": np.eye(3, dtype=np.float32)[None]}
     known = replace(condition.known.select([0]), center_m=np.float32([[31.9, 5, 0]]), **car)
     condition = replace(condition, known=known)

@@ -50,7 +50,8 @@ def build_sampler(name: str):
     [("ddpm", 250, 0.03), ("ddim", 250, 0.03), ("dpm++", 20, 0.01), ("dpm++", 10, 0.02), ("sde-dpm++", 20, 0.02)],
 )
 def test_samplers_reproduce_gaussian_with_exact_denoiser(name, steps, tolerance):
-    """With the exact denoiser of data N(mean, std^2), samples have the mean and the standard deviation of the data."""
+    """With the exact denoiser for data from N(mean, std^2), samples have the mean and the standard deviation of the
+    data."""
     mean, std, alpha_bar = 1.5, 0.5, torch.from_numpy(Diffusion().alpha_bar).float()
 
     def model(latent, timestep, label):
@@ -77,7 +78,7 @@ def test_samplers_are_independent_of_batch_composition(pipeline):
         again = pipeline.sample_latents(labels, 3, range(3), 10)
         assert torch.equal(together, again), name  # a scheduler keeps no state of the previous run
     assert len({round(float(latents.abs().sum()), 3) for latents in drawn.values()}) == len(SAMPLERS)
-    pipeline.use_sampler("dpm++")  # sde-dpm++, the previous sampler, draws noise; dpm++ does not
+    pipeline.use_sampler("dpm++")  # the previous sampler (sde-dpm++) draws noise, but dpm++ draws no noise
     assert torch.equal(pipeline.sample_latents(labels, 3, range(3), 10), drawn["dpm++"])
     with pytest.raises(ValueError, match="num_inference_steps is 600"):
         pipeline.sample_latents(labels, 3, range(3), 600)
@@ -125,7 +126,7 @@ def test_pipeline_decodes_objects_above_its_threshold(pipeline, tmp_path):
     latents, identities = torch.zeros(1, *pipeline.lvae.latent_shape), [pipeline.new_identity("run", 0, 0, "low")]
     (everything,) = pipeline.decode(latents, identities, 1e-6)
     existence = np.sort(everything.existence)
-    # The threshold is in a gap, because existence probabilities may round differently after loading.
+    # The threshold is in a gap between probabilities, because rounding may change the probabilities after loading.
     gap = np.argmax(np.diff(existence))
     middle = float(existence[gap : gap + 2].mean())
     (probable,) = pipeline.decode(latents, identities, middle)
@@ -163,7 +164,7 @@ def test_guided_inpainting_scales_noise_and_repaint_does_not(pipeline):
 def test_noise_scaling_corrects_overestimated_noise():
     """For Gaussian data, the exact noise is known.
 
-    A model that overestimates the noise by 1 % samples a standard deviation that is too small.
+    If a model overestimates the noise by 1 %, the standard deviation of the samples is too small.
     """
     alpha_bar = torch.from_numpy(Diffusion().alpha_bar).float()
 
@@ -222,7 +223,7 @@ def test_pipeline_callback_sees_steps_and_may_change_latents(pipeline):
     seen.clear()
     whole = np.ones((32, 32), bool)
     pipeline.inpaint([random_scene(0, grid=SPEC.grid)], [whole], ["low"], repaint=QUICK, callback_on_step_end=watch)
-    assert [step for step, _ in seen] == list(range(10))  # 6 steps and two jumps back by 2 steps
+    assert [step for step, _ in seen] == list(range(10))  # 6 steps, and two jumps of 2 steps back
 
 
 # ------------------------------------------------------------------------------------------------------- inpainting
@@ -292,7 +293,7 @@ def test_inpaint_keeps_known_region(pipeline, contents):
 
 
 def test_inpaint_decodes_given_ground_exactly(pipeline):
-    """If only objects are inpainted, the ground decoder reads only known channels of the latent."""
+    """If the pipeline inpaints only objects, the ground decoder reads only known channels of the latent."""
     scene = random_scene(5, n=30, grid=SPEC.grid)
     whole = np.ones((32, 32), bool)
     (raw,) = pipeline.inpaint([scene], [whole], ["low"], "objects", repaint=QUICK, composite=False)

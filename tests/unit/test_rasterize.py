@@ -1,4 +1,4 @@
-"""Tests of the rasteriser against vertical rays of trimesh (embree) and polygons of shapely."""
+"""Tests that compare the rasteriser with vertical rays of trimesh (embree) and with polygons of shapely."""
 
 import numpy as np
 import shapely
@@ -9,7 +9,7 @@ from pipelines.geometry.rasterize import cast_rays_down, fill_polygon
 
 
 def cast_by_rays(triangles_m: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return heights (H, W) from embree, -inf where a ray hits nothing."""
+    """Return heights (H, W) from embree; a height is -inf if the ray hits nothing."""
     mesh = trimesh.Trimesh(triangles_m.reshape(-1, 3), np.arange(3 * len(triangles_m)).reshape(-1, 3), process=False)
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     origins = np.stack([x, y, np.full_like(x, 100.0)], -1).reshape(-1, 3)

@@ -55,7 +55,7 @@ def test_reconstruction_of_perfect_decoder_scores_one():
     assert got["ground_iou"] == got["ground_mean_iou"] == 1 and got["height_rmse_m"] < 1e-4
     for variant in got["detection"].values():
         assert variant["ap3d"] > 0.99 and variant["ap3d_50"] > 0.99
-    # Random extents differ, so a scatter matrix determines the axes of each box.
+    # The random extents of a box differ, so the scatter matrix determines the axes of the box.
     assert got["matched"]["found"] == got["matched"]["right"] == 1 and got["matched"]["mean_iou3d"] > 0.99
     assert got["matched"]["category_mean_iou3d"]["vegetation_ellipsoid"] > 0.98
     assert got["voxels"]["iou"] > 0.995 and got["voxels"]["miou"] > 0.99
@@ -76,7 +76,7 @@ def test_reconstruction_ground_errors_are_in_meters():
     exact = encode_perfectly(scene, SPEC)
     raised = replace(exact, height=exact.height + 0.3 / 6.0, occupancy=np.zeros_like(exact.occupancy))
     got = compute_reconstruction_scores([make_record(scene, raised)], SPEC, make_voxel_grid(SPEC))
-    assert got["ground_iou"] == 0  # no pixel is predicted as occupied, but height errors count
+    assert got["ground_iou"] == 0  # the prediction contains no occupied pixel, but height errors count
     assert got["height_rmse_m"] == pytest.approx(0.3, abs=1e-4) and got["height_mae_m"] == pytest.approx(0.3, abs=1e-4)
     assert got["height_mse_normalised"] == pytest.approx((0.3 / 6) ** 2, rel=1e-3)
 

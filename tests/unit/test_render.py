@@ -1,4 +1,4 @@
-"""Tests of rendered pictures, in part against rays of trimesh."""
+"""Tests of rendered pictures; some tests compare with rays of trimesh."""
 
 from dataclasses import replace
 
@@ -15,9 +15,9 @@ from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, EMPTY, list_gro
 
 
 def render_literally(scene: Scene, view: Grid) -> np.ndarray:
-    """Return class ids (H, W) from vertical lines through all pixel centres and all primitives.
+    """Return class ids (H, W) from intersections of all primitives with vertical lines through the pixel centres.
 
-    At equal heights, the ground has priority, then the last box, then ellipsoids.
+    If heights are equal, the ground has the highest priority, followed by the last box and by ellipsoids.
     """
     x, y = np.meshgrid(view.x_m(), view.y_m(), indexing="ij")
     height, winner = scene.surface()
@@ -161,7 +161,7 @@ def test_cast_ellipsoids_is_exact():
     assert np.allclose(own, 0.5, atol=1e-6)  # the point is on the surface of the ellipsoid that the ray hits
     homogeneous[:, 2] += 1e-3
     radius = np.linalg.norm((unit_from_scene[:, None, :3, :] @ homogeneous[..., None])[..., 0], axis=-1)
-    assert (radius > 0.5 - 1e-6).all()  # no ellipsoid contains a point just above
+    assert (radius > 0.5 - 1e-6).all()  # no ellipsoid contains a point directly above
 
 
 def test_cast_ellipsoids_accepts_none():

@@ -1,4 +1,4 @@
-"""Tests of the run guard: a run name is bound to its options when the run has written scenes."""
+"""Tests of the run guard: after a run has written scenes, its name is bound to its options."""
 
 import json
 
@@ -15,7 +15,7 @@ def test_run_guard_releases_name_of_empty_run(tmp_path):
     guard_run(root, "generated-a", "a", first)
     rejects = Shard(root, "generated-a", "generated", 0).path("rejects")
     storage.write_parquet(make_rejects_table([]), rejects)
-    guard_run(root, "generated-a", "a", first)  # the same options keep all files
+    guard_run(root, "generated-a", "a", first)  # with the same options, all files are kept
     assert storage.exists(rejects)
     guard_run(root, "generated-a", "a", second)
     assert not storage.exists(rejects)

@@ -50,7 +50,7 @@ def test_scatter_matrix_round_trips():
         compute_scatter_matrix(back_rotation, back_size), compute_scatter_matrix(rotation, size), atol=1e-9
     )
     assert np.allclose(np.linalg.det(back_rotation), 1)
-    # Unlike quaternions, scatter matrices are equal for all axes of the same box.
+    # All choices of axes for a box have the same scatter matrix, but different quaternions.
     assert np.allclose(compute_cholesky_parameters(rotation * [-1, -1, 1], size), parameters)
 
 

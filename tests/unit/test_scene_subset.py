@@ -1,4 +1,4 @@
-"""Tests of subsets of scenes: against brute force, in special cases and for several worlds."""
+"""Tests of subsets of scenes: comparison with brute force, special cases, and several worlds."""
 
 import numpy as np
 import pyarrow as pa

@@ -12,14 +12,14 @@ from models.scene import KITTI_GROUND_CLASSES, Grid
 GRID = Grid(rows=64, cols=64, resolution_m=0.5, front_m=32.0, left_m=16.0)
 ROAD, SIDEWALK = (KITTI_GROUND_CLASSES.index(name) for name in ("road", "sidewalk"))
 NEW = np.zeros((64, 64), bool)
-NEW[:32] = True  # the generated region, more than 16 m ahead
+NEW[:32] = True  # the generated region begins 16 m ahead
 REACH = round(BLEND_M / GRID.resolution_m)
 
 
 def make_street(left_px: int, height_m: float):
     """Return a scene with a road of 12 pixels that starts at column `left_px`.
 
-    The sidewalk on its left is 0.1 m higher, and there is no ground on its right.
+    The sidewalk to the left of the road is 0.1 m higher. There is no ground to the right of the road.
     """
     height, occupied = np.zeros((len(KITTI_GROUND_CLASSES), 64, 64), np.float32), np.zeros((5, 64, 64), bool)
     for c, columns, up_m in ((ROAD, slice(left_px, left_px + 12), 0.0), (SIDEWALK, slice(0, left_px), 0.1)):
@@ -34,9 +34,9 @@ def test_blend_ground_aligns_shifted_street():
     for c in (ROAD, SIDEWALK):
         assert np.array_equal(
             bent.occupied[c, 31], known.occupied[c, 32]
-        )  # both sides of the seam have the same columns
+        )  # the road has the same columns on both sides of the seam
         assert np.abs(bent.height_m[c, 31] - known.height_m[c, 32]).max() < 0.003
-    # Further ahead, the edge of the road moves by at most one pixel per row and the height by at most 3 cm per row.
+    # Ahead of the seam, the road edge moves by at most one pixel per row. The height changes by at most 3 cm per row.
     left = bent.occupied[ROAD].argmax(axis=1)[:32]
     assert left[0] == 23 and left[31] == 20 and set(np.diff(left)) <= {0, -1}
     along = np.abs(np.diff(bent.height_m[ROAD, :32, 26]))

@@ -1,4 +1,4 @@
-"""Tests of the split of the paper (supplement A) against a literal implementation and all pairs of distances."""
+"""Tests that compare the split of the paper (supplement A) with a literal implementation and with all distances."""
 
 import logging
 
@@ -17,7 +17,7 @@ def draw_drive(rng: np.random.Generator, length_m: float, start_m: np.ndarray) -
 
 
 def split_literally(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """Compute the split of the supplement pose by pose."""
+    """Compute the split as in the supplement, pose by pose."""
     driven, label = 0.0, {}
     for sequence, positions in positions_by_sequence.items():
         for k in range(len(positions)):
@@ -68,7 +68,7 @@ def test_split_of_straight_drive_has_100_test_regions_of_15_m():
     assert len(starts) == 100
     assert abs((split == "test").sum() - 1500) <= 100
     # Each segment of 200 m has 10 m without a split: 5 m at its end and 5 m before the test region.
-    # The removal of poses within 5 m of the other split adds few poses.
+    # A few more poses have no split because they are less than 5 m from the other split.
     assert abs((split == "unused").sum() - 1000) <= 200
 
 

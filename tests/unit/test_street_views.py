@@ -1,4 +1,5 @@
-"""Tests of street views against ray casting, of centrelines, and of OpenDRIVE files against their schema."""
+"""Tests of street views (compared with ray casting), of centrelines, and of OpenDRIVE files (checked by their
+schema)."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -40,9 +41,9 @@ def compute_rays(camera: StreetCamera) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_street_view_equals_ray_casting(seed):
-    """The references are embree for the mesh of boxes and ground, and the exact quadric for ellipsoids."""
+    """The reference for boxes and ground is embree. The reference for ellipsoids is the exact quadric."""
     scene = random_scene(seed, 60, tilt_rad=0.4)
-    # As in the renderer, rays hit only outer faces, so a camera inside a box sees through its faces.
+    # As in the renderer, rays hit only outer faces, so a camera inside a box sees through the faces of the box.
     camera = StreetCamera.at([1.0, 2.0, 3.0], 0.2, -0.1, SMALL)
     view, way = StreetRenderer(scene).view(camera), compute_rays(camera)
     soup = triangulate_scene(scene)
@@ -67,7 +68,7 @@ def test_street_view_equals_ray_casting(seed):
         a, b, c = (d * d).sum(1), d @ p, p @ p - 1
         if (
             camera.local(scene.center_m[index])[2] < 3.5 or c < 0
-        ):  # exclude ellipsoids that are near the camera or contain it
+        ):  # exclude ellipsoids that contain the camera or are near the camera
             continue
         inside = b * b - a * c
         near = np.where((inside > 0) & (b > 0), (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
@@ -94,7 +95,8 @@ def test_street_view_normals_face_camera_and_are_deterministic(town_scenes):
 
 
 def test_street_view_clips_at_near_plane():
-    """The side of a long box, from behind the camera to far ahead, fills the left half of the picture."""
+    """The side of a long box fills the left half of the picture. The box reaches from behind the camera to far
+    ahead."""
     scene = random_scene(0, 1, tilt_rad=0)
     box = {"category": np.array([6], np.int8), "center_m": np.array([[0, 3, 0]], np.float32), "label": UNSET}
     box |= {"size_m": np.array([[100, 2, 8]], np.float32), "rotation": np.eye(3, dtype=np.float32)[None]}
@@ -109,7 +111,7 @@ def test_street_view_clips_at_near_plane():
 def test_street_view_at_half_resolution_shows_same_view():
     full, half = Lens(), Lens().resize(704, 188)
     assert half.fx == pytest.approx(full.fx / 2)
-    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # borders of the picture have equal directions at both resolutions
+    for corner in ((-0.5, -0.5), (1407.5, 375.5)):  # the border rays are the same at both resolutions
         there = ((corner[0] + 0.5) / 2 - 0.5 - half.cx) / half.fx, ((corner[1] + 0.5) / 2 - 0.5 - half.cy) / half.fy
         assert np.allclose(there, [(corner[0] - full.cx) / full.fx, (corner[1] - full.cy) / full.fy])
 
@@ -118,7 +120,7 @@ def test_street_view_at_half_resolution_shows_same_view():
 
 
 def make_scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = None) -> Scene:
-    """Return a scene on a slope of 2 % whose road covers all points within width_m / 2 of the lines (k, 2)."""
+    """Return a scene on a slope of 2 %. Its road covers all points within width_m / 2 of the lines (k, 2)."""
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     road = np.zeros(x.shape, bool)
@@ -200,7 +202,7 @@ def test_route_goes_straight_and_keeps_right():
     back = plan_drive(network, start_m=(64.0, 3.0))
     assert (
         back[0, 0] > 60 and back[-1, 0] < 4 and back[10:15, 1].mean() > 3.5
-    )  # in this direction, the right lane is on the other side
+    )  # in the opposite direction, the right lane is on the other side
 
 
 # ----------------------------------------------------------------------------------------------------- OpenDRIVE
@@ -279,7 +281,7 @@ def test_opendrive_junction_connects_lanes_of_its_roads(schema):
             end = 0 if link.get("contactPoint") == "start" else -1
             assert np.abs(points[which] - other_points[end]).max() < 1e-3
             turn = headings[which] - other_headings[end]
-            assert abs(np.sin(turn)) < 0.05  # the roads are parallel, in either direction
+            assert abs(np.sin(turn)) < 0.05  # the roads are parallel and have the same or the opposite direction
             leads_on = (which == 0) == (end == -1)
             assert (np.cos(turn) > 0) == leads_on
         link = connection.find("laneLink")

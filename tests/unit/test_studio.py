@@ -1,4 +1,4 @@
-"""Tests of extending and inpainting scenes larger than a block, and of the studio without Ray."""
+"""Tests that extend and inpaint scenes larger than a block, and tests of the studio without Ray."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_inpaint_regenerates_only_region_of_large_scene(contents):
         row, col = scene.grid.pixel(*scene.center_m[:, :2].T)
         kept = scene.center_m[~inside[row, col] | (contents == "ground")]
         assert np.array_equal(new.center_m[: len(kept)], kept)
-    # For a scene of the size of a block, the result equals inpainting by the pipeline.
+    # If the scene has the size of a block, the result equals the result of the pipeline.
     scene = studio_scene(2)
     region = select_polygon(scene.grid, [(20, -10), (40, -10), (40, 10), (20, 10)])
     *_, last = inpaint_blocks(pipeline, scene, region, "low", contents, repaint=quick)

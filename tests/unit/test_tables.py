@@ -1,4 +1,4 @@
-"""Tests of tables: scenes round-trip, and DuckDB can query the files."""
+"""Tests of tables: scenes are the same after writing and reading, and DuckDB can query the files."""
 
 import duckdb
 import numpy as np

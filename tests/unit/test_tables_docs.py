@@ -1,7 +1,7 @@
 """Tests of docs/reference/tables.md and of the descriptions in table files.
 
-Every code block runs, query results equal results in Python, and the lists of columns equal the schemas.
-The command `PYTHONPATH=tests python tests/unit/test_tables_docs.py` writes the lists of columns and categories to the
+Every code block must run, queries must give the same results as Python code, and column lists must match the schemas.
+The command `PYTHONPATH=tests python tests/unit/test_tables_docs.py` updates the lists of columns and categories on the
 page.
 """
 
@@ -107,7 +107,7 @@ QUESTIONS = [heading for heading, _ in find_code_blocks("sql") if heading not in
 
 
 def label_scenes_of_town(scenes: list[Scene]) -> list[Scene]:
-    """Return the scenes with density labels from the thresholds of their training split."""
+    """Return the scenes with density labels; the thresholds come from the training split."""
     labels = {}
     for name, group in (("vegetation_density", VEGETATION), ("vehicle_density", VEHICLES)):
         count = np.array([np.isin(s.category, group).sum() for s in scenes])
@@ -122,7 +122,7 @@ def label_scenes_of_town(scenes: list[Scene]) -> list[Scene]:
 def make_generated_scene(scene: Scene, index: int) -> Scene:
     """Return a substitute for a generated scene.
 
-    The scene has a third of the primitives of a real scene, at 0.8 times their size.
+    The scene has one third of the primitives of a real scene, scaled by 0.8.
     """
     some = scene.select(np.arange(index % 3, len(scene), 3))
     return replace(
@@ -168,7 +168,7 @@ def rejects() -> list[dict]:
 
 @pytest.fixture(scope="module")
 def root(town, generated_scenes, rejects, tmp_path_factory) -> Path:
-    """Folder with `real` and `generated`, which replace `DIR` and `GENERATED` of the page."""
+    """Folder with `real` and `generated`. These paths replace `DIR` and `GENERATED` of the page."""
     path = tmp_path_factory.mktemp("tables")
     for split in ("train", "test"):
         for number, sequence in enumerate(sorted({s.sequence for s in town if s.split == split})):
@@ -438,7 +438,7 @@ def test_table_units_match_column_names():
 
 
 def test_label_scenes_keeps_column_descriptions(root, tmp_path):
-    """label_scenes, the last step of preprocessing, rewrites the scenes tables."""
+    """The function label_scenes, the last step of preprocessing, rewrites the scenes tables."""
     from pipelines.schema.dataset import Statistics, label_scenes
 
     staged = Shard(f"{root}/real", "town", "train", 0).read("scenes")
@@ -455,7 +455,7 @@ def test_duckdb_lists_table_columns(answers):
 
 
 def test_shard_reads_files_without_descriptions(tmp_path):
-    """Files without descriptions are readable, alone and together with files with descriptions."""
+    """Files without descriptions are readable, both alone and together with files that have descriptions."""
     old, new = (Shard(str(tmp_path), "town", "train", k) for k in (0, 1))
     old.write([random_scene(0)])
     new.write([random_scene(1)])

@@ -33,7 +33,7 @@ def test_layout_round_trip_keeps_primitives_and_pixels():
     order = np.lexsort((np.linalg.norm(scene.center_m, axis=1), scene.category))
     assert np.array_equal(back.category, scene.category[order])
     assert np.allclose(back.center_m, scene.center_m[order], atol=1e-4)
-    # Compare scatter matrices instead of rotations: the yaw of a square footprint is ambiguous.
+    # Compare scatter matrices instead of rotations, because the yaw of a square footprint is ambiguous.
     want = compute_scatter_matrix(scene.rotation[order], scene.size_m[order])
     assert np.allclose(compute_scatter_matrix(back.rotation, back.size_m), want, atol=1e-3)
     assert np.array_equal(back.occupied, scene.occupied)

@@ -33,7 +33,7 @@ def drives():
 
 @pytest.fixture(scope="module")
 def large_sample():
-    """Counts of 1,000 test scenes, and the relief of every tenth scene in m."""
+    """Counts of 1,000 test scenes, and the relief (m) of every tenth scene."""
     relief = []
 
     def scenes():
@@ -67,7 +67,8 @@ def test_town_counts_are_overdispersed_with_every_category(large_sample):
 
 
 def test_town_vegetation_and_relief_are_in_stated_ranges(large_sample):
-    """Medians are within the stated ranges (p05 to p95) of count and volume per label; tails are close to them."""
+    """Per label, the medians of count and volume are within the stated ranges (p05 to p95). The tails are close to the
+    ranges."""
     sample, relief = large_sample
     label = sample.labels()
     for which, count_range, volume_range in (
@@ -114,7 +115,7 @@ def test_town_imu_is_above_road_with_z_down_and_small_tilt(drives):
             scene = drive.scene(index, grid=Grid(front_m=32.0))
             road = scene.ground_classes.index("road")
             assert scene.occupied[road, 126:130, 126:130].all()  # The ego vehicle is on a road.
-            # Slab tops are 0.3 m above the true surface, and the IMU is 0.93 m above it.
+            # The tops of slabs are 0.3 m and the IMU is 0.93 m above the true surface.
             assert abs(scene.height_m[road, 128, 128] + 0.63) < 0.06
 
 
@@ -192,7 +193,7 @@ def test_town_slabs_are_closed_simple_and_disjoint(drives):
         corners.append(n)
     union = shapely.union_all([polygon.buffer(-0.02) for polygon in polygons])
     total = sum(polygon.area for polygon in polygons)
-    assert union.area > 0.97 * total  # slabs do not overlap, except at bends and for rounding
+    assert union.area > 0.97 * total  # slabs overlap only at bends or because of rounding
     assert 120 < np.median(areas["road"]) < 320
     assert 10 < np.median(areas["sidewalk"]) < 35
     assert 0.15 < np.mean(np.array(corners) == 4) < 0.6

@@ -54,7 +54,8 @@ def test_read_voxels_repeats_coarse_voxels(tmp_path, shape):
 
 
 def test_read_voxels_undoes_every_axis_convention(tmp_path):
-    """A voxel at x (forward), y (left), z (up) is read correctly for each axis order and direction of a file."""
+    """For each order and direction of the axes in a file, a voxel is read at its correct x (forward), y (left) and z
+    (up)."""
     ours = random_voxels((64, 64, 8))
     for letters in permutations("xyz"):
         for signs in product("+-", repeat=3):
@@ -76,7 +77,7 @@ def test_voxel_picture_shows_topmost_filled_voxel():
 
 
 def test_voxel_picture_agrees_with_picture_of_primitives(town_scenes):
-    """The pictures differ where a primitive covers no voxel centre."""
+    """The pictures may differ at a primitive that covers no voxel centre."""
     tall = VoxelGrid(bottom_m=-10.0, top_m=22.0, levels=64)
     for scene in town_scenes[:3]:
         same = (draw_voxels(voxelize(scene, tall)) == render_bev(scene)).all(axis=2)

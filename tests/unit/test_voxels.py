@@ -1,4 +1,4 @@
-"""Tests of voxelisation against a test of every centre in every primitive, and against trimesh."""
+"""Tests that compare voxelisation with trimesh and with a test of every voxel centre in every primitive."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def compute_centers_m(voxels: VoxelGrid) -> np.ndarray:
 
 
 def draw_objects(seed: int, n: int = 40, tilt_rad: float = np.pi, voxels: VoxelGrid = SMALL) -> Scene:
-    """Return a scene without ground, with primitives of any rotation in and around a voxel grid."""
+    """Return a scene with primitives of any rotation in and around a voxel grid, without ground."""
     rng = np.random.default_rng(seed)
     grid = voxels.columns
     low = np.array([grid.back_m, grid.right_m, voxels.bottom_m]) - 1
@@ -35,7 +35,7 @@ def draw_objects(seed: int, n: int = 40, tilt_rad: float = np.pi, voxels: VoxelG
 
 
 def place_primitive(scene: Scene, k: int, center_m, size_m, category=CAR) -> Scene:
-    """Return the scene after primitive k is set to an axis-aligned box at a position."""
+    """Return the scene with primitive k replaced by an axis-aligned box at the given position."""
     parts = [scene.center_m.copy(), scene.size_m.copy(), scene.category.copy(), scene.rotation.copy()]
     for part, value in zip(parts, (center_m, size_m, category, np.eye(3)), strict=True):
         part[k] = value
@@ -47,7 +47,7 @@ def make_one_box(center_m, size_m, category=CAR) -> Scene:
 
 
 def voxelize_literally(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
-    """Test every centre in every primitive; finer categories overwrite coarser categories."""
+    """Test every voxel centre in every primitive. Finer categories overwrite coarser categories."""
     out, at = np.zeros(voxels.shape, np.uint8), compute_centers_m(voxels)
     for name in reversed(PRECEDENCE):
         for k in np.flatnonzero(scene.category == CATEGORY_INDEX[name]):
@@ -168,7 +168,7 @@ def voxelize_ground_literally(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [12, 24, 48])
 def test_voxelise_ground_is_voxel_at_surface(pixels):
-    """The raster pixels have the size of the voxels, a larger size and a smaller size."""
+    """The test uses raster pixels that are as large as the voxels, larger, and smaller."""
     grid = Grid(front_m=12.0, left_m=6.0, resolution_m=12.0 / pixels, rows=pixels, cols=pixels)
     voxels = VoxelGrid(replace(SMALL.columns, left_m=6.0, cols=24), -1.0, -0.2, 8)
     scene = random_scene(4, n=0, grid=grid)

@@ -1,4 +1,4 @@
-"""Tests of the web export: the web viewer receives the scene of the tables."""
+"""Tests of the web export: the web viewer receives the same scene as in the tables."""
 
 import base64
 import io
