@@ -15,7 +15,7 @@ from pipelines.reporting.report_style import STYLE
 WIDTH, HEIGHT = 640, 360
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 46  # Margins around the axes.
 MAX_POINTS = 600
-NUM_COLORS = 6  # Classes series-0 to series-5 of the style.
+NUM_COLORS = 6  # The style defines the classes series-0 to series-5.
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Chart:
     """Line chart of named series (x, y).
 
     Values that are not finite are skipped. On a logarithmic axis, values that are not positive are skipped too. A
-    series of 200 points or more is drawn faintly, with its moving average on top.
+    series with at least 200 points is drawn in a faint colour, and its moving average is drawn over it.
     """
 
     title: str
@@ -62,7 +62,7 @@ def make_standalone_svg(chart: Chart) -> str:
 
 
 def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Choose round numbers (1, 2 or 5 times a power of ten) that cover the range from `low` to `high`."""
+    """Choose evenly spaced round numbers that cover [low, high]; the step is 1, 2 or 5 times a power of ten."""
     if high <= low:
         high = low + max(abs(low), 1.0)
     raw = (high - low) / about
@@ -73,7 +73,7 @@ def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Choose powers of ten around [low, high], and also 2 and 5 times these powers for at most two decades."""
+    """Choose powers of ten around [low, high]; for at most two decades, also choose 2 and 5 times these powers."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
     factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)
@@ -85,7 +85,7 @@ def choose_log_ticks(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class _Axis:
-    """Map from values to pixels."""
+    """Mapping from values to pixels."""
 
     low: float
     high: float
@@ -105,7 +105,7 @@ def _find_drawable(
 ) -> tuple[np.ndarray, np.ndarray]:
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     if xs.shape != ys.shape:
-        raise ValueError(f"a series has {xs.size} x values but {ys.size} y values")
+        raise ValueError(f"a series must have the same number of x and y values, got {xs.size} and {ys.size}")
     keep = np.isfinite(xs) & np.isfinite(ys)
     if log_y:
         keep &= ys > 0
@@ -164,7 +164,7 @@ def _draw_legend(names: list[str]) -> str:
 
 
 def format_number(value: float) -> str:
-    """Format a number: at most four significant digits, thousands separators, powers of ten for extreme values."""
+    """Format a number with at most four significant digits, thousands separators and an exponent for extreme values."""
     if not math.isfinite(value):
         return "–"
     size = abs(value)

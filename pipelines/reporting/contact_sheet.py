@@ -1,4 +1,4 @@
-"""Draw pictures of a dataset directory: a plate of one scene in all views, and sheets of many scenes.
+"""Draw scenes of a dataset directory: a plate shows one scene in all views, and a sheet shows many scenes.
 
 The functions accept real and generated scenes. Only `paint_scene` uses Ray.
 """
@@ -35,8 +35,8 @@ class View:
     """Kind and size of a picture of a scene.
 
     Attributes:
-        kind: `bev` for a view from above, `3d` for an oblique view.
-        size_px: Length of the longer side for `bev`; width for `3d`, with aspect 4 : 3 (px).
+        kind: `bev` is a view from above; `3d` is an oblique view.
+        size_px: For `bev`, length of the longer side (px). For `3d`, width (px); the aspect ratio is 4 : 3.
     """
 
     kind: Literal["bev", "3d"]
@@ -53,11 +53,11 @@ def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
     """Render the scenes of a row.
 
     Args:
-        row: Row with a shard, rows of the shard and their places in the result.
+        row: Dictionary with a shard, rows of the shard, and the positions of the scenes in the result.
         views: Views to render.
 
     Returns:
-        Rows with place, view, shape and bytes of each picture.
+        One row per picture, with its place, view, shape and bytes.
     """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
@@ -71,7 +71,7 @@ def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
 def paint_scene(
     catalogue: Catalogue, indices: np.ndarray, views: tuple[View, ...], on_picture: Callable[[], None] | None = None
 ) -> list[list[np.ndarray]]:
-    """Render selected scenes with Ray; one task renders up to CHUNK scenes of a shard.
+    """Render selected scenes with Ray; a task renders up to CHUNK scenes of one shard.
 
     Args:
         catalogue: Scenes of a dataset directory.
@@ -104,13 +104,13 @@ def paint_scene(
 
 
 def load_font(size: int) -> ImageFont.FreeTypeFont:
-    """Load the font that is included in Pillow, so that all machines draw the same text."""
-    # With a size, Pillow never returns a bitmap font.
+    """Load the font that Pillow contains; text then looks the same on all machines."""
+    # Pillow returns a scalable font, because a size is given.
     return cast(ImageFont.FreeTypeFont, ImageFont.load_default(size=size))
 
 
 def fit_text(text: str, size: int, width_px: float) -> str:
-    """Return the text, shortened in the middle if it is wider than `width_px`."""
+    """Return the text; text wider than `width_px` is shortened in the middle."""
     face, shown = load_font(size), text
     for kept in range(len(text) - 1, 3, -1):
         if face.getlength(shown) <= width_px:
@@ -133,13 +133,13 @@ def write_text(draw: ImageDraw.ImageDraw, x: float, y: float, text: str, size: i
 
 
 def draw_swatch(draw: ImageDraw.ImageDraw, x: float, y: float, name: str, size: int = 16) -> None:
-    """Draw the colour of a ground class or category, vertically centred on y."""
+    """Draw a square in the colour of a ground class or category, vertically centred on y."""
     draw.rectangle((x, y - size / 2, x + size, y + size / 2), fill=parse_rgb(COLOR_HEX[name]), outline=LINE)
 
 
 # ------------------------------------------------------------------------------------------- one scene, every view
 
-# Colours of the viridis map at equal steps.
+# Evenly spaced colours of the viridis map.
 RAMP = np.array(
     [
         parse_rgb(c)
@@ -149,16 +149,17 @@ RAMP = np.array(
 
 
 def draw_heights(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, float]]:
-    """Draw the height of the fused ground in the colours of RAMP, and white where there is no ground.
+    """Draw the height of the fused ground in the colours of RAMP; pixels without ground are white.
 
-    The ends of the ramp are the 1st and 99th percentile, because single distant slabs would reduce the contrast.
+    The colours range from the 1st to the 99th percentile of the heights, because outliers would reduce the contrast.
 
     Args:
         scene: Scene.
         size_px: Length of the longer side (px).
 
     Returns:
-        (H, W, 3) uint8 picture, and the heights of the ends of the ramp (m); (0, 1) without ground.
+        (H, W, 3) uint8 picture, and the lowest and highest height of the colour ramp (m). Without ground, the heights
+        are (0, 1).
     """
     surface, winner = scene.surface()
     known = winner >= 0
@@ -171,13 +172,13 @@ def draw_heights(scene: Scene, size_px: int) -> tuple[np.ndarray, tuple[float, f
 
 
 def make_color_ramp(share: np.ndarray) -> np.ndarray:
-    """Return the colours (..., 3) float sRGB of values (...). Values are clipped to [0, 1]."""
+    """Return the float sRGB colours (..., 3) of values (...), which are clipped to [0, 1]."""
     share = np.clip(share, 0, 1) * (len(RAMP) - 1)
     return np.stack([np.interp(share, np.arange(len(RAMP)), channel) for channel in RAMP.T], axis=-1)
 
 
 def compute_footprints_m(scene: Scene) -> list[np.ndarray]:
-    """Compute the outline (k, 2) of each primitive from above (m, scene frame)."""
+    """Compute the outline (k, 2) of each primitive as seen from above (m, scene frame)."""
     transform = compute_placements(scene)
     outlines = []
     turn = np.linspace(0, 2 * np.pi, 33)[:-1]
@@ -194,14 +195,14 @@ def compute_footprints_m(scene: Scene) -> list[np.ndarray]:
 
 
 def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndarray:
-    """Draw the transparent footprints of the primitives from above, higher primitives over lower ones.
+    """Draw transparent footprints of the primitives, seen from above; higher primitives cover lower primitives.
 
     A line from the centre shows the heading of a primitive if it is known.
 
     Args:
         scene: Scene.
         size_px: Length of the longer side (px).
-        supersample: Each pixel is the mean of supersample^2 points.
+        supersample: Square root of the number of points that are averaged per pixel.
 
     Returns:
         (H, W, 3) uint8 picture.
@@ -235,7 +236,7 @@ class LayoutBox(NamedTuple):
     height: int
 
     def of(self, plate: np.ndarray) -> np.ndarray:
-        """Return the part of a plate inside this box."""
+        """Return the part of a plate inside the box."""
         return plate[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
@@ -251,15 +252,15 @@ LEGEND_X = PRIMITIVES_X + SMALL + GAP
 
 
 def draw_scene_plate(scene: Scene) -> tuple[np.ndarray, dict[str, LayoutBox]]:
-    """Draw one scene in all views with its names, labels and counts.
+    """Draw one scene in all views, with its ids, labels and counts.
 
-    The pictures are bev, 3d, ground, heights and primitives. The first equals the result of `render_bev`.
+    The pictures are bev, 3d, ground, heights and primitives. The bev picture is the result of `render_bev`.
 
     Args:
         scene: Scene.
 
     Returns:
-        (H, W, 3) uint8 plate, and the position of each picture.
+        (H, W, 3) uint8 plate, and the position of each picture on the plate.
     """
     bare = replace(scene, height_m=np.zeros_like(scene.height_m), occupied=np.zeros_like(scene.occupied))
     heights, span_m = draw_heights(scene, SMALL)
@@ -322,7 +323,7 @@ def _draw_header(draw: ImageDraw.ImageDraw, scene: Scene) -> None:
 
 
 def _draw_ticks(draw: ImageDraw.ImageDraw, scene: Scene, box: LayoutBox) -> None:
-    """Draw ticks of x at the left of a view from above, and ticks of y below it."""
+    """Draw x ticks to the left of a view from above, and y ticks below the view."""
     grid = scene.grid
     for x in choose_ticks(grid.back_m, grid.front_m, 4):
         if grid.back_m <= x <= grid.front_m:
@@ -378,7 +379,7 @@ def draw_scene_sheet(
         pictures: (H, W, 3) uint8 pictures.
         captions: Two lines of text per picture.
         title: Title.
-        columns: Pictures per row; None chooses the number.
+        columns: Pictures per row. None: the number is chosen automatically.
 
     Returns:
         (H, W, 3) uint8 sheet.
@@ -399,7 +400,7 @@ def draw_scene_sheet(
 
 
 def choose_columns(count: int, aspect: float) -> int:
-    """Choose the number of columns for a sheet of about 5 : 4 whose last row is as full as possible.
+    """Choose the number of columns for an aspect ratio of about 5 : 4 and a last row with few empty places.
 
     Args:
         count: Number of pictures.
@@ -421,7 +422,7 @@ def _draw_title(text: str, width: int, margin: int) -> np.ndarray:
 
 
 def _draw_colors(width: int, margin: int) -> np.ndarray:
-    """Draw a strip with the colour of each class, in one or more lines."""
+    """Draw a legend of the class colours, in one or more lines."""
     size = min(22, max(13, width // 90))
     places, x, line = [], margin, 0
     for name in COLOR_HEX:
@@ -440,7 +441,7 @@ def _draw_colors(width: int, margin: int) -> np.ndarray:
 
 
 def make_captions(catalogue: Catalogue, indices: np.ndarray, sort: str) -> list[tuple[str, str]]:
-    """Make captions for scenes: the scene id, then the number of primitives and the value of the sort column."""
+    """Make captions for scenes: scene id, number of primitives and value of the sort column."""
     names, totals = catalogue.column("scene_id"), catalogue.column("num_primitives")
     column = None if sort in ("drive", "random", "primitives", "num_primitives") else catalogue.sort_column(sort)
     values = None if column is None else catalogue.column(column)

@@ -1,6 +1,6 @@
-"""Draw a dataset as inline SVG: histograms, ranges of sizes, bars, label matrices and maps of drives.
+"""Draw charts of a dataset as inline SVG: histograms, size ranges, bars, label matrices and maps of drives.
 
-Text, lines and series have the colours of the page's style. Classes have the colours of the palette.
+The style of the page defines the colours of text, lines and series. The palette defines the colours of classes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pipelines.reporting.chart import choose_log_ticks, choose_ticks, format_num
 from pipelines.schema.palette import COLOR_HEX
 
 MAX_BINS = 25
-LEAST_SPAN = 10  # Minimum range of counts on the axis of a histogram, so that single bars are not too wide.
+LEAST_SPAN = 10  # Minimum range of counts on the axis of a histogram; it limits the width of the bars.
 PAGE_PX = 1140  # Width of a drawing that fills the page.
 
 
@@ -59,19 +59,19 @@ def count_bins(counts: np.ndarray) -> tuple[int, np.ndarray]:
         counts: (n,) whole numbers, at least 0.
 
     Returns:
-        Width of a bin, and the number of values per bin. The first bin starts at 0.
+        Width of the bins, and the number of values per bin. The first bin starts at 0.
     """
     width = int(counts.max(initial=0)) // MAX_BINS + 1
     return width, np.bincount(counts.astype(int) // width)
 
 
 def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, float]) -> str:
-    """Draw the number of scenes by their number of primitives of a category.
+    """Draw a histogram of scenes over their number of primitives of a category.
 
     Args:
         category: Category.
         counts: (n,) primitives per scene.
-        marks: Counts to mark by a line, by name.
+        marks: Counts that are marked by a line (dictionary from name to count).
 
     Returns:
         <svg> element.
@@ -112,7 +112,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
 
 
 def _join_mark_names(marks: Mapping[str, float]) -> dict[float, str]:
-    """Return the joined names of the marks by value."""
+    """Join the names of marks that have the same value; return them by value."""
     names: dict[float, list[str]] = {}
     for name, value in marks.items():
         names.setdefault(value, []).append(name)
@@ -123,13 +123,14 @@ def _join_mark_names(marks: Mapping[str, float]) -> dict[float, str]:
 
 
 def draw_size_ranges(percentiles_m: Mapping[str, np.ndarray]) -> str:
-    """Draw the ranges of length, width and height per category on one logarithmic axis.
+    """Draw the ranges of length, width and height of each category on one logarithmic axis.
 
-    A thin line extends from the 5th to the 95th percentile, a thick line from the 25th to the 75th. A dot marks the
-    median.
+    A thin line extends from the 5th to the 95th percentile. A thick line extends from the 25th to the 75th percentile.
+    A dot marks the median.
 
     Args:
-        percentiles_m: (5, 3) 5th, 25th, 50th, 75th and 95th percentile of length, width and height, by category (m).
+        percentiles_m: (5, 3) array per category: rows are the 5th, 25th, 50th, 75th and 95th percentile; columns are
+            length, width and height (m).
 
     Returns:
         <svg> element.
@@ -177,7 +178,7 @@ def draw_share_bars(title: str, shares: Mapping[str, Mapping[str, float]]) -> st
 
     Args:
         title: Title.
-        shares: Shares in [0, 1] by ground class and label.
+        shares: Shares in [0, 1], for each ground class and label.
 
     Returns:
         <svg> element.
@@ -201,11 +202,11 @@ def draw_share_bars(title: str, shares: Mapping[str, Mapping[str, float]]) -> st
 
 
 def draw_label_matrix(title: str, counts: np.ndarray, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Draw the number of scenes per pair of labels as shaded cells.
+    """Draw the number of scenes for each pair of labels as shaded cells.
 
     Args:
         title: Title.
-        counts: (rows, columns) scenes.
+        counts: (rows, columns) number of scenes.
         rows: Names of the rows.
         columns: Names of the columns.
 
@@ -238,8 +239,8 @@ def draw_label_matrix(title: str, counts: np.ndarray, rows: Sequence[str], colum
 
 # --------------------------------------------------------------------------------------------------------- map
 
-SPLIT_STYLE = {"unused": "axis", "train": "series-1", "test": "series-3"}  # Styles in the order of drawing.
-MAX_NAMED = 60  # Maximum number of sequences with names; frames of more sequences are too small for names.
+SPLIT_STYLE = {"unused": "axis", "train": "series-1", "test": "series-3"}  # Styles; splits are drawn in this order.
+MAX_NAMED = 60  # Names are drawn for at most this many sequences, because smaller frames lack space.
 
 
 class _Shelf(NamedTuple):
@@ -265,12 +266,12 @@ PADDING_PX, LEGEND_PX = 7, 34
 
 
 def draw_track_map(positions_m: Mapping[str, Mapping[str, np.ndarray]]) -> str:
-    """Draw the positions of the scenes of each sequence at one scale, with x to the right and y upwards.
+    """Draw a map of the scenes of each sequence, all at the same scale, with x to the right and y upwards.
 
     Each scene is a dot. Each sequence has a frame, and the frames are arranged in rows.
 
     Args:
-        positions_m: (n, 2) x and y by sequence and split (m, world frame).
+        positions_m: (n, 2) x and y of the scenes of each sequence and split (m, world frame).
 
     Returns:
         <svg> element.
@@ -303,7 +304,7 @@ def _draw_order(split: str) -> tuple[int, str]:
 
 
 def _draw_frame(sequence: str, scenes: int, corner_px: np.ndarray, cell_px: np.ndarray, shelf: _Shelf) -> list[str]:
-    """Draw the frame of a sequence, and its name below the frame if there is room."""
+    """Draw the frame of a sequence, and its name below the frame if there is enough space."""
     x, y = corner_px - PADDING_PX
     outline = 'rx="6" fill="none" stroke="var(--line)"'
     width, height = cell_px + 2 * PADDING_PX
@@ -315,7 +316,7 @@ def _draw_frame(sequence: str, scenes: int, corner_px: np.ndarray, cell_px: np.n
 
 
 def _draw_map_legend(positions_m: Mapping[str, Mapping[str, np.ndarray]], px_per_m: float) -> list[str]:
-    """Draw the colours and numbers of scenes of the splits, and a scale bar with a round number of metres."""
+    """Draw the legend of the splits with their numbers of scenes, and a scale bar with a round number of metres."""
     found: Counter = Counter()
     for by_split in positions_m.values():
         found.update({split: len(xy) for split, xy in by_split.items()})
@@ -337,7 +338,7 @@ def _draw_map_legend(positions_m: Mapping[str, Mapping[str, np.ndarray]], px_per
 
 
 def _draw_scale(extent_m: np.ndarray, shelf: _Shelf) -> float:
-    """Return the maximum pixels per metre at which each sequence fits its cell and all sequences fit the map."""
+    """Return the largest scale (px / m) at which each sequence fits into its cell and all of them fit into the map."""
     low, high = 1e-6, 20.0
     for _ in range(40):
         middle = (low * high) ** 0.5

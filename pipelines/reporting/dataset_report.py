@@ -1,7 +1,7 @@
-"""Render a dataset directory as one page: numbers, sizes, places and labels of its scenes, and rejected scenes.
+"""Render one page about a dataset directory: counts, sizes, poses and labels of its scenes, and rejected scenes.
 
-All figures come from the tables. Slots, thresholds and the reports of the readers come from dataset.json. The file is
-optional, so that directories of generated scenes have a page as well.
+All figures are computed from the tables. Slots, thresholds and the reports of the readers are read from dataset.json.
+This file is optional: directories of generated scenes do not have it.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class DatasetFacts:
     Attributes:
         catalogue: Scenes of the dataset directory.
         grid_area_m2: (n,) area of the grid of each scene (m^2).
-        sizes_m: Length, width and height (k, 3) of all primitives by category (m).
-        labels: Number of primitives by category and label of the dataset.
+        sizes_m: (k, 3) length, width and height of all primitives of each category (m).
+        labels: Number of primitives for each category and class label of the dataset.
         rejects: Rows of the rejects table.
-        description: Content of dataset.json, if any.
-        records: Options of each generated source, by source.
+        description: Content of dataset.json. None: there is no such file.
+        records: Options of the run that generated a source, for each source.
     """
 
     catalogue: Catalogue
@@ -72,7 +72,7 @@ class DatasetFacts:
 
     @property
     def slots(self) -> dict[str, int]:
-        """Return the number of slots by category; empty without dataset.json."""
+        """Return the number of slots per category; the dictionary is empty if there is no dataset.json."""
         layout = self.description["layout"] if self.description else {"categories": (), "slots": ()}
         return dict(zip(layout["categories"], layout["slots"], strict=True))
 
@@ -84,15 +84,15 @@ def read_facts(
 
     Args:
         root: Dataset directory.
-        source: Source to read; None reads all.
-        split: Split to read; None reads all.
-        on_shard: Called after each shard with the number of finished shards and the number of all shards.
+        source: Source to read. None: all sources are read.
+        split: Split to read. None: all splits are read.
+        on_shard: Called after each shard with the number of finished shards and the total number of shards.
 
     Returns:
         Contents of the page.
 
     Raises:
-        ValueError: The directory holds no scenes of this source and split.
+        ValueError: The directory contains no scenes of this source and split.
     """
     catalogue = Catalogue.read(root, source, split)
     sizes: dict[str, list[np.ndarray]] = {name: [] for name in CATEGORIES}
@@ -139,7 +139,7 @@ def render_dataset_html(facts: DatasetFacts, scenes: Sequence[tuple[Picture, Pic
 
     Args:
         facts: Contents of the page.
-        scenes: Pairs of pictures of a scene: oblique view, and view from above.
+        scenes: Two pictures per scene: an oblique view and a view from above.
 
     Returns:
         HTML page.
@@ -192,7 +192,7 @@ def group_by_split(facts: DatasetFacts) -> dict[str, int]:
 
 
 def draw_scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
-    """Make rows of oblique pictures, each above a row of the same scenes from above."""
+    """Make rows of oblique views; below each row, the same scenes are shown from above."""
     columns, pictures = min(len(scenes), 4), []
     for start in range(0, len(scenes), columns):
         row = scenes[start : start + columns]
@@ -202,7 +202,7 @@ def draw_scene_pictures(scenes: Sequence[tuple[Picture, Picture]]) -> Pictures:
 
 
 def make_split_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
-    """Make the table of splits, and the map of splits if the poses are known."""
+    """Make the table of splits. If the poses are known, also make the map of splits."""
     catalogue = facts.catalogue
     source, split, sequence = (catalogue.column(name) for name in ("source", "split", "sequence"))
     per_scene, rows = catalogue.column("num_primitives"), []
@@ -234,13 +234,13 @@ def make_split_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
     }
     note = (
         "Each dot is the pose of a scene in the world frame, with x to the right and y upwards. All sequences have the "
-        "same scale. The map does not show where sequences lie relative to each other."
+        "same scale. The relative position of sequences on the map has no meaning."
     )
     return [*sections, DrawingsSection("Split map", [CaptionedSvg(draw_track_map(tracks))], "wide", note)]
 
 
 def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
-    """Draw the number of scenes by count, per category, with the slots and the 95th percentile that defines them."""
+    """Draw a histogram of counts per category; mark the slots and the 95th percentile, from which slots are derived."""
     training, drawings = facts.catalogue.column("split") == "train", []
     for k, name in enumerate(CATEGORIES):
         counts = facts.counts[:, k]
@@ -262,9 +262,9 @@ def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
     )
     if facts.description:
         note += (
-            " The mark p95 is the 95th percentile of the training split. The mark slots is the maximum number of "
-            "primitives of a category in a tensor, which keeps the nearest primitives. Over slots is the share of "
-            "training scenes with more primitives than slots."
+            " The mark p95 shows the 95th percentile of the training split. The mark slots shows the maximum number of "
+            "primitives of a category in a tensor. If a scene has more primitives, the tensor keeps the nearest "
+            "primitives. Over slots is the share of training scenes with more primitives than slots."
         )
     return DrawingsSection("Primitives per scene", drawings, "small", note)
 
@@ -301,7 +301,7 @@ def _format_metres(value: float) -> str:
 
 
 def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
-    """Draw the mean share of the grid per ground class and density label."""
+    """Draw the mean share of the grid for each ground class and density label."""
     drawings = []
     for group in ("vegetation", "vehicle"):
         labels = facts.catalogue.column(f"{group}_density")
@@ -319,7 +319,7 @@ def draw_ground_shares(facts: DatasetFacts) -> DrawingsSection:
 
 
 def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
-    """Show the number of scenes per pair of density labels and split, and the thresholds of the labels."""
+    """Show the number of scenes for each split and pair of density labels, and the thresholds of the labels."""
     columns = [facts.catalogue.column(f"{group}_density") for group in ("vegetation", "vehicle")]
     names = [[*DENSITIES, *([None] if None in set(values) else [])] for values in columns]
     split, drawings = facts.catalogue.column("split"), []
@@ -330,9 +330,9 @@ def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
             CaptionedSvg(draw_label_matrix(f"{part}, {format_number(total)} scenes", counts, *_name_rows(names)))
         )
     note = (
-        "Each cell is the number of scenes with a pair of density labels. A scene has label low if count and volume "
-        "are both below their p25. A scene has label high if both are above their p75. All other scenes have label "
-        "medium."
+        "Each cell is the number of scenes with a pair of density labels. A label depends on the number and the "
+        "total volume of the objects. Label low: both are below the 25th percentile (p25). Label high: both are above "
+        "the 75th percentile (p75). All other scenes have label medium."
     )
     if not facts.description:
         note = "Each cell is the number of scenes with a pair of requested density labels."
@@ -370,7 +370,7 @@ def make_reject_sections(facts: DatasetFacts) -> list[Section]:
 
 
 def make_reader_sections(facts: DatasetFacts) -> list[Section]:
-    """Tabulate the objects that the readers of raw drives excluded, per sequence, label and defect."""
+    """Tabulate, per sequence, label and defect, the objects that the readers of raw drives excluded."""
     reports: Mapping[str, Mapping] = (facts.description or {}).get("reports") or {}
     if not reports:
         return []

@@ -1,4 +1,4 @@
-"""Render a report page with SVG drawings among its sections."""
+"""Render a report page that contains sections with SVG drawings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DrawingsSection:
     Attributes:
         title: Heading.
         drawings: Drawings in reading order.
-        layout: `wide` for the full page width, `pairs` for two per row, `small` for many per row.
+        layout: `wide`: one drawing per row. `pairs`: two drawings per row. `small`: many drawings per row.
         note: Text above the drawings.
     """
 
@@ -35,7 +35,7 @@ class DrawingsSection:
 
 
 def render_page_html(title: str, sections: Sequence[Section | DrawingsSection], subtitle: str = "") -> str:
-    """Render a page like `render_report_html`, with drawings among the sections."""
+    """Render a page like `render_report_html`, but allow sections with drawings."""
     plain = [
         Text(section.title, [section.note, _make_marker(index)]) if isinstance(section, DrawingsSection) else section
         for index, section in enumerate(sections)

@@ -1,4 +1,4 @@
-"""Render the comparison of generated with real scenes as one page: scores, intervals, meanings and pictures."""
+"""Render the comparison of generated and real scenes as one page: scores, intervals, meanings and pictures."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from pipelines.reporting.report import (
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
 MEANINGS = {
-    "fid": "Frechet distance of Inception's pool3 features. 0 means equal. The distance falls with the number of "
-           "samples, so compare distances of equal numbers only",
+    "fid": "Frechet distance of Inception's pool3 features; equal sources have 0. The distance falls with the number "
+           "of samples. Compare only distances that were computed from the same number of samples",
     "sfid": "Frechet distance of Inception's spatial features, which depend on the positions of objects",
-    "kid": "kernel distance of the pool3 features with a cubic kernel. 0 means equal. The number of samples causes no "
-           "bias",
-    "inception_score": "confidence and variety of Inception's class predictions. The score is designed for photographs",
+    "kid": "kernel distance of the pool3 features with a cubic kernel; equal sources have 0. The expected value does "
+           "not depend on the number of samples",
+    "inception_score": "confidence and variety of Inception's class predictions. The score is intended for photographs",
     "inception_score_real": "Inception score of the real pictures",
     "precision": "share of generated pictures that lie in the neighbourhood of a real picture",
     "recall": "share of real pictures that lie in the neighbourhood of a generated picture",
     "density": (
-"mean number of real neighbourhoods that contain a generated picture, over k. Equal sources have"
-" about 1"
+"mean number of real neighbourhoods that contain a generated picture, divided by k. Equal sources"
+" have about 1"
 ),
     "coverage": "share of real pictures whose neighbourhood contains a generated picture",
     "layout_frechet": (
-"Frechet distance of object counts, object sizes and ground areas. 0 means equal. It is not an"
-" FID"
+"Frechet distance of object counts, object sizes and ground areas; equal sources have 0. It is not"
+" an FID"
 ),
-    "layout_mmd": "kernel distance of object counts, object sizes and ground areas. 0 means equal",
-    "random_frechet": "Frechet distance of the features of a fixed untrained network. 0 means equal. It is not an FID",
-    "random_mmd": "kernel distance of the features of a fixed untrained network. 0 means equal. It is not a KID",
+    "layout_mmd": "kernel distance of object counts, object sizes and ground areas; equal sources have 0",
+    "random_frechet": "Frechet distance of the features of a random network; equal sources have 0. It is not an FID",
+    "random_mmd": "kernel distance of the features of a random network; equal sources have 0. It is not a KID",
     "vegetation_fidelity": "share of scenes whose vegetation density matches the requested label",
     "vehicle_fidelity": "share of scenes whose vehicle density matches the requested label",
     "joint_fidelity": "share of scenes whose vegetation and vehicle densities both match the requested labels",
@@ -56,7 +56,7 @@ VALIDITY = {
     "floating": "standing objects more than 0.5 m above the ground",
     "sunken": "standing objects more than 0.5 m below the ground",
     "over_unknown_ground": "standing objects without any ground below them",
-    "off_road_vehicles": "vehicles outside roads and parking areas",
+    "off_road_vehicles": "vehicles that are not on roads or parking areas",
     "buildings_on_road": "buildings on the road",
     "road_connectivity": "road pixels in the largest connected component",
 }
@@ -70,8 +70,8 @@ class ExamplePictures:
     Attributes:
         real: Real examples.
         generated: Generated examples.
-        neighbours: Generated pictures, each with its nearest real pictures and their distances.
-        worst: Generated pictures with most faults, each with a caption.
+        neighbours: Generated pictures; each is followed by the nearest real pictures and their distances.
+        worst: Generated pictures with the most faults, and a caption for each picture.
     """
 
     real: Sequence[np.ndarray]
@@ -86,10 +86,10 @@ def render_evaluation_html(
     """Render the page.
 
     Args:
-        scores: Scores of `convert_estimates`.
-        counts: (n, 11) objects per scene and category of both sides, if known.
+        scores: Scores, as returned by `convert_estimates`.
+        counts: (n, 11) number of objects per scene and category, for both sides. None: unknown.
         shown: Pictures.
-        protocol: Paragraphs about the measurement.
+        protocol: Paragraphs that describe the measurement.
 
     Returns:
         HTML page.
@@ -136,7 +136,7 @@ def format_value(value: Mapping | float | None) -> str | None:
 
 
 def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | float]]:
-    """Yield the scores of nested plain scores with names joined by dots; words and nulls are skipped."""
+    """Flatten nested scores: yield (names joined by dots, score). Words and nulls are skipped."""
     for name, value in scores.items():
         if isinstance(value, Mapping) and set(value) != {"value", "low", "high"}:
             yield from iterate_leaves(value, f"{prefix}{name}.")
@@ -145,7 +145,7 @@ def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Map
 
 
 def list_headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
-    """Return the scores for short lists, without scores of single categories, classes or thresholds."""
+    """Return the main scores, without the scores of single categories, classes or thresholds."""
     return ((name, value) for name, value in iterate_leaves(scores) if not any(part in name for part in DETAILS))
 
 
@@ -177,7 +177,7 @@ def build_score_table(scores: Mapping) -> Table:
     note = (
         ""
         if "fid" in scores
-        else "Scores of Inception features need a local file of Inception weights: pass --inception FILE."
+        else "Inception scores are missing. They need a local file with Inception weights: pass --inception FILE."
     )
     return Table("Scores", ("score", "value"), rows, meanings=[explain_score(name) for name in flat], note=note)
 
@@ -187,7 +187,7 @@ def build_validity_table(validity: Mapping) -> Table:
         (words, *(format_value(validity[name][side]) for side in ("real", "generated")))
         for name, words in VALIDITY.items()
     ]
-    note = "Compare the shares with those of real scenes, because real scenes do not reach 0 either."
+    note = "Real scenes do not reach 0 either. Compare the shares with the shares of real scenes."
     return Table("Validity", ("share of", "real", "generated"), rows, note=note)
 
 
@@ -241,8 +241,8 @@ def draw_neighbour_pictures(shown: ExamplePictures) -> Pictures:
         pictures += [Picture(f"distance {d:.3g}", image, "real") for image, d in zip(nearest, distances, strict=True)]
     columns = 1 + max((len(nearest) for _, nearest, _ in shown.neighbours), default=0)
     note = (
-        "The figure shows the generated scenes with the smallest distance to a real scene. Each is followed by its "
-        "nearest real scenes and their distances."
+        "The figure shows the generated scenes with the smallest distance to a real scene. Each generated "
+        "scene is followed by the nearest real scenes and their distances."
     )
     return Pictures("Nearest real scenes", pictures, columns=columns, note=note)
 

@@ -1,4 +1,4 @@
-"""Render a gallery of scenes as one self-contained HTML page with filters by label and statistics, and scenes in 3D.
+"""Render a gallery of scenes as one self-contained HTML page, with a 3D view and filters.
 
 The page needs no download and no installation. It can be published as one file or sent by mail.
 """
@@ -36,10 +36,10 @@ def pack_scenes(row: dict) -> list[dict]:
     """Render and pack the scenes of a row.
 
     Args:
-        row: Row with a shard, rows of the shard and their places in the result.
+        row: Dictionary with a shard, rows of the shard, and the positions of the scenes in the result.
 
     Returns:
-        Rows with place, picture and viewer content of each scene.
+        One row per scene, with its place, picture and viewer content.
     """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []
@@ -52,7 +52,7 @@ def pack_scenes(row: dict) -> list[dict]:
 def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
-    """Render the page, about 35 kB per scene. Each Ray task packs up to CHUNK scenes of a shard."""
+    """Render the page; its size is about 35 kB per scene. Each Ray task packs up to CHUNK scenes of a shard."""
     import ray.data
 
     tasks = [
@@ -81,7 +81,7 @@ def render_gallery_html(
 
 
 def list_scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
-    """Return the values that the page shows and filters by: a number, word or null per scene and column."""
+    """Return the values that the page shows and uses as filters: a number, word or null per scene and column."""
     table = catalogue.scenes.take(pa.array(indices))
     names = [name for name in ("scene_id", *CHOICES, *NUMBERS) if name in table.column_names]
     rows = table.select(names).to_pylist()
@@ -89,7 +89,7 @@ def list_scene_values(catalogue: Catalogue, indices: np.ndarray) -> list[dict]:
 
 
 def read_script(name: str) -> str:
-    """Return a file of pipelines/web as a part of an inline module."""
+    """Return a script of pipelines/web for use in an inline module."""
     return files("pipelines").joinpath("web", name).read_text(encoding="utf-8").replace("export class", "class")
 
 

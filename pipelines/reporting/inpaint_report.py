@@ -1,4 +1,4 @@
-"""Render the page of an inpainting run: scenes before and after, and the decoder errors in the known region."""
+"""Render the page of an inpainting run: scenes before and after inpainting, and decoder errors in the known region."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pipelines.rendering.render import render_outlined_bev
 from pipelines.reporting.report import Picture, Pictures, Table, render_report_html
 
 PICTURE_PX = 512
-PER_ROW = 4  # Pictures per scene: the given scene and its first variants.
+PER_ROW = 4  # Pictures per scene: the input scene and its first variants.
 SUBJECTS = {"both": "Ground and objects are", "ground": "The ground is", "objects": "The objects are"}
 
 
 @dataclass(frozen=True)
 class InpaintExample:
-    """A given scene, its generated region (rows, cols) and its variants."""
+    """An input scene, its generated region (rows, cols) and its variants."""
 
     given: Scene
     region: np.ndarray
@@ -38,7 +38,7 @@ def render_inpaint_html(
     Args:
         run: Run name, shown as the subtitle.
         contents: Contents that were regenerated.
-        num_variants: Variants per scene.
+        num_variants: Number of variants per scene.
         examples: Scenes to show.
         drift: Scores of the decoder output in the known region.
 
@@ -55,8 +55,8 @@ def render_inpaint_html(
     )
     how = (
         "Outside the generated region, the latent equals the latent of the given scene. The decoders process the whole "
-        "latent, so their output may still differ there. The table shows these differences. The pictures and the "
-        "tables of scenes copy this part from the given scene."
+        "latent, so their output may still differ there. The table shows these differences. In the pictures and "
+        "the tables of scenes, this part is copied from the given scene."
     )
     pictures = Pictures("Scenes", shown, min(PER_ROW, 1 + num_variants), note)
     table = Table("Decoder errors outside the region", tuple(drift), [tuple(drift.values())], note=how)

@@ -10,26 +10,26 @@ from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
 
-HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; the card reports them elsewhere.
+HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; other parts of the card contain them.
 
 Points = Sequence[Sequence[float]]  # Training steps and values.
 
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """One run of training, as MLflow or the training.json of a published model records it.
+    """One training run, read from MLflow or from the training.json of a published model.
 
     Attributes:
-        name: lvae or dit; dit-2 for a second run that continues from the weights of the first.
-        stage: Stage of the training.
+        name: lvae or dit. dit-2 is a second run that starts with the weights of the first run.
+        stage: Training stage.
         weights: Digest of the resulting weights.
-        parameters: Number of weights of the network; None if unknown.
+        parameters: Number of weights of the network. None: unknown.
         steps: Number of training steps.
-        hours: Duration of the training steps without start-up and validation (h).
+        hours: Duration of all training steps, without start-up and validation (h).
         options: Options of the run.
         origin: Command, commit, machine and versions.
-        curves: Training steps and values by name of the loss.
-        data: Options of the dataset, as in its dataset.json.
+        curves: Training steps and values of each loss, by the name of the loss.
+        data: Options of the dataset, from dataset.json.
     """
 
     name: str
@@ -48,7 +48,7 @@ class TrainingRecord:
         return f"curves-{self.name}.svg"
 
     def record(self, data: Mapping) -> dict:
-        """Return the content of training.json: options of the run and of the dataset, without paths of this machine."""
+        """Return the content of training.json: options of the run and of the dataset, without local paths."""
         known = {key: value for key, value in self.options.items() if key not in HIDDEN}
         return asdict(self) | {"options": known, "data": self.data or dict(data)}
 
@@ -158,7 +158,7 @@ class ModelCard:
         yield "## Use and limits\n"
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
-            "training on other data. It is trained on the dataset above only. A procedural town does not represent "
+            "training on other data. It is trained only on the dataset above. A procedural town does not represent "
             "any real place, and neither do the generated scenes. The model is not tested for vehicle safety. "
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
@@ -170,7 +170,7 @@ class ModelCard:
 
 
 def render_table(head: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Iterator[str]:
-    """Yield the lines of a Markdown table, and an empty line."""
+    """Yield the lines of a Markdown table, followed by an empty line."""
     yield "| " + " | ".join(head) + " |"
     yield "|" + "---|" * len(head)
     for row in rows:

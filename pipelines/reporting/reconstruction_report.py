@@ -1,4 +1,4 @@
-"""Render the scores of layout-VAE reconstruction as one page, by category and class, with best and worst scenes."""
+"""Render layout-VAE reconstruction scores as one page: all scores, and the best and worst scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipelines.reporting.chart import Chart
 from pipelines.reporting.dataset_charts import spell_name
 from pipelines.reporting.report import Charts, Figure, KeyFigures, Picture, Pictures, Table, Text, render_report_html
 
-MIB = 2**20  # One MB of the paper.
+MIB = 2**20  # The paper calls this number of bytes 1 MB.
 # Scores of the paper (Tab. 1 and 2): KITTI-360, 1,233 test poses, three days of training on an A100.
 PAPER = {
     "ground_iou": 0.9996,
@@ -37,8 +37,8 @@ MEMORY = {
     "vectors_filled": "primitives as float32 tensors with filled slots only",
     "tables": "Parquet files on disk: rasters, primitives and the row of the scene",
     "latent": "latent mean as a float32 tensor",
-    "voxels": "256 x 256 x 32 voxels of one byte",
-    "voxels_32_bit": "256 x 256 x 32 voxels of four bytes, as the paper counts 8.00 MB for SemCity",
+    "voxels": "256 x 256 x 32 voxels, one byte each",
+    "voxels_32_bit": "256 x 256 x 32 voxels, four bytes each; the paper states 8.00 MB for SemCity",
 }
 
 
@@ -49,7 +49,7 @@ def render_reconstruction_html(
 
     Args:
         scores: Scores of a `Reconstruction`.
-        scenes: Scores of each scene, best first.
+        scenes: Scores of each scene; the best scene is first.
         best: Pictures of the first scenes (`draw_scenes`).
         worst: Pictures of the last scenes (`draw_scenes`).
         subtitle: Text below the title.
@@ -103,7 +103,7 @@ def _format_percent(share: float | None, digits: int = 1) -> str:
 
 
 def draw_scene_pictures(title: str, shown: Sequence[Mapping], scenes: pa.Table) -> Pictures:
-    """Make a row per scene: true scene and reconstruction from above, then both in an oblique view."""
+    """Make one row of pictures per scene: true scene and reconstruction, first from above, then in an oblique view."""
     by_id, pictures = {row["scene_id"]: row for row in scenes.to_pylist()}, []
     for drawn in shown:
         row = by_id[drawn["scene_id"]]
@@ -147,7 +147,7 @@ def draw_curves(scores: Mapping, scenes: pa.Table) -> Charts:
         "Score distributions",
         [
             Chart("Average precision by IoU3D threshold", thresholds, "IoU3D", "AP"),
-            Chart("Scores by percentile of scenes, sorted per score", spread, "percentile of scenes", "score"),
+            Chart("Percentiles of the scores over all scenes", spread, "percentile of scenes", "score"),
         ],
     )
 
@@ -160,15 +160,14 @@ def build_overall_table(scores: Mapping) -> Table:
             "ground IoU",
             scores["ground_iou"],
             PAPER["ground_iou"],
-            "pixels that both sides occupy, over pixels that either side occupies, at the resolution of the true "
-            "scene and over all classes together",
+            "intersection over union of occupied pixels, summed over all classes, at the resolution of the true scene",
         ),
         (
             "ground IoU, model resolution",
             scores["raster_ground_iou"],
             None,
-            f"ground IoU after the true scene is resampled to {scores['raster_px']} x {scores['raster_px']} pixels, "
-            "which excludes the error of this resolution",
+            f"ground IoU at the model resolution: the true scene is resampled to {scores['raster_px']} x "
+            f"{scores['raster_px']} pixels, and resampling errors are excluded",
         ),
         ("height RMSE, m", scores["height_rmse_m"], None, "over pixels that are occupied in the true scene"),
         ("height MAE, m", scores["height_mae_m"], None, "over pixels that are occupied in the true scene"),
@@ -180,7 +179,7 @@ def build_overall_table(scores: Mapping) -> Table:
             "paper does not state its bounds",
         ),
         ("AP3D", scores["ap3d"], PAPER["ap3d"], "mean over categories and ten IoU3D thresholds, 0.05 to 0.50"),
-        ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at IoU3D 0.50"),
+        ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at the IoU3D threshold 0.50"),
         ("mean IoU3D", matched["mean_iou3d"], None, "over matched pairs of boxes"),
         (
             "found",
@@ -200,8 +199,8 @@ def build_overall_table(scores: Mapping) -> Table:
             "label fidelity",
             scores["label_fidelity"]["joint_fidelity"],
             None,
-            "share of scenes whose reconstruction has both density labels of the true scene, which "
-            "approximately limits the score of generated scenes",
+            "share of scenes whose reconstruction has both density labels of the true scene; generated "
+            "scenes can hardly reach a higher share",
         ),
         (
             "size, MiB",
@@ -236,8 +235,8 @@ def build_category_table(scores: Mapping) -> Table:
         if name in scores["truths"] or name in matched["category_right"]
     ]
     note = (
-        "Ellipsoids have no AP3D, as in the paper. Their IoU3D is computed by sampling and is not part of the overall "
-        "mean."
+        "Ellipsoids have no AP3D, as in the paper. The IoU3D of ellipsoids is computed by sampling. The overall "
+        "mean excludes ellipsoids."
     )
     return Table("Scores by category", ("category", "true primitives", *columns), rows, note=note)
 
@@ -278,8 +277,8 @@ def describe_voxel_range(scores: Mapping) -> Table:
     for name, partly in voxels["category_partly_outside"].items():
         rows.append((spell_name(name), partly, voxels["category_outside"][name]))
     note = (
-        f"The voxel grid extends from {voxels['bottom_m']:g} to {voxels['top_m']:g} m in height. The table shows the "
-        "shares of the true scenes outside this range, which voxel scores ignore."
+        f"The voxel grid extends from {voxels['bottom_m']:g} to {voxels['top_m']:g} m in height. Voxel scores "
+        "ignore everything outside this range. The table shows the ignored shares of the true scenes."
     )
     columns = ("content", "partly outside", "completely outside")
     return Table("Content outside the voxel grid", columns, rows, note=note)
@@ -306,9 +305,9 @@ def list_definitions(scores: Mapping) -> Text:
             "precision uses 101 recall points. The IoU3D of boxes is exact.",
             "Mean IoU3D: Reconstructed primitives above the existence threshold are matched one-to-one with true "
             "primitives of the same scene and category. The matching maximises the sum of IoU3D. Primitives that do "
-            "not overlap are not a pair.",
+            "not overlap are not matched.",
             "Voxels: A primitive fills each voxel whose centre lies inside the primitive. If primitives overlap, the "
             "finer category has priority. Ground fills the voxel that its highest surface crosses. One confusion "
-            "matrix covers all scenes, and a class that occurs on neither side does not count.",
+            "matrix covers all scenes, and classes that do not occur are ignored.",
         ],
     )

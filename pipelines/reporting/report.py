@@ -1,7 +1,7 @@
-"""Render a report as one self-contained HTML page: text, key figures, pictures, charts and tables.
+"""Render a report as one self-contained HTML page with text, key figures, pictures, charts and tables.
 
-The page contains its style, charts and pictures, and it needs no script and no download. The file can be mailed,
-archived and opened offline. All text from outside is escaped.
+The page contains its style, charts and pictures. It uses no scripts and downloads nothing. The file can be mailed,
+archived and opened offline. All inserted text is escaped.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Pictures:
     Attributes:
         title: Heading.
         pictures: Pictures in reading order.
-        columns: Pictures per row, fewer on a narrow screen; None fills the row.
+        columns: Pictures per row; narrow screens show fewer. None: as many as fit.
         note: Text above the pictures.
     """
 
@@ -92,15 +92,15 @@ class Charts:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under column names.
+    """Table with column names.
 
-    Numbers are shortened and right-aligned. Booleans are a tick or a cross, and None is a dash.
+    Numbers are shortened and right-aligned. Booleans are shown as a tick or a cross. None is shown as a dash.
 
     Attributes:
         title: Heading.
         columns: Column names.
         rows: Cells of each row.
-        meanings: Explanation of each row, if any.
+        meanings: Explanation of each row. None: no explanations.
         note: Text above the table.
     """
 
@@ -115,7 +115,7 @@ Section = Text | KeyFigures | Pictures | Charts | Table
 
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
-    """Write `render_report_html` to a temporary file next to `path` and move it into place."""
+    """Write the result of `render_report_html` to a temporary file and move it to `path`."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid4().hex}.tmp")
     temporary.write_text(render_report_html(title, sections, subtitle), encoding="utf-8")
@@ -123,7 +123,7 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section], subt
 
 
 def render_report_html(title: str, sections: Sequence[Section], subtitle: str = "") -> str:
-    """Render the whole page. Raises ValueError if the rows or meanings of a table do not fit its columns."""
+    """Render the whole page; raise ValueError if the rows or meanings of a table do not match its columns."""
     anchors = [f"{index}-{re.sub('[^a-z0-9]+', '-', s.title.lower())}" for index, s in enumerate(sections, 1)]
     links = [f'<a href="#{a}">{escape(s.title)}</a>' for a, s in zip(anchors, sections, strict=True)]
     bodies = [
@@ -185,7 +185,7 @@ def _render_picture(picture: Picture) -> str:
 
 
 def encode_data_uri(image: np.ndarray) -> str:
-    """Encode an image (H, W, 3) uint8 as a data URI: exact PNG for up to 256 colours, otherwise lossy WebP."""
+    """Encode an image (H, W, 3) uint8 as a data URI: lossless PNG for at most 256 colours, otherwise lossy WebP."""
     picture, file = Image.fromarray(image), io.BytesIO()
     flat = picture.getcolors(256) is not None
     if flat:

@@ -1,4 +1,4 @@
-"""The style of a report: one column of sections, light and dark, from phone to wide screen."""
+"""CSS style of reports, for light and dark mode and for narrow and wide screens."""
 
 STYLE = """
 :root {

@@ -1,4 +1,4 @@
-"""Index the scenes of a dataset directory by their place in the tables; select and sort them."""
+"""Index the scenes of a dataset directory; select and sort scenes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SORTS = {
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """Scenes of a dataset directory, or of one source or split.
+    """Scenes of a dataset directory, or only of one source or split.
 
     Attributes:
         root: Dataset directory.
-        scenes: Rows of the scenes table without world_from_imu, with source and split.
+        scenes: Rows of the scenes table with the additional columns source and split, without world_from_imu.
         shards: Shards of the scenes.
-        shard: (n,) index of each scene's shard.
-        row: (n,) row of each scene in its shard.
+        shard: (n,) index of the shard of each scene.
+        row: (n,) row of each scene within the shard.
     """
 
     root: str
@@ -42,14 +42,14 @@ class Catalogue:
 
         Args:
             root: Dataset directory.
-            source: Source to read; None reads all.
-            split: Split to read; None reads all.
+            source: Source to read. None: all sources are read.
+            split: Split to read. None: all splits are read.
 
         Returns:
             Catalogue of all scenes.
 
         Raises:
-            ValueError: There is no such scene.
+            ValueError: The directory has no scene of this source and split.
         """
         shards = find_shards(root, "scenes", source, split)
         columns = [name for name in SCENES.names if name != "world_from_imu"]
@@ -74,7 +74,7 @@ class Catalogue:
         return len(self.scenes)
 
     def column(self, name: str) -> np.ndarray:
-        """Return a column (n,): numbers with NaN for null, or strings as objects."""
+        """Return a column (n,) as numbers, with NaN for null, or as an object array of strings."""
         return self.scenes[name].to_numpy()
 
     def find(self, scene_ids: Sequence[str]) -> np.ndarray:
@@ -112,7 +112,7 @@ class Catalogue:
         return np.random.default_rng(seed).permutation(len(self))[:count]
 
     def sort_column(self, sort: str) -> str:
-        """Return the column for an order. Raises ValueError if there is no such column."""
+        """Return the column by which an order sorts. Raises ValueError if there is no such column."""
         column = SORTS.get(sort, sort)
         if column not in SCENES.names or not pa.types.is_primitive(SCENES.field(column).type):
             raise ValueError(
@@ -122,20 +122,20 @@ class Catalogue:
         return column
 
     def choose(self, count: int, sort: str, pick: str = "uniform", seed: int = 0) -> np.ndarray:
-        """Choose scenes in an order.
+        """Choose scenes and return them in an order.
 
         Args:
             count: Maximum number of scenes.
-            sort: random, drive (by sequence and frame) or an order that `sort_column` accepts. Scenes without a value
-                in the column are skipped.
-            pick: uniform (evenly from lowest to highest), lowest or highest.
+            sort: random, drive (by sequence and frame) or an order that `sort_column` accepts. Scenes that have no
+                value in the column are skipped.
+            pick: uniform (evenly spaced from lowest to highest), lowest or highest.
             seed: Seed of the random order.
 
         Returns:
             Indices of the scenes.
 
         Raises:
-            ValueError: There is no such column, or no scene has a value in it.
+            ValueError: The column does not exist, or it has no value for any scene.
         """
         if sort == "random":
             return self.draw(count, seed)
@@ -146,13 +146,13 @@ class Catalogue:
             values = self.column(self.sort_column(sort)).astype(float)
             order = np.argsort(values, kind="stable")[: np.isfinite(values).sum()]
             if len(order) == 0:
-                raise ValueError(f"--sort {sort}: no scene of {self.root} has a value in this column")
+                raise ValueError(f"--sort {sort}: in {self.root}, no scene has a value in this column")
         if pick == "uniform":
             return self.spread(order, count)
         return order[:count] if pick == "lowest" else order[::-1][:count]
 
     def chunks(self, indices: np.ndarray, size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
-        """Yield chunks of at most `size` scenes from one shard: shard, rows in the shard, and places in `indices`."""
+        """Yield chunks of at most `size` scenes of one shard: (shard, rows in the shard, positions in `indices`)."""
         for shard in np.unique(self.shard[indices]):
             places = np.flatnonzero(self.shard[indices] == shard)
             for start in range(0, len(places), size):
