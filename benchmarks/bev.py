@@ -1,11 +1,11 @@
-"""Compare two renderers of pictures from above at 256 x 256: all primitives together, and one primitive at a time.
+"""Compare two renderers of 256 x 256 pictures from above: one draws all primitives together, one draws them in turn.
 
-python benchmarks/bev.py                      dense towns
-python benchmarks/bev.py --dataset DIRECTORY  scenes selected evenly from a dataset
+    python benchmarks/bev.py                      # dense towns
+    python benchmarks/bev.py --dataset DIRECTORY  # scenes selected evenly from a dataset
 
 The plain renderer is vectorised over the pixels inside the bounds of one primitive, without a tolerance at edges. Times
-are CPU seconds of one thread, without the time to read scenes. Workers of the jobs keep freed memory, so set
-MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1, as jobs/support/cli.py does.
+are CPU seconds of one thread, without the time to read scenes. Set MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1 as
+jobs/support/cli.py does, because workers of the jobs keep freed memory.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
     height, class_id = (
         np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id)
     )
-    # Draw boxes before ellipsoids, the last box first, because a later primitive is drawn only where it is higher.
+    # Draw boxes before ellipsoids and start with the last box. A later primitive is drawn only where it is higher.
     for i in sorted(range(len(scene)), key=lambda i: (scene.category[i] == ELLIPSOID, -i)):
         center, rotation, half = (part[i].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m / 2))
         reach = np.abs(rotation) @ half
@@ -55,7 +55,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
             continue
         part = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
         dx, dy = (x[part[0]] - center[0])[:, None, None], (y[part[1]] - center[1])[:, None]
-        # Vertical line through the pixel in units of the primitive's half axes: foot + z along.
+        # The vertical line through a pixel is foot + z along, in units of the half axes of the primitive.
         foot, along = (dx * rotation[0] + dy * rotation[1]) / half, rotation[2] / half
         with np.errstate(divide="ignore", invalid="ignore"):
             if scene.category[i] == ELLIPSOID:

@@ -27,10 +27,10 @@ def describe_machine() -> str:
 def time_interleaved(
     ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, list[float]]:
-    """Time each function once per round, in turn, so that a busy machine slows all of them.
+    """Time each function once per round. The functions run in turn, so a busy machine slows all functions equally.
 
-    Each function is called with the number of the round. The result is a list of seconds per function: CPU time, or the
-    time of `clock`.
+    Each function is called with the number of the round. The result contains a list of times in seconds for each
+    function: CPU time, or time measured by `clock`.
     """
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for k in range(rounds):
@@ -42,7 +42,7 @@ def time_interleaved(
 
 
 def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
-    """Format values as median (lowest to highest)."""
+    """Format values as the median, followed by the lowest and the highest value in brackets."""
     low, middle, high = (scale * f(values) for f in (min, statistics.median, max))
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
@@ -53,7 +53,7 @@ def format_ratios(slow: list[float], fast: list[float], digits: int = 1) -> str:
 
 
 def with_dense_poses(drive: Drive, spacing_m: float) -> Drive:
-    """Return the drive with a pose every `spacing_m` along its path; KITTI-360 has a pose every 0.3 to 1.1 m."""
+    """Return the drive with a pose every `spacing_m` metres along the path; KITTI-360 has a pose every 0.3 to 1.1 m."""
     xyz = drive.world_from_imu[:, :, 3]
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(xyz, axis=0), axis=1).cumsum()])
     at = np.arange(0, along[-1], spacing_m)

@@ -2,11 +2,12 @@
 
 The benchmark compares this project's DiT, the original code with the same weights, and the class of diffusers.
 
-python benchmarks/dit_step.py                      DiT-B, batch 1 and 8; some minutes python benchmarks/dit_step.py
---preset kitti360-l --batches 1
+    python benchmarks/dit_step.py                      # DiT-B, batch sizes 1 and 8; some minutes
+    python benchmarks/dit_step.py --preset kitti360-l --batches 1
 
 Times are wall-clock seconds; the implementations are measured in turn. The benchmark also times the matrix products
-alone, which are a lower bound. The benchmark also compares guidance at scale 1 with a batch that is always doubled.
+alone, which are a lower bound. The benchmark also compares guidance at scale 1 with an implementation that always
+doubles the batch.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Config:
 
 
 def make_matrix_products(dit: DiT, batch: int) -> Callable[[], None]:
-    """Return a function that runs only the matrix products of a step, which give a lower bound of its time."""
+    """Return a function that runs only the matrix products of a step; their time is a lower bound for the step."""
     c, tokens = dit.config, (dit.config.size // dit.config.patch) ** 2
     wide, deep = torch.randn(batch * tokens, c.width), torch.randn(batch * tokens, 4 * c.width)
     q = torch.randn(batch, c.heads, tokens, c.width // c.heads)
@@ -80,7 +81,7 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
     for way, found in seconds.items():
         print(f"{name}, batch {batch}, {way}: {spread(found, 1e3, 0)} ms")
     for way in list(ways)[1:]:
-        print(f"{name}, batch {batch}: ours takes {format_ratios(seconds['ours'], seconds[way], 2)} {way}")
+        print(f"{name}, batch {batch}: ours takes {format_ratios(seconds['ours'], seconds[way], 2)} the time of {way}")
 
 
 def main(config: Config) -> None:

@@ -1,11 +1,11 @@
-"""Time precision, recall and FID of 2048-d features, and compare them with a direct implementation of ADM's formulas.
+"""Time precision, recall and FID of 2048-d features, and compare with a direct implementation of ADM's formulas.
 
-python benchmarks/generation.py                      1,000 samples per side with both, 10,000 with ours
-python benchmarks/generation.py --samples 61913      ours only, on Ray: memory and time
+    python benchmarks/generation.py                      # 1,000 samples per side with both, 10,000 with ours
+    python benchmarks/generation.py --samples 61913      # ours only, on Ray: memory and time
 
-There are two kinds of features. The first has a falling spectrum like Inception's: most of the variance of 2,048
-dimensions lies in a few dozen. The second is isotropic noise, the worst case, in which all distances are similar. Times
-are wall-clock seconds on all cores.
+There are two kinds of features. The first kind has a falling spectrum like Inception features: a few dozen of 2,048
+dimensions have most of the variance. The second kind is isotropic noise. It is the worst case, because all distances
+are similar. Times are wall-clock seconds on all cores.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ROUNDS = 3
 def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
     """Return features (count, 2048) in float32.
 
-    With `falling`, features are not negative, and mean squares along a random basis fall as 1 / rank^2.
+    With `falling`, no feature is negative, and mean squares along a random basis are proportional to 1 / rank^2.
     """
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((count, DIMENSIONS), dtype=np.float32)
@@ -43,7 +43,7 @@ def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
 def compute_adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
     """Compute precision and recall as ADM's evaluator does.
 
-    Distances are |x|^2 - 2 x.y + |y|^2 in float16. Whole rows are sorted to find the radius.
+    Distances are |x|^2 - 2 x.y + |y|^2 in float16. The function sorts whole rows to find the radius.
     """
     sides = [torch.from_numpy(side).half() for side in (real, generated)]
 
@@ -83,7 +83,7 @@ def compare_with_adm() -> None:
         f"{format_ratios(*found.values())}"
     )
     theirs, ours = compute_adm_precision_recall(real, generated), compute_neighbourhoods(real, generated)[0]
-    print(f"  ADM {theirs[0]:.4f} {theirs[1]:.4f}, ours, exact, {ours.precision:.4f} {ours.recall:.4f}")
+    print(f"  ADM {theirs[0]:.4f} {theirs[1]:.4f}, ours (exact) {ours.precision:.4f} {ours.recall:.4f}")
     a, b = compute_moments(make_features(5000, 0, True)), compute_moments(make_features(5000, 1, True))
     found = time_interleaved(
         {"sqrtm": lambda _: compute_adm_frechet(a, b), "eigenvalues": lambda _: compute_frechet_distance(a, b)},

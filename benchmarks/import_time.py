@@ -1,6 +1,6 @@
-"""Measure the CPU time that a process needs to start: the interpreter alone, a loaded pipeline, Ray workers.
+"""Measure the CPU time to start the interpreter alone, a process with a loaded pipeline, and Ray workers.
 
-    python benchmarks/import_time.py                    a minute
+    python benchmarks/import_time.py                    # a minute
 
 The time of a Ray worker includes the start of Ray. The import of torch is listed as a reference, because its time also
 differs between machines.
@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     print(describe_machine())
     seconds: dict[str, list[float]] = {}
     ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False)
-    for _ in range(config.rounds):  # in turn, so that a busy machine slows all equally
+    for _ in range(config.rounds):  # measure in turn, so a busy machine slows all measurements equally
         for name, code in PROCESSES.items():
             seconds.setdefault(name, []).append(measure_process(code))
         for name, modules in WORKERS.items():

@@ -1,9 +1,9 @@
 """Measure speed and errors of exact IoU3D of rotated boxes and of sampled IoU3D of ellipsoids.
 
-python benchmarks/iou3d.py
+    python benchmarks/iou3d.py
 
-Cases and reference values are those of tests/unit/test_iou3d.py. The reference is manifold3d, or a half-space
-intersection in float64 if manifold3d disagrees. Times are CPU seconds of one thread.
+Cases and reference values come from tests/unit/test_iou3d.py. The reference is manifold3d. If manifold3d disagrees, the
+reference is an intersection of half-spaces in float64. Times are CPU seconds of one thread.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def time_overlapping_pairs() -> None:
-    """Time overlapping boxes of any rotation per pair, for this project's code and for manifold3d."""
+    """Measure the time per pair of overlapping rotated boxes, for this project's code and for manifold3d."""
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4), random_boxes(rng, 3 * NUM_PAIRS, 0.5, 0.5, 4)
     kept = np.flatnonzero(compute_iou3d_pairs(a, b) > 0)[:NUM_PAIRS]
@@ -68,7 +68,7 @@ def time_overlapping_pairs() -> None:
 def time_whole_scenes() -> None:
     """Time all pairs of predicted and true boxes of a scene.
 
-    Bounds exclude most pairs; in AP3D, categories exclude further pairs.
+    Bounds exclude most pairs. In AP3D, different categories exclude more pairs.
     """
     rng = np.random.default_rng(1)
     scenes = [drive.scene(len(drive) // 2) for drive in map(generate_town, DENSE_SEEDS)]
@@ -78,7 +78,7 @@ def time_whole_scenes() -> None:
     crowded = (joined.take(crowd), np.concatenate([category for _, category in truths])[crowd])
     for name, chosen in (
         ("dense towns", truths),
-        (f"{PAPER_OBJECTS} boxes, from several towns at the same position", [crowded]),
+        (f"{PAPER_OBJECTS} boxes from several towns, moved to the same position", [crowded]),
     ):
         sides = [(disturbed(rng, box, 0.1), box, category[:, None] == category) for box, category in chosen]
         count = sum(len(a.size_m) * len(b.size_m) for a, b, _ in sides)
@@ -99,7 +99,7 @@ def time_whole_scenes() -> None:
             print(
                 f"{name}, {kind}: "
                 f"{spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, "
-                f"{100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms a scene"
+                f"{100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms per scene"
             )
 
 
@@ -117,13 +117,13 @@ def print_errors() -> None:
         off = int((~(error <= TOLERANCE)).sum())
         total, wrong = total + len(ours), wrong + off
         print(f"{name:36s} {len(ours):5d}   {np.median(error):15.1e} {error.max():11.1e} {off:12d} {theirs:18d}")
-    print(f"{wrong} of {total} pairs off by more than {TOLERANCE:g}")
+    print(f"{wrong} of {total} pairs have an error of more than {TOLERANCE:g}")
 
 
 def print_ellipsoid_errors() -> None:
     """Print errors against the closed form of spheres.
 
-    Stretching both spheres gives ellipsoids with the same IoU.
+    If both spheres are stretched, the resulting ellipsoids have the same IoU.
     """
     rng, n = np.random.default_rng(2), 2_000
     radius, distance = rng.uniform(0.5, 2, (2, n)), rng.uniform(0, 3, n)
@@ -145,7 +145,7 @@ def print_ellipsoid_errors() -> None:
     real = [s.select(s.category == ELLIPSOID) for s in (generate_town(seed).scene(100) for seed in DENSE_SEEDS)]
     pair = [(extract_boxes(s), disturbed(rng, extract_boxes(s), 0.1)) for s in real if len(s)]
     survive = [len(find_overlapping_bounds(a, b)[0]) for a, b in pair]
-    print(f"ellipsoids of dense towns: {', '.join(map(str, survive))} pairs a scene survive their bounds")
+    print(f"ellipsoids of dense towns: {', '.join(map(str, survive))} pairs per scene with overlapping bounds")
 
 
 def draw_directions(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Evaluate how well a layout VAE decodes latents with small errors, which sampled latents have.
+"""Evaluate how well a layout VAE decodes latents with small errors, because sampled latents have such errors.
 
-python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
+    python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
 
-Held-out scenes are encoded, and noise is added in units of each channel's standard deviation over the scene. The noisy
-latents are decoded and scored.
+The benchmark encodes held-out scenes and adds noise, in units of the standard deviation of each channel in a scene. The
+noisy latents are decoded and scored.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Config:
 
 
 def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
-    """Decode posterior means with noise of the given number of standard deviations; keep ids and labels."""
+    """Decode posterior means after adding noise of the given number of standard deviations; keep ids and labels."""
     generator = torch.Generator().manual_seed(seed)
     made = []
     for scene in scenes:
@@ -56,7 +56,7 @@ def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: 
 
 
 def format_counts(scenes: list[Scene], dataset: Dataset) -> str:
-    """Format mean counts of the categories and the validity of scenes."""
+    """Format the mean count per category and the validity of the scenes."""
     offset_m = find_slab_offset_m(dataset.spec.surface)
     counts = np.mean([scene.counts() for scene in scenes], axis=0)
     found = compute_validity_rates(np.array([compute_scene_validity(scene, offset_m) for scene in scenes]))

@@ -1,10 +1,10 @@
-"""Time the parts of a training step of the layout VAE, and compare it with a plain version of its objective.
+"""Time the parts of a training step of the layout VAE, and compare the step with a plain version.
 
-The comparison uses the paper's DETR decoder, because the plain version would pad to the thousands of proposals of a
-cell decoder.
+The comparison uses the paper's DETR decoder. With a cell decoder, the plain version would pad to thousands of
+proposals.
 
-python benchmarks/lvae_step.py                   town, batch 8, and kitti360, batch 2; several minutes
-python benchmarks/lvae_step.py --presets town
+    python benchmarks/lvae_step.py                   # town, batch 8, and kitti360, batch 2; several minutes
+    python benchmarks/lvae_step.py --presets town
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Config:
 
 
 def time_step(model: LayoutVAE, optimiser: torch.optim.Optimizer, batch, noise: torch.Tensor) -> dict[str, float]:
-    """Run one step and return the seconds of its parts, and its loss."""
+    """Run one step, and return the time of each part in seconds and the loss."""
     clock = time.perf_counter()
     seconds = {}
 

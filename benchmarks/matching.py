@@ -1,6 +1,8 @@
-"""Compare two versions of matching on the same inputs: real primitives only, and padded square cost tensors.
+"""Compare two versions of matching on the same inputs: costs of real primitives only, and padded square costs.
 
-python benchmarks/matching.py
+    python benchmarks/matching.py
+
+The times are CPU seconds of one thread, and wall-clock seconds on all cores.
 """
 
 from __future__ import annotations
@@ -67,7 +69,7 @@ def main() -> None:
         torch.set_num_threads(os.cpu_count())
         seconds = time_interleaved(ways, 7, time.perf_counter)
         print(
-            f"  on all cores, by the clock: padded {spread(seconds['padded'], 1e3, 0)} ms, "
+            f"  wall-clock time on all cores: padded {spread(seconds['padded'], 1e3, 0)} ms, "
             f"ours {spread(seconds['ours'], 1e3, 1)} ms: {format_ratios(seconds['padded'], seconds['ours'])}"
         )
 

@@ -1,10 +1,10 @@
-"""Compare two kinds of known latents of a block: copied and shifted (`copy`, the paper), or re-encoded (`reencode`).
+"""Compare two sources of the known latents of a block: copies (`copy`, the paper) and re-encoded scenes (`reencode`).
 
-python benchmarks/overlap.py --lvae DIRECTORY
+    python benchmarks/overlap.py --lvae DIRECTORY
 
 The two blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent
-comes from the first block, the new half from the true scene. The second latent is decoded, and its known half is
-compared with the true scene. The upper bound is "own latent", for which the second block is encoded as a whole.
+comes from the first block. The other half comes from the true scene. The second latent is decoded, and its known half
+is compared with the true scene. The upper bound is "own latent": the latent of the whole second block.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class Config:
 
 
 def make_pairs(seed: int, count: int, spec: LayoutSpec) -> list[tuple[Scene, Scene]]:
-    """Return scenes of a town and the scenes 32 m ahead, each in its own frame with the same heading and height."""
+    """Return pairs of scenes in a town, 32 m apart; each scene has a separate frame with the same heading and
+    height."""
     drive, grid = generate_town(seed), Grid()
     large = replace(grid, front_m=grid.front_m + STEP_M, rows=grid.rows + round(STEP_M / grid.resolution_m))
     found = []

@@ -1,7 +1,8 @@
-"""A direct implementation of the layout VAE's objective from the paper, as the baseline of other benchmarks.
+"""A direct implementation of the paper's training objective of the layout VAE, used as a baseline by benchmarks.
 
 Matching pads the true primitives to the number of proposals and fills whole cost tensors. Losses loop over samples and
-categories. The object encoder also computes padded slots. The values equal those of this project, at a higher cost.
+categories. The object encoder also computes padded slots. The results equal the results of this project, but the
+computation takes more time.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def compute_square_cost(features, logit, truth, real, weights) -> torch.Tensor:
 
 @torch.no_grad()
 def match_primitives(features, logit, truth, real, slots, proposals, weights) -> torch.Tensor:
-    """Match as models.vae.matching.match_primitives does."""
+    """Match primitives like models.vae.matching.match_primitives."""
     assignment = torch.full(logit.shape, -1, dtype=torch.long)
     for sample in range(len(features)):
         slot = proposal = 0
@@ -58,7 +59,7 @@ def match_primitives(features, logit, truth, real, slots, proposals, weights) ->
 
 
 def compute_object_losses(features, logit, truth, real, assignment, spec: LayoutSpec, proposals):
-    """Compute the losses as models.vae.losses.compute_object_losses does."""
+    """Compute the same losses as models.vae.losses.compute_object_losses."""
     totals = [features.new_zeros(()) for _ in range(3)]
     batch = len(features)
     for sample in range(batch):
@@ -83,7 +84,7 @@ def compute_object_losses(features, logit, truth, real, assignment, spec: Layout
 
 @contextlib.contextmanager
 def replace_ours():
-    """Replace the objective and the object encoder by the plain versions within a context."""
+    """Replace the objective and the object encoder with the plain versions inside a context."""
     kept = losses.match_primitives, losses.compute_object_losses, ObjectEncoder.without_padding
     losses.match_primitives, losses.compute_object_losses = match_primitives, compute_object_losses
     ObjectEncoder.without_padding = lambda self, features, real: (
@@ -98,7 +99,7 @@ def replace_ours():
 
 
 def sum_cost(features, logit, truth, real, assignment, slots, proposals, weights) -> float:
-    """Sum the cost of an assignment over all samples and categories, padding included, in float64."""
+    """Sum the cost of an assignment in float64 over all samples and categories, including padding."""
     total = 0.0
     for sample in range(len(features)):
         slot = proposal = 0

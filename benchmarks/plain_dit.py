@@ -1,4 +1,4 @@
-"""The original Diffusion Transformer as in the code of its paper, with separate modules for each operation.
+"""The original Diffusion Transformer, with one module per operation as in the code of the DiT paper.
 
 The network loads the weights of `models.dit.DiT` by name. For comparison only.
 """

@@ -1,8 +1,9 @@
-"""Measure preprocessing on one core: speed per stage, comparison with ray casting, size, memory and reading.
+"""Measure preprocessing on one core: speed per stage, agreement with ray casting, file size, memory, reading speed.
 
-python benchmarks/preprocess.py                    about four minutes; raw data are written once
-python benchmarks/preprocess.py --raw KITTI-360    any directory in KITTI-360's layout
+    python benchmarks/preprocess.py                    # about four minutes; raw data are written once
+    python benchmarks/preprocess.py --raw KITTI-360    # any directory in KITTI-360's layout
 
+The default data are dense towns in KITTI-360's file format.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
 pa.set_io_thread_count(1)
-BATCH = 32  # consecutive scenes that the job cuts, per scene that ray casting renders
+BATCH = 32  # scenes per timing of the rasteriser; ray casting renders one scene per timing
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Config:
 
 
 def measure_density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float, float]:
-    """Return the mean numbers of primitives and of slabs in a crop."""
+    """Return the mean number of primitives and the mean number of slabs in a crop."""
     primitives, slabs = [], []
     for k in poses:
         local = drive.pose(int(k)).to_ego(drive.ground.vertices_m)
@@ -60,7 +61,7 @@ def measure_density(drive: Drive, poses: np.ndarray, grid: Grid) -> tuple[float,
 
 
 def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
-    """Return heights (G, H, W), -inf without ground, from one vertical ray per pixel centre (trimesh with embree)."""
+    """Return heights (G, H, W) from one vertical ray per pixel centre (trimesh with embree); -inf means no ground."""
     pose, ground = drive.pose(index), drive.ground
     local = pose.to_ego(ground.vertices_m)
     inside = np.zeros(len(ground.slab_class), bool)
@@ -104,9 +105,9 @@ def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict
 
 
 def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
-    """Return the share of pixel and class decisions that agree with rays, and height errors of common pixels.
+    """Return the share of decisions per pixel and class that agree with rays, and the height errors of common pixels.
 
-    The height errors are the share within 1 cm and the largest error in metres.
+    The height errors are the share of pixels with an error of at most 1 cm, and the largest error in metres.
     """
     same, within, worst = [], [], 0.0
     for index in indices:
@@ -122,7 +123,7 @@ def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[fl
 
 
 def measure_storage_error(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> tuple[bool, float]:
-    """Return whether the tables contain all masks exactly, and the largest height error in metres."""
+    """Return True if the tables contain all masks exactly, and return the largest height error in metres."""
     stored = Shard(out, "kitti360", "train", 0).scenes()[: len(poses)]
     masks, worst = True, 0.0
     for scene, index in zip(stored, poses, strict=False):

@@ -1,10 +1,10 @@
 """Measure preprocessing on Ray with one and two workers, and on a simulated cluster of many nodes.
 
-    python benchmarks/preprocess_scaling.py                 about six minutes
-    python benchmarks/preprocess_scaling.py --nodes 16      many-node part with 16 simulated nodes of one CPU
+    python benchmarks/preprocess_scaling.py                 # about six minutes
+    python benchmarks/preprocess_scaling.py --nodes 16      # many-node part with 16 simulated nodes of one CPU
 
 The simulated cluster runs on one machine. The results are the CPU time and the network traffic of the driver per scene.
-These two numbers must be small and must not grow with the number of nodes, because there is only one driver.
+There is only one driver, so both numbers must be small and independent of the number of nodes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pipelines.preprocess.sharding import ShardTask, plan_kitti360
 from pipelines.preprocess.sources import kitti360
 from pipelines.schema.tables import find_shards
 
-FULL_POSES, FULL_LOGS = 80_000, 1_000  # KITTI-360; Argoverse 2, two logs a shard
+FULL_POSES, FULL_LOGS = 80_000, 1_000  # KITTI-360, and Argoverse 2 with two logs per shard
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Config:
     spacing_m: float = 1.5
     """Distance between poses in metres; 1.5 m gives about 1,700 scenes per sequence."""
     rounds: int = 2
-    """Number of comparisons of one and two workers, in turn."""
+    """Number of comparisons between one worker and two workers."""
     nodes: int = 8
     """Number of simulated nodes with one CPU each."""
 
@@ -50,7 +50,7 @@ class Run:
     scenes: int
     shards: int
     seconds: float
-    driver_seconds: float  # CPU of the driver process.
+    driver_seconds: float  # CPU time of the driver process.
     manifest_bytes: int  # Size of the manifests that the workers return to the driver.
 
 
@@ -68,7 +68,7 @@ def time_ingest(tasks: list[ShardTask]) -> Run:
 
 
 def warm_up_workers(tasks: list[ShardTask]) -> None:
-    """Let the workers import their modules before the time measurement starts."""
+    """Let the workers import all modules before the measurement starts."""
     time_ingest(tasks[:2])
 
 

@@ -1,9 +1,9 @@
-"""Measure errors of samplers with few steps on Gaussian data, for which the optimal noise prediction is known.
+"""Measure the errors of samplers with few steps on Gaussian data, where the optimal noise prediction is known.
 
-python benchmarks/samplers.py
+    python benchmarks/samplers.py
 
-A sampler that adds no noise is linear on such data. The ratio of the samples' standard deviation to that of the data is
-1 for an exact sampler. Computations use float64, so the results are the same on every machine.
+A sampler that adds no noise is linear on such data. For an exact sampler, the standard deviation of the samples divided
+by that of the data is 1. Computations use float64, so the results are the same on every machine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEPS = (10, 20, 25, 50)
 
 
 def measure_kept_deviation(solver: SchedulerMixin, steps: int, deviation: float) -> float:
-    """Return the ratio of the samples' standard deviation to that of the data."""
+    """Return the standard deviation of the samples divided by the standard deviation of the data."""
     alpha_bar = Diffusion().alpha_bar
 
     def model(latent: torch.Tensor, timestep: torch.Tensor, label: torch.Tensor) -> torch.Tensor:

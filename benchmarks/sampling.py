@@ -1,10 +1,10 @@
 """Measure the time of sampling, decoding and writing scenes, and the peak memory.
 
-python benchmarks/sampling.py                       the untrained town presets, which need the same time
-python benchmarks/sampling.py --model DIRECTORY     a trained pipeline
+    python benchmarks/sampling.py                       # the untrained town presets, which need the same time
+    python benchmarks/sampling.py --model DIRECTORY     # a trained pipeline
 
-Times are CPU seconds of one thread. The target: all work after sampling takes at most a tenth of the time of sampling
-with 50 steps. The memory figures are the peak of the process, and the part for Python, torch and the weights.
+Times are CPU seconds of one thread. Target: all work after sampling takes at most a tenth of the time for sampling with
+50 steps. There are two memory figures: the peak of the process, and the memory of Python, torch and the weights.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def main(config: Config) -> None:
             for name, start, end in zip(seconds, marks, marks[1:], strict=False):
                 seconds[name].append((end - start) / config.batch)
     for name, found in seconds.items():
-        print(f"{name}: {spread(found, 1e3, 1)} ms a scene")
+        print(f"{name}: {spread(found, 1e3, 1)} ms per scene")
     after = [(d + w) / s for s, d, w in zip(*seconds.values(), strict=True)]
     print(f"after sampling / sampling, {config.steps} steps: {spread(after, 100, 1)} %; {len(scenes[0])} primitives")
     print(f"memory: {read_peak_mib():.0f} MiB at most, {loaded_mib:.0f} of it before the first scene")

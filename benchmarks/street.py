@@ -1,11 +1,11 @@
-"""Compare the time of street views of 704 x 188 pixels between this project's renderer and embree.
+"""Compare the times of this project's renderer and of embree for street views of 704 x 188 pixels.
 
-python benchmarks/street.py
+    python benchmarks/street.py
 
-The scenes are dense towns of about 250 primitives, with cameras along their roads. Embree casts one ray per pixel at
-the whole mesh, in which ellipsoids consist of facets. The search tree of embree is built once per scene, like the
-triangles of this project's renderer. This project's renderer also returns normals and intersects ellipsoids exactly.
-Times are CPU seconds of one thread; the target is 250 ms per frame.
+The scenes are dense towns of about 250 primitives, with cameras along their roads. Embree casts one ray per pixel at a
+mesh of the whole scene. In this mesh, ellipsoids consist of facets. The search tree of embree is built once per scene,
+like the triangles of this project's renderer. This project's renderer also returns normals and intersects ellipsoids
+exactly. Times are CPU seconds of one thread; the target is 250 ms per frame.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main() -> None:
         {name: lambda _, way=way: [way(*one) for one in chosen] for name, way in ways.items()}, ROUNDS
     )
     for name, values in seconds.items():
-        print(f"{name}: {spread([1e3 * value / frames for value in values], 1, 0)} ms a frame")
+        print(f"{name}: {spread([1e3 * value / frames for value in values], 1, 0)} ms per frame")
     print(
         f"embree / ours: {format_ratios(seconds['embree'], seconds['ours'])}; "
         f"{100 * np.mean(same):.2f} % of pixels of one class (facets differ from ellipsoids at their rims)"

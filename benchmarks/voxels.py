@@ -1,6 +1,6 @@
-"""Compare two voxelisations at 256 x 256 x 32: vertical runs per column, and tests of voxel centres per primitive.
+"""Compare two ways to compute 256 x 256 x 32 voxels: vertical runs per column, and tests of the voxel centres.
 
-python benchmarks/voxels.py
+    python benchmarks/voxels.py
 
 The plain voxelisation is vectorised over the voxels inside the bounds of one primitive. Times are CPU seconds of one
 thread.
@@ -29,7 +29,7 @@ PAPER_OBJECTS = 514
 
 
 def voxelize_plainly(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
-    """Voxelise a scene like `voxelize`, by tests of voxel centres per primitive."""
+    """Compute the same voxels as `voxelize`, but test the voxel centres for each primitive."""
     out = np.zeros(voxels.shape, np.uint8)
     grid = voxels.columns
     surface, winner = scene.surface()
@@ -55,13 +55,13 @@ def voxelize_plainly(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 
 def tilt_primitives(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with every primitive tilted by a few degrees, like decoded primitives."""
+    """Return the scene after tilting every primitive by a few degrees; decoded primitives are also tilted."""
     axis = rng.normal(size=(len(scene), 3))
     return replace(scene, rotation=(Rotation.from_rotvec(0.05 * axis).as_matrix() @ scene.rotation).astype(np.float32))
 
 
 def merge_scenes(scenes: list[Scene]) -> Scene:
-    """Return one scene with the primitives of several scenes, as many as the paper has slots."""
+    """Return one scene with primitives of several scenes; their number is the paper's number of slots."""
     joined = {
         name: np.concatenate([getattr(s, name) for s in scenes])
         for name in ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")
@@ -77,7 +77,7 @@ def main() -> None:
     for name, scenes in (
         ("dense towns", dense),
         ("the same, leaning", leaning),
-        (f"{PAPER_OBJECTS} primitives, from several towns at the same position", [merge_scenes(leaning)]),
+        (f"{PAPER_OBJECTS} primitives from several towns, moved to the same position", [merge_scenes(leaning)]),
     ):
         differ = sum(int((voxelize(s, voxels) != voxelize_plainly(s, voxels)).sum()) for s in scenes)
         seconds = time_interleaved(
