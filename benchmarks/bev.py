@@ -3,7 +3,7 @@
     python benchmarks/bev.py                      # dense towns
     python benchmarks/bev.py --dataset DIRECTORY  # scenes selected evenly from a dataset
 
-The plain renderer is vectorised over the pixels inside the bounds of one primitive, without a tolerance at edges. Times
+The plain renderer is vectorised over the pixels inside the bounds of one primitive. It has no tolerance at edges. Times
 are CPU seconds of one thread, without the time to read scenes. Set MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1 as
 jobs/support/cli.py does, because workers of the jobs keep freed memory.
 """

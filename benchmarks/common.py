@@ -14,7 +14,7 @@ from pipelines.preprocess.sources.drive import Drive
 from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
 from pipelines.runtime import provenance
 
-# Seeds of towns as dense as KITTI-360, with 240 to 280 primitives and 57 to 69 slabs in a crop.
+# Seeds of towns with the density of KITTI-360: 240 to 280 primitives and 57 to 69 slabs in a crop.
 DENSE_SEEDS = (0, 2, 4, 6)
 
 

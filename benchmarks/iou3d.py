@@ -98,7 +98,7 @@ def time_whole_scenes() -> None:
             per_scene = [1e3 * s / len(sides) for s in seconds]
             print(
                 f"{name}, {kind}: "
-                f"{spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core including culled ones, "
+                f"{spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core (including excluded pairs), "
                 f"{100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms per scene"
             )
 

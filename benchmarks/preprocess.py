@@ -81,7 +81,7 @@ def cast_rays(drive: Drive, index: int, grid: Grid) -> np.ndarray:
 
 
 def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict[str, float]:
-    """Measure the CPU time per scene in milliseconds for each stage, on shards of 256 scenes as in pass 1."""
+    """Measure the CPU time per scene in milliseconds for each stage, for shards of 256 scenes (as in pass 1)."""
     spent = dict.fromkeys(("cut and rasterise", "to tables", "write Parquet"), 0.0)
     for number, start in enumerate(range(0, len(poses), 256)):
         clock = time.process_time()

@@ -8,8 +8,8 @@
     jobs/ablate_lvae.py augmentation        mirrored scenes and moved vehicles
     jobs/ablate_lvae.py branches --dataset DIR --minutes 60 --num-seeds 5
 
-Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML), and logs its scores to MLflow. Run the
-same command again to resume; finished trials are kept.
+Each study writes a table (text, JSON, Parquet), figures (SVG) and a page (HTML). Each study also logs its scores to
+MLflow. Run the same command again to resume; finished trials are kept.
 """
 
 from __future__ import annotations

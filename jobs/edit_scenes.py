@@ -10,9 +10,9 @@
     jobs/edit_scenes.py repair                                         overlapping, floating and sunken objects
     jobs/edit_scenes.py replay edits.json --input DIR                  a list of edits, one after another
 
-An edit applies to the primitives that match all selection options; --where "true" selects every primitive. The job
-writes scene tables with source=edited-<run>, and lists the changes of each step in edits/. The job also writes the list
-of edits for `replay` to edited-<run>.json, and pictures to <run>.html.
+An edit changes the primitives that match all selection options. With --where "true", an edit changes every primitive.
+The job writes scene tables with source=edited-<run>, and lists the changes of each step in edits/. The job also writes
+the list of edits for `replay` to edited-<run>.json, and pictures to <run>.html.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ compares N real scenes with N generated scenes. Each label has the same share of
 95 % confidence interval over scenes.
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
-also writes reconstruction.html with the best and worst scenes, and reconstruction.parquet with one row per scene. FID,
+also writes reconstruction.html (the best and the worst scenes) and reconstruction.parquet (one row per scene). FID,
 sFID, KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
 distances of layout statistics and of features of a fixed random network, under separate names. Run the same command
 again to resume after an interruption.

@@ -4,11 +4,11 @@
     jobs/export_scenes.py --input DIR --formats glb xodr
     jobs/export_scenes.py --max-scenes 10 --formats ply npz --output DIR
 
-A GLB file (glTF 2.0) has one named node per primitive; class, instance and exact parameters are in the extras of the
-node. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x 32
-voxels with class ids. The jobs import_scenes and evaluate_voxels read such files. An XODR file describes the roads for
-simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. The job writes OUTPUT/<format>/<scene_id>.<format> and
-keeps existing files.
+A GLB file (glTF 2.0) has one named node per primitive. The extras of the node contain class, instance and exact
+parameters. A PLY file has one mesh with a colour, class id and primitive number per vertex. An NPZ file has 256 x 256 x
+32 voxels with class ids. The jobs import_scenes and evaluate_voxels read such files. An XODR file describes the roads
+for simulators, as OpenDRIVE 1.7 with lanes, elevation and junctions. The job writes OUTPUT/<format>/<scene_id>.<format>
+and keeps existing files.
 """
 
 from __future__ import annotations

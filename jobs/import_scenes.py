@@ -5,12 +5,12 @@
     jobs/import_scenes.py 'DIR/night-*.glb' --name night --axes y+ z+ x+
     jobs/import_scenes.py DIR --format npz --name semcity       voxel grids, of 256 x 256 x 32 or coarser
 
-The job converts GLB meshes to scene tables with source=imported-<name>; evaluate_scenes --generated OUTPUT scores them.
-The job converts voxel grids to pictures from above in OUTPUT/<name>.npz (array arr_0, uint8); evaluate_scenes
---generated OUTPUT/<name>.npz scores them. The table OUTPUT/rejects lists unreadable files with the reason. The file
-formats are specified in docs/how_to/import_scenes.md. An axis is x (forward), y (left) or z (up), with + or -. GLB
-files that this package exported contain their axes. Run the same command again to resume after an interruption or to
-read repaired files.
+The job converts GLB meshes to scene tables with source=imported-<name>. The command evaluate_scenes --generated OUTPUT
+scores the scenes. The job converts voxel grids to pictures from above in OUTPUT/<name>.npz (array arr_0, uint8). The
+command evaluate_scenes --generated OUTPUT/<name>.npz scores the pictures. The table OUTPUT/rejects lists unreadable
+files with the reason. The file formats are specified in docs/how_to/import_scenes.md. An axis is x (forward), y (left)
+or z (up), with + or -. GLB files that this package exported contain their axes. Run the same command again to resume
+after an interruption or to read repaired files.
 """
 
 from __future__ import annotations

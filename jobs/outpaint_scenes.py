@@ -8,9 +8,9 @@
     jobs/outpaint_scenes.py --guided                                     fast, with smoother seams
 
 By default, the job adds eight blocks around a scene, as in the paper: four sides in one batch, then four corners. The
-job writes scene tables with source=generated-<run>, one GLB file per scene, and block_tables/ with the share of known
-ground in each block. A block is generated as soon as the blocks that it depends on are complete. The result does not
-depend on the number of actors.
+job writes scene tables with source=generated-<run> and one GLB file per scene. The tables in block_tables/ contain the
+share of known ground in each block. The job generates a block as soon as all neighbours that the block depends on are
+complete. The result does not depend on the number of actors.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ The job writes weights, configuration and a model card, and registers a version 
 runs that trained these weights, and an evaluation of scenes generated with these weights. If the training started from
 published weights, the card quotes the entry of those weights. If a run or the evaluation is missing or belongs to other
 weights, the job publishes nothing. Other jobs accept a published pipeline as --model NAME, as its directory, as
-models:/NAME/VERSION, or as the id of its MLflow run.
+models:/NAME/VERSION, or as the id of the MLflow run.
 """
 
 from __future__ import annotations

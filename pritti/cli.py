@@ -49,7 +49,7 @@ def describe_usage() -> str:
 
 
 def main() -> None:
-    """Run the job that the first argument names, with the other arguments as its command line."""
+    """Run the job named by the first argument, and pass the other arguments to the job."""
     name, *args = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print(describe_usage())

@@ -40,8 +40,8 @@ def publish(config: Config) -> list[str]:
     """Write the entry of the model zoo and register it in MLflow.
 
     Returns:
-        Values of --model that select the entry: its directory and, if it is registered, models:/NAME/VERSION and the
-        run's id.
+        Values of --model that select the entry: the directory and, for a registered entry, models:/NAME/VERSION and run
+        id.
     """
     pipeline = load_pipeline(find_pipeline_directory(config.model))
     weights = [digest_weights(pipeline.lvae), digest_weights(pipeline.dit)]

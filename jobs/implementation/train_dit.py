@@ -43,7 +43,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     """Prepare training; generate the inputs of the smoke preset if they are missing.
 
     Returns:
-        The training run, and a function that adds the other components of a pipeline to its output directory.
+        The training run, and a function that adds the other components of a pipeline to the output directory.
     """
     row = resolve_preset(config)
     root = find_training_dataset(config, LVAE_PRESETS[row.lvae].source)
@@ -158,7 +158,7 @@ def make_dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: L
 def make_run_identity(
     config: Config, row: DiTPreset, settings: OptimizerConfig, latents: dict, root: str, start: Start | None
 ) -> dict:
-    """Return the options that a resumed run must share with the run that it continues."""
+    """Return the options that must not change when a run is resumed."""
     identity = trainer.make_run_identity(
         settings,
         stage="dit",
@@ -239,7 +239,7 @@ def build(
 
 
 def complete_pipeline(lvae: str, sampling: dict, output: str) -> str:
-    """Write the layout VAE and the scheduler next to a trained DiT, so that `output` is a PrITTIPipeline directory.
+    """Write the layout VAE and the scheduler next to a trained DiT. Then `output` is a directory for PrITTIPipeline.
 
     Args:
         lvae: Directory of the layout VAE.

@@ -121,7 +121,7 @@ def make_optimizer_config(config: Config, row: LVAEPreset) -> OptimizerConfig:
 def make_run_identity(
     config: Config, row: LVAEPreset, settings: OptimizerConfig, spec: LayoutSpec, root: str, augment: Augmentation
 ) -> dict:
-    """Return the options that a resumed run must share with the run that it continues."""
+    """Return the options that must not change when a run is resumed."""
     identity = trainer.make_run_identity(
         settings,
         stage="lvae",

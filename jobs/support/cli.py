@@ -15,7 +15,7 @@ import tyro
 
 from jobs.support.renames import find_renamed
 
-# Environment variables that Ray reads when it is imported and when it starts. Values of the user are kept.
+# Environment variables that Ray reads at import and at start. Values of the user are kept.
 RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -51,7 +51,7 @@ def home_path(*parts: str) -> str:
 
 
 def make_absolute(path: str) -> str:
-    """Return an absolute path or URI, so that workers in other working directories find it."""
+    """Return an absolute path or URI, which is valid for workers in other working directories."""
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
@@ -76,7 +76,7 @@ def require_positive(config: object, *names: str) -> None:
 
 
 def find_root_cause(error: BaseException) -> BaseException:
-    """Return the exception that the user should read from the chain of exceptions in which Ray wraps an error.
+    """Return the exception that the user should read. Ray wraps this exception in other exceptions.
 
     The outermost ValueError or OSError that is not a wrapper comes from this package. The message of this exception
     names the file and the remedy; the messages of deeper causes do not.
@@ -111,7 +111,7 @@ def hide_empty_defaults(options: ModuleType) -> None:
 def run(job: str, args: Sequence[str] | None = None, prog: str | None = None) -> None:
     """Parse the command line of a job, check its options, then import and run its implementation.
 
-    The option classes come from the module jobs.<job>, even if that file runs as __main__, so each class exists only
+    The option classes come from the module jobs.<job> even if the file runs as __main__. Thus each class exists only
     once. A ValueError or OSError is reported as one line on stderr with exit code 2.
 
     Args:

@@ -17,7 +17,7 @@ def select_scenes(options: SceneOptions) -> SceneSubset:
 
 
 def make_repaint_config(options: RePaintOptions) -> RePaintConfig:
-    """Return the settings of the paper or of --guided; other options that are given override single values."""
+    """Return the RePaint settings of the paper or of --guided, after changing the values that other options set."""
     given = {
         "num_inference_steps": options.num_inference_steps,
         "jump_length": options.jump_length,

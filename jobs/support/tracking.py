@@ -55,7 +55,8 @@ class Tracker:
     def start(cls, experiment: str, name: str, parameters: dict, record: str | None = None) -> Tracker:
         """Return a tracker of the MLflow run that the file `record` names, or of a new MLflow run.
 
-        Call this method only in the driver, because two processes that create the database concurrently damage it.
+        Call this method only in the driver. Two processes that create the database concurrently would damage the
+        database.
 
         Args:
             experiment: Name of the MLflow experiment.

@@ -40,8 +40,8 @@ class TrainingRun:
     """Description of a training run for its workers. All fields can be pickled.
 
     The function `build(device, wrap)` returns the Trainer. The function `validate(trainer)` returns metrics and
-    pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that a
-    resumed run must share.
+    pictures (arrays by name); it runs on rank 0 at every checkpoint. The field `identity` holds the options that must
+    not change when a run is resumed.
     """
 
     name: str
@@ -173,12 +173,12 @@ def tag_weights(tracker: Tracker, model: torch.nn.Module, steps: int) -> None:
 
 
 def fit(run: TrainingRun, num_workers: int, output: str) -> str:
-    """Train to the end and write the model to a directory.
+    """Train until the last step, and write the model to a directory.
 
     Args:
         run: Training run.
         num_workers: Number of Ray Train workers.
-        output: Directory or URI to write the model to; its weights are the EMA weights if EMA is enabled.
+        output: Directory or URI for the model. The model has the EMA weights if EMA is enabled.
 
     Returns:
         `output`.
@@ -251,7 +251,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
     Args:
         name: Name of the run.
         storage_path: Directory of all runs.
-        identity: Options that a resumed run must share with the run that it continues.
+        identity: Options that must not change when the run is resumed.
 
     Returns:
         Path of the file with the id of the MLflow run.
@@ -274,7 +274,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
 
 
 def publish_directory(directory: str, output: str) -> None:
-    """Copy a saved model or pipeline file by file; the files that mark it as complete are copied last.
+    """Copy a saved model or pipeline file by file. The last files are those that mark a copy as complete.
 
     Args:
         directory: Local directory.
@@ -295,7 +295,7 @@ def override_settings(settings: OptimizerConfig, **changes: Any) -> OptimizerCon
 
     Args:
         settings: Settings of the preset.
-        **changes: Values of options by name of the setting; None keeps the value of the preset.
+        **changes: New value for each setting; None keeps the value of the preset.
 
     Returns:
         The changed settings.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from pipelines.schema.scene_subset import Pick
 
-# Records of training runs use the names of version 0.1, so that runs of that version can be resumed.
+# Records of training runs use the names of version 0.1, so runs of version 0.1 can be resumed.
 RECORDED_PREDICTIONS = {"epsilon": "noise", "v_prediction": "velocity"}
 RECORDED_TIMESTEPS = {"uniform": "even", "logit_normal": "middle"}
 REFERENCES: dict[str, Pick] = {"farthest-point": "farthest", "min-distance": "apart", "uniform": "spread"}

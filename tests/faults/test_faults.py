@@ -674,7 +674,7 @@ SWEEPS = 315969904359876000 + 100_000_000 * np.arange(3)
 
 
 def write_av2(root: Path) -> None:
-    """Write two logs of three sweeps with six boxes per sweep, on a square of road with a crossing."""
+    """Write two logs, each with three sweeps and six boxes per sweep. The map is a square of road with a crossing."""
     rng = np.random.default_rng(0)
     for log in AV2_LOGS:
         folder = root / "train" / log

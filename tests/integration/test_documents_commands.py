@@ -1,4 +1,4 @@
-"""Tests that run every command block and Python block of README and docs, except blocks marked with a reason."""
+"""Tests that run all command blocks and Python blocks of README and docs, except blocks with a stated reason."""
 
 import os
 import re

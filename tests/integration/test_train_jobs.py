@@ -1,5 +1,4 @@
-"""Tests of the training jobs on Ray with the smoke presets: order of the jobs, resuming, two workers, and invalid
-input."""
+"""Tests of the training jobs on Ray with the smoke presets: job order, resuming, two workers and invalid input."""
 
 import json
 import os

@@ -73,7 +73,7 @@ def find_cycle(graph: dict[str, dict[str, str]]) -> list[str]:
 
 
 def find_cycles(root: Path) -> list[str]:
-    """Return the import cycles between modules and between the children of a package, one line of imports per cycle."""
+    """Return the import cycles between modules and between the children of a package; each cycle is one line."""
     graph = find_imports(root)
     modules = {name: {target: f"{name} imports {target}" for target in targets} for name, targets in graph.items()}
     found = [find_cycle(modules)]

@@ -58,7 +58,7 @@ def make_points(*xy: tuple[float, float]) -> list[dict]:
 
 
 def make_map_json() -> dict:
-    """Return a map with a road area up to 40 m from the origin and a crossing of 3 x 10 m.
+    """Return a map with a crossing of 3 x 10 m and a road that covers all points within 40 m of the origin.
 
     The two edges of the crossing have opposite directions.
     """

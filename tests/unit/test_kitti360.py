@@ -17,7 +17,7 @@ CUBE = np.array(
     [[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1], [-1, 1, -1], [-1, 1, 1], [-1, -1, -1], [-1, -1, 1]]
 ) / 2  # fmt: skip
 CUBE_FACES = "0 2 1 2 3 1 4 6 5 6 7 5 4 5 1 5 0 1 7 6 2 6 3 2 5 7 0 7 2 0 1 3 4 3 6 4"
-# A prism with an L-shaped outline of 64 m2; the first 6 corners are the top, the last 6 corners the bottom.
+# A prism with an L-shaped outline of 64 m2; the top has the first 6 corners and the bottom has the last 6 corners.
 L_OUTLINE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], float)
 L_SLAB = np.concatenate([np.column_stack([L_OUTLINE, np.full(6, z)]) for z in (0.3, -0.3)])
 L_FACES = "0 1 2 0 2 3 0 3 4 0 4 5 8 7 6 9 8 6 10 9 6 11 10 6 " + " ".join(

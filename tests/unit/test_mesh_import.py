@@ -216,7 +216,8 @@ def export_authors_glb(
 
 
 def assert_same_primitives(got: Scene, want: Scene) -> None:
-    """Assert that the primitives match one to one in any order; compare corners of boxes and shapes of ellipsoids."""
+    """Assert that the primitives match one to one in any order; boxes match by corners and ellipsoids match by
+    shape."""
     assert np.array_equal(got.counts(), want.counts())
     left = list(range(len(got)))
     for k, corners in enumerate(compute_corners_m(want)):

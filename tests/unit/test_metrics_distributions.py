@@ -26,7 +26,7 @@ GRID = Grid(64.0, 32.0, 0.25, 256, 256)
 
 
 def make_street(width_px: int, cars_xy_m=(), tilted: bool = False) -> Scene:
-    """Return a scene with a road ahead, terrain on both sides and cars of 4 x 2 x 1.5 m."""
+    """Return a scene with a straight road, terrain on both sides of the road, and cars of 4 x 2 x 1.5 m."""
     n = len(cars_xy_m)
     occupied = np.zeros((2, 256, 256), bool)
     row, col = np.mgrid[:256, :256]

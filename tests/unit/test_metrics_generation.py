@@ -181,8 +181,8 @@ def test_neighborhood_scores_count_ties_as_within():
 
 
 def test_neighborhood_scores_include_border_of_ball():
-    """generated[0] equals real[1]. Therefore it lies on the border of each ball that has the distance to real[1] as
-    radius."""
+    """generated[0] equals real[1]. Therefore generated[0] lies on the border of each ball whose radius is the distance
+    to real[1]."""
     rng = np.random.default_rng(6)
     base = rng.normal(size=(40, 512))
     generated = rng.normal(50, 1, size=(40, 512))

@@ -421,7 +421,7 @@ def test_dit_is_conditioned_and_starts_at_zero():
 
 
 def test_dit_unpatchify_inverts_patchify():
-    """A network that consists of the patch embedding and its transpose returns its normalised input."""
+    """The patch embedding, followed by its transpose, returns the normalised input."""
     dit = DiT(channels=3, size=8, width=12, depth=1, heads=1)
     with torch.no_grad():
         dit.patch_in.weight.copy_(torch.eye(12).view(12, 3, 2, 2))

@@ -67,7 +67,7 @@ def test_split_of_straight_drive_has_100_test_regions_of_15_m():
     starts = np.flatnonzero((split[1:] == "test") & (split[:-1] != "test"))
     assert len(starts) == 100
     assert abs((split == "test").sum() - 1500) <= 100
-    # Each segment of 200 m has 10 m without a split: 5 m at its end and 5 m before the test region.
+    # Each segment of 200 m has 10 m without a split: the last 5 m, and 5 m before the test region.
     # A few more poses have no split because they are less than 5 m from the other split.
     assert abs((split == "unused").sum() - 1000) <= 200
 

@@ -215,7 +215,7 @@ def schema() -> etree.XMLSchema:
 
 
 def sample_reference_line(road: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (k, 3) and headings (k,) of the reference line of a road, as the standard defines them."""
+    """Return points (k, 3) and headings (k,) of the reference line of a road, as defined by OpenDRIVE."""
     points, headings = [], []
     elevation = [{k: float(v) for k, v in e.attrib.items()} for e in road.iter("elevation")]
     for geometry in road.iter("geometry"):

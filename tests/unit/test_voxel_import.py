@@ -54,8 +54,8 @@ def test_read_voxels_repeats_coarse_voxels(tmp_path, shape):
 
 
 def test_read_voxels_undoes_every_axis_convention(tmp_path):
-    """For each order and direction of the axes in a file, a voxel is read at its correct x (forward), y (left) and z
-    (up)."""
+    """The reader puts a voxel at the correct x (forward), y (left) and z (up) for each order and direction of the
+    axes."""
     ours = random_voxels((64, 64, 8))
     for letters in permutations("xyz"):
         for signs in product("+-", repeat=3):
