@@ -1,4 +1,4 @@
-"""Apply a list of edits to the scenes of a dataset, one Ray task per shard, and render a page before and after."""
+"""Apply a list of edits to the scenes of a dataset, with one Ray task per shard, and render a page of the changes."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import EDITS, TABLES, Shard, make_rejects_table
 
 PICTURE_PX = 512
-OUTLINE_M = 0.4  # Margin of the outline around changed objects.
+OUTLINE_M = 0.4  # Margin between changed objects and their outline (m).
 
 
 @dataclass(frozen=True)
 class EditRequest:
-    """Edits, and the place of the edited scenes: source edited-<run>, in the split of each given scene.
+    """Edits and the location of the edited scenes: source edited-<run>, in the same split as the input scene.
 
     Attributes:
-        edits: Edits in the order of application.
+        edits: Edits, in the order in which they are applied.
         output: Dataset directory of the edited scenes.
         run: Run name.
     """
@@ -46,25 +46,25 @@ class EditRequest:
         return f"edited-{self.run}"
 
     def shard(self, number: int, given: Shard) -> Shard:
-        """Return the shard of the run for the edited scenes of a given shard.
+        """Return the shard for the edited scenes of an input shard.
 
         Args:
             number: Number of the new shard.
-            given: Shard of the given scenes.
+            given: Shard of the input scenes.
 
         Returns:
-            Shard with the split of the given one.
+            New shard of the run, with the split of the input shard.
         """
         return Shard(self.output, self.source, given.split, number)
 
     def guard(self, selection: SceneSubset) -> None:
-        """Bind the source to these edits of these scenes (run_guard.py).
+        """Bind the source to the edits and the selected scenes (run_guard.py).
 
         Args:
             selection: Scenes to edit.
 
         Raises:
-            ValueError: The output holds a run of the same name with other edits or other scenes.
+            ValueError: The output contains a run of the same name with other edits or other scenes.
         """
         chosen = {
             "input": selection.root,
@@ -83,7 +83,7 @@ def edit_shard(scene: Scene, request: EditRequest) -> tuple[Scene, list[pa.Table
         request: Edits and run name.
 
     Returns:
-        Edited scene, and its rows of the edits table.
+        Edited scene, and the rows of the edits table for this scene.
 
     Raises:
         ValueError: An edit fails. The message names the edit.
@@ -102,8 +102,8 @@ def write_edited(row: dict, request: EditRequest, parts: list[tuple[Shard, list[
 
     Args:
         row: Row with the number of a shard.
-        request: Edits, and the place of the edited scenes.
-        parts: Given shards and the selected rows of each.
+        request: Edits and the location of the edited scenes.
+        parts: Input shards, each with its selected rows.
 
     Returns:
         Row with the numbers of scenes and of rejected scenes.
@@ -135,9 +135,9 @@ class EditResult:
     """Result of a run of edits.
 
     Attributes:
-        scenes: Number of scenes written.
+        scenes: Number of edited scenes.
         rejects: Number of rejected scenes.
-        table: Changes of each edit.
+        table: Table of the changes that each edit made.
         page: Path of the HTML page.
     """
 
@@ -150,19 +150,19 @@ class EditResult:
 def edit_scenes(
     request: EditRequest, selection: SceneSubset, pictures: int = 8, on_shard: Callable[[int], None] | None = None
 ) -> EditResult:
-    """Edit scenes; write the edited tables, the edits table and a page. Another call resumes an interrupted run.
+    """Edit scenes; write the edited tables, the edits table and a page; resume an interrupted run.
 
     Args:
-        request: Edits, and the place of the edited scenes.
+        request: Edits and the location of the edited scenes.
         selection: Scenes to edit.
-        pictures: Number of changed scenes on the page.
+        pictures: Maximum number of changed scenes on the page.
         on_shard: Called with the number of scenes of each finished shard.
 
     Returns:
         Numbers of scenes, the table of changes and the path of the page.
 
     Raises:
-        ValueError: The output holds a run of the same name with other edits, all scenes are rejected, or no edit
+        ValueError: The output contains a run of the same name with other edits, all scenes are rejected, or no edit
             changes a scene.
     """
     if not request.edits:
@@ -198,7 +198,7 @@ def edit_scenes(
 
 
 def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
-    """Tabulate scenes, primitives and sizes of the changes, per edit and kind of change."""
+    """Tabulate the numbers of scenes and primitives and the sizes of the changes, per edit and kind of change."""
     rows = []
     for step, edit in enumerate(edits):
         of_step = changes.filter(pa.array(changes["step"].to_numpy() == step))
@@ -223,19 +223,19 @@ def _sum_changes(edits: Sequence[Edit], changes: pa.Table) -> Table:
 
 
 def _find_maximum(column: pa.ChunkedArray) -> float | None:
-    """Return the maximum of the values that are not null, or None."""
+    """Return the maximum of the values that are not null, or None if there are none."""
     return max((value for value in column.to_pylist() if value is not None), default=None)
 
 
 def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[int]]], count: int) -> Pictures:
-    """Show the first changed scenes before and after the edits; the objects of the first edit are outlined."""
+    """Show the first changed scenes before and after the edits; outline the objects that the first edit changes."""
     shown: list[Picture] = []
     for scene, after, changes in islice(_list_changed(request, parts), count):
         region = select_around_objects(scene, changes.primitive, OUTLINE_M)
         shown.append(Picture(scene.scene_id, render_outlined_bev(scene, region, PICTURE_PX), "given"))
         shown.append(Picture(scene.scene_id, render_bev(after, PICTURE_PX, 2), "edited"))
     note = (
-        "The left picture shows the given scene, with the objects that the first edit changes outlined in red. The "
+        "The left picture shows the input scene. Red outlines mark the objects that the first edit changes. The "
         "right picture shows the scene after all edits."
     )
     return Pictures("Before and after", shown, 4, note)
@@ -244,7 +244,7 @@ def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[i
 def _list_changed(
     request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]
 ) -> Iterator[tuple[Scene, Scene, ObjectChange]]:
-    """Yield the scenes that the edits change, before and after, and the changes of the first edit."""
+    """Yield each changed scene before the edits, after the edits, and with the changes that the first edit made."""
     for given, rows in parts:
         for scene in given.scenes(rows):
             with suppress(ValueError):  # Rejected scenes are skipped.

@@ -1,4 +1,4 @@
-"""Regenerate scenes inside a region: one Ray Data graph, one pipeline per actor, all variants of a scene per task."""
+"""Regenerate a region of scenes with a Ray Data graph; each task makes all variants of one scene."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ from pipelines.schema.tables import Shard
 
 @dataclass(frozen=True)
 class RegionConfig:
-    """Region to regenerate: the union of the given parts, or the complement of the union.
+    """Region that is regenerated: the union of the parts below, or its complement.
 
     Attributes:
         polygon_m: Corners of a polygon as x, y, x, y, ... (m, scene frame).
-        half_plane: Direction x, y of a half plane, and the distance along the direction at which it begins (m).
+        half_plane: Direction x, y of a half plane, and the distance (m) along this direction at which the half plane
+            begins.
         objects: Indices of primitives of a scene.
         margin_m: Margin around the objects (m).
-        outside: Whether to regenerate the complement.
+        outside: Whether the complement of the union is regenerated.
     """
 
     polygon_m: tuple[float, ...] = ()
@@ -48,13 +49,13 @@ class RegionConfig:
     outside: bool = False
 
     def region(self, scene: Scene) -> np.ndarray:
-        """Return the pixels of a scene to regenerate.
+        """Return the pixels of a scene that are regenerated.
 
         Args:
             scene: Scene.
 
         Returns:
-            (rows, cols) bool; True means regenerate.
+            (rows, cols) bool; True means that the pixel is regenerated.
 
         Raises:
             ValueError: A part of the region is invalid, or no pixel of the scene lies in the region.
@@ -62,12 +63,12 @@ class RegionConfig:
         found = np.zeros((scene.grid.rows, scene.grid.cols), bool)
         if self.polygon_m:
             if len(self.polygon_m) % 2:
-                raise ValueError(f"a polygon has {len(self.polygon_m)} numbers, expected pairs x y x y ... in metres")
+                raise ValueError(f"a polygon needs pairs x y x y ... in metres, got {len(self.polygon_m)} numbers")
             found |= select_polygon(scene.grid, np.reshape(self.polygon_m, (-1, 2)))
         if self.half_plane:
             if len(self.half_plane) != 3:
                 raise ValueError(
-                    f"a half plane has {len(self.half_plane)} numbers, expected direction x y and distance in metres"
+                    f"a half plane needs direction x y and distance in metres, got {len(self.half_plane)} numbers"
                 )
             found |= select_half_plane(scene.grid, self.half_plane[:2], self.half_plane[2])
         if self.objects:
@@ -86,9 +87,9 @@ class InpaintRequest(Request):
 
     Attributes:
         where: Region to regenerate.
-        contents: Contents to regenerate: ground, objects or both.
-        variants: Variants per scene.
-        label: Label of the generated region; None keeps the label of each scene.
+        contents: Contents that are regenerated: ground, objects or both.
+        variants: Number of variants per scene.
+        label: Label of the generated region. None: the label of each scene.
         seed: Seed of the noise.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
@@ -104,7 +105,7 @@ class InpaintRequest(Request):
 
 
 def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, float]:
-    """Sum the errors of a raw decode in the known region, that is outside the generated region.
+    """Sum the errors of the decoder output in the known region, which is the part outside the generated region.
 
     Args:
         scene: Known scene.
@@ -128,13 +129,14 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
 
 
 def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Compute scores of the known region from the sums of all decodes.
+    """Compute scores of the known region from the sums over all decoder outputs.
 
     Args:
         sums: Results of `compute_drift`.
 
     Returns:
-        Ground IoU, height RMSE (m), share of objects found and their mean IoU3D. A ratio 0 / 0 is None.
+        Ground IoU, height RMSE (m), share of objects that are found, and the mean IoU3D of these objects. A ratio 0 / 0
+        is None.
     """
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 
@@ -162,7 +164,7 @@ def inpaint_one(
         number: Number of the scene in the run.
 
     Returns:
-        Variants, and the drift of each raw decode of a block.
+        Variants, and the drift of the decoder output of each block.
 
     Raises:
         ValueError: The region contains no pixel of the scene, or the scene has no label and the request has none.
@@ -197,10 +199,10 @@ def inpaint_one(
 
 
 def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: RegionConfig) -> np.ndarray:
-    """Return the pixels of a scene's region, extended to whole latent cells.
+    """Return the pixels of the region in a scene, extended to whole latent cells.
 
     Args:
-        pipeline: Pipeline, which defines the latent grid.
+        pipeline: Pipeline that defines the latent grid.
         scene: Scene in the resolution of the model.
         where: Region to regenerate.
 
@@ -216,7 +218,7 @@ def find_regenerated_pixels(pipeline: PrITTIPipeline, scene: Scene, where: Regio
 class Inpainter:
     """Actor that regenerates one scene per row and writes its shard and its GLB files.
 
-    The input row holds the number of a scene. The output row holds the number and the drift of the scene.
+    The input row holds the number of a scene. The output row holds the number of the scene and its drift.
     """
 
     def __init__(self, request: InpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
@@ -244,7 +246,7 @@ def inpaint_scenes(
     pictures: int = 8,
     on_scene: Callable[[], None] | None = None,
 ) -> dict[str, float | None]:
-    """Regenerate a region of the selected scenes; write tables, GLB files and a page. An interrupted run resumes.
+    """Regenerate a region of the selected scenes; write tables, GLB files and a page; resume an interrupted run.
 
     Args:
         request: Region, contents and options of the sampler.
@@ -254,17 +256,18 @@ def inpaint_scenes(
         on_scene: Called after each scene.
 
     Returns:
-        Errors of the decoders in the known region, as `compute_drift_scores` defines them.
+        Errors of the decoders in the known region, as returned by `compute_drift_scores`.
 
     Raises:
-        ValueError: The output holds a run of the same name with other options, or a scene has no pixel in the region.
+        ValueError: The output contains a run of the same name with other options, or the region contains no pixel of a
+            scene.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
     first, row = chosen[0]
     request.where.region(
         resample_to_model_resolution(first.scenes([row])[0], pipeline.spec)
-    )  # Raises errors of the region before actors start.
+    )  # An invalid region raises its error here, before actors start.
     if request.label:
         require_labels(pipeline.dit.config.label, [request.label])
     guard_generation_run(

@@ -1,4 +1,4 @@
-"""Extend scenes by blocks with Ray. An actor generates a block as soon as the blocks that it depends on are done."""
+"""Extend scenes by blocks with Ray. A block is generated as soon as all blocks on which it depends are done."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # Below this fraction of known pixels with ground, the job prints a warning about a block.
-MAX_RETRIES = 3  # Retries of a block whose process died.
+HARDLY_KNOWN = 0.1  # The job prints a warning if a smaller fraction of the known pixels of a block has ground.
+MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class OutpaintRequest(Request):
     """Options of outpainting.
 
     Attributes:
-        label: Label of the generated blocks; None keeps the label of each scene.
+        label: Label of the generated blocks. None: the label of each scene.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
-        num_blocks: Number of blocks ahead, behind, left and right.
-        order: Order of the blocks, a key of RANKS.
-        batch_size: Blocks per batch.
+        num_blocks: Number of blocks to generate ahead, behind, to the left and to the right.
+        order: Order in which blocks are generated (a key of RANKS).
+        batch_size: Maximum number of blocks per batch.
     """
 
     label: str | None
@@ -83,7 +83,7 @@ class OutpaintRequest(Request):
         return f"{self.source}-{self.seed}-{number:07d}"
 
     def blocks_directory(self, number: int) -> str:
-        """Return the directory of a scene's blocks. It is deleted after the blocks are stitched.
+        """Return the directory of the blocks of a scene; it is deleted after stitching.
 
         Args:
             number: Number of the scene in the run.
@@ -97,7 +97,7 @@ class OutpaintRequest(Request):
         """Return the block grid.
 
         Args:
-            size: Side of a block in latent cells.
+            size: Side length of a block (latent cells).
 
         Returns:
             Block grid.
@@ -124,9 +124,9 @@ class BlockBatch:
 
 
 def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[BlockBatch]:
-    """List all blocks of a scene except the given one in batches, in an order that respects dependencies.
+    """List the batches of a scene in an order that respects dependencies; the input block is not included.
 
-    The batches depend on the arguments only, so that a resumed run has the same batches.
+    The batches depend only on the arguments. A resumed run therefore has the same batches.
 
     Args:
         block_grid: Block grid.
@@ -149,10 +149,10 @@ def list_batches(block_grid: BlockGrid, number: int, batch_size: int) -> list[Bl
 
 
 def make_block_path(directory: str, index: BlockIndex) -> str:
-    """Return the path of a block's file.
+    """Return the path of the file of a block.
 
     Args:
-        directory: Directory of the scene's blocks.
+        directory: Directory of the blocks of the scene.
         index: Index of the block.
 
     Returns:
@@ -162,7 +162,7 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
 
 
 def write_block(block: SceneBlock, path: str) -> None:
-    """Write a block without loss, unlike the tables, so that a resumed run yields the same scene.
+    """Write a block without rounding, unlike the tables; a resumed run then gives exactly the same scene.
 
     Args:
         block: Block.
@@ -204,7 +204,7 @@ def read_block(path: str, empty: Scene) -> SceneBlock:
 
 
 class Outpainter:
-    """Actor with a pipeline that generates blocks and stitches the blocks of a scene."""
+    """Actor that holds a pipeline, generates blocks and stitches the blocks of a scene."""
 
     def __init__(self, request: OutpaintRequest, chosen: list[tuple[Shard, int]]) -> None:
         self.request, self.chosen = request, chosen
@@ -212,11 +212,11 @@ class Outpainter:
 
     @cached_property
     def block_grid(self) -> BlockGrid:
-        """Return the block grid of the model's latent size."""
+        """Return the block grid for the latent size of the model."""
         return self.request.make_block_grid(self.pipeline.latent_shape[-1])
 
     def load_scene(self, number: int) -> Scene:
-        """Return a given scene on the model's grid.
+        """Return an input scene, resampled to the grid of the model.
 
         Args:
             number: Number of the scene in the run.
@@ -230,14 +230,14 @@ class Outpainter:
     def load_blocks(
         self, number: int, indices: Sequence[BlockIndex]
     ) -> tuple[BlockComposer, Scene, dict[BlockIndex, SceneBlock]]:
-        """Load the given scene and generated blocks of it.
+        """Load an input scene and some of its generated blocks.
 
         Args:
             number: Number of the scene in the run.
             indices: Indices of generated blocks.
 
         Returns:
-            Composer, given scene, and blocks by index, including the given scene as block (0, 0).
+            Composer, input scene, and blocks by index. Block (0, 0) is the input scene.
         """
         given = self.load_scene(number)
         empty = make_empty_scene(given.scene_id, given.source, given.sequence, given.frame, self.pipeline.spec)
@@ -250,7 +250,7 @@ class Outpainter:
         return composer, given, blocks
 
     def generate(self, batch: BlockBatch) -> None:
-        """Generate the blocks of a batch and write each to a file.
+        """Generate the blocks of a batch and write each block to a file.
 
         Args:
             batch: Blocks to generate.
@@ -274,7 +274,7 @@ class Outpainter:
             write_block(block, make_block_path(request.blocks_directory(batch.number), index))
 
     def finish(self, number: int) -> None:
-        """Write the tables and the GLB of a scene from its blocks, and a table of the blocks. Delete the block files.
+        """Stitch the blocks of a scene; write its tables, its GLB and a table of blocks; delete the block files.
 
         Args:
             number: Number of the scene in the run.
@@ -299,7 +299,7 @@ class Outpainter:
 
 
 def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
-    """Return the path of the table of a scene's blocks.
+    """Return the path of the table of the blocks of a scene.
 
     Args:
         request: Options of outpainting.
@@ -320,19 +320,19 @@ def outpaint_scenes(
     num_actors: int = 1,
     on_blocks: Callable[[int], None] | None = None,
 ) -> pa.Table:
-    """Extend the selected scenes. An interrupted run resumes.
+    """Extend the selected scenes; resume an interrupted run.
 
     Args:
         request: Options of outpainting.
         selection: Scenes to extend.
         num_actors: Number of pipelines that run concurrently.
-        on_blocks: Called with the number of blocks that finished after the last call.
+        on_blocks: Called with the number of blocks that finished since the previous call.
 
     Returns:
-        Table with a row per block.
+        Table with one row per block.
 
     Raises:
-        ValueError: The output holds a run of the same name with other options.
+        ValueError: The output contains a run of the same name with other options.
     """
     chosen = [(shard, row) for shard, rows in selection.shards() for row in rows]
     pipeline = load_pipeline(request.model)
@@ -366,7 +366,7 @@ def run_batches(
     num_actors: int,
     on_blocks: Callable[[int], None] | None,
 ) -> None:
-    """Start actors and assign batches to them as soon as the blocks that a batch depends on are done.
+    """Start actors; assign each batch to an actor as soon as the blocks on which it depends are done.
 
     Args:
         request: Options of outpainting.
@@ -380,12 +380,12 @@ def run_batches(
         num_cpus=1, num_gpus=count_gpus_per_actor(), max_restarts=-1, max_task_retries=MAX_RETRIES
     )
     room = int(ray.cluster_resources().get("GPU" if count_gpus_per_actor() else "CPU", 0))
-    # An actor without a free CPU or GPU would take that of a killed actor, which then could not restart.
+    # A waiting actor would take the CPU or GPU of a killed actor, and the killed actor could not restart.
     count = min(num_actors, max(len(waiting), len(done)), max(1, room))
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
-    finally:  # The traceback of an error holds references to the actors, which would keep their CPUs in use.
+    finally:  # Without kill, the actors would occupy CPUs: the traceback of an error holds references to them.
         for worker in workers:
             ray.kill(worker)
 
@@ -395,12 +395,13 @@ def schedule_batches(
 ) -> None:
     """Give each idle actor a batch, or a scene to stitch, until all work is done.
 
-    An actor takes part as soon as it is ready, because other work may occupy its CPU at first.
+    Actors may become ready at different times, because other work may occupy their CPUs. Each actor gets work as soon
+    as it is ready.
 
     Args:
         workers: Actor handles.
         waiting: Batches to generate; the function empties the list.
-        done: Finished blocks by scene number; the function adds to it.
+        done: Finished blocks by scene number; the function adds the new blocks.
         on_blocks: Called with the number of blocks of each finished batch.
     """
     idle: list = []
@@ -432,11 +433,11 @@ def pop_ready_task(
 
     Args:
         waiting: Batches to generate.
-        whole: Numbers of scenes whose blocks are all done; these are stitched first.
+        whole: Numbers of scenes whose blocks are all done; stitching these scenes has priority.
         done: Finished blocks by scene number.
 
     Returns:
-        A batch, the number of a scene to stitch, or None if no task is ready.
+        A batch, or the number of a scene to stitch. None: no task is ready.
     """
     if whole:
         return whole.pop(0)

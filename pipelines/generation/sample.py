@@ -1,4 +1,4 @@
-"""Generate scenes from labels and seeds: one Ray Data graph, one pipeline per actor, one output shard per task."""
+"""Generate scenes from labels and seeds with a Ray Data graph; each task writes one output shard."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pipelines.training.latents import digest_weights
 
 @dataclass(frozen=True)
 class Request:
-    """Run of a pipeline, whose scenes become source generated-<run> of a dataset directory.
+    """Run of a pipeline; its scenes are written as source generated-<run> of a dataset directory.
 
     Attributes:
         model: Directory of a PrITTIPipeline.
@@ -58,19 +58,20 @@ class Request:
 
 @dataclass(frozen=True)
 class SampleRequest(Request):
-    """Scenes to generate. Scene i depends on the seed, i and the options only.
+    """Scenes to generate. Scene i depends only on the seed, i and the options.
 
     Attributes:
         num_scenes: Number of scenes.
-        labels: Labels; scene i has label labels[i mod len(labels)].
+        labels: Labels; scene i gets label labels[i mod len(labels)].
         seed: Seed of the noise.
         num_inference_steps: Steps of the sampler.
         guidance_scale: Scale of classifier-free guidance.
         sampler: Name of the sampler.
-        noise_scaling: Noise scaling; None uses the value of the model.
-        existence_threshold: Minimum existence probability; None uses the value of the model.
-        repair: Whether to move primitives to the ground and apart, without removing any (pipelines/editing/edit.py).
-        shard_scenes: Scenes per shard.
+        noise_scaling: Noise scaling. None: the value of the model.
+        existence_threshold: Minimum existence probability. None: the value of the model.
+        repair: Whether floating, sunken and overlapping primitives are moved; none are removed
+            (pipelines/editing/edit.py).
+        shard_scenes: Number of scenes per shard.
     """
 
     num_scenes: int
@@ -111,7 +112,7 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
         Pipeline without progress bar.
 
     Raises:
-        ValueError: The directory holds no complete pipeline.
+        ValueError: The directory does not contain a complete pipeline.
     """
     try:
         pipeline = PrITTIPipeline.from_pretrained(directory)
@@ -122,7 +123,7 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
-    """Bind source generated-<run> of a dataset directory to one request and to the weights of its model (run_guard.py).
+    """Bind source generated-<run> of a dataset directory to one request and the weights of the model (run_guard.py).
 
     Args:
         request: Request of the run.
@@ -131,28 +132,27 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
         **also: Further options of the run.
 
     Raises:
-        ValueError: The directory holds a run of the same name with other options or other weights.
+        ValueError: The directory contains a run of the same name with other options or other weights.
     """
     options: dict[str, Any] = asdict(request) | also
     options["weights"] = f"{digest_weights(pipeline.lvae)}-{digest_weights(pipeline.dit)}"
-    del options["model"]  # The digests identify the model, so that its directory may change.
+    del options["model"]  # The model is identified by digests, because its directory may change.
     options.setdefault("existence_threshold", pipeline.config.existence_threshold)
-    if not options.get("repair"):  # Records of earlier versions lack this option.
+    if not options.get("repair"):  # Records written by earlier versions lack this option.
         options.pop("repair", None)
-    if (
-        "repaint" in options and options["repaint"]["eta"] != 1
-    ):  # With eta other than 1, the sampler uses the noise scaling.
+    # The sampler uses the noise scaling only if eta is not 1.
+    if "repaint" in options and options["repaint"]["eta"] != 1:
         options["noise_scaling"] = pipeline.config.noise_scaling
     guard_run(options.pop("output"), request.source, request.run, options, parts)
 
 
 def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
-    """Resample a scene to the model's ground classes and grid.
+    """Resample a scene to the ground classes and the grid of the model.
 
     Args:
         scene: Scene.
         spec: Layout of the model.
-        grid: Other grid of the same area; None uses the grid of the model.
+        grid: Another grid with the same area. None: the grid of the model.
 
     Returns:
         Scene with resampled rasters; primitives are unchanged.
@@ -163,7 +163,7 @@ def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = N
 
 
 def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
-    """Resample a scene to the model's ground classes and resolution, over the whole area of the scene.
+    """Resample a scene to the ground classes and the resolution of the model; the area of the scene is kept.
 
     Args:
         scene: Scene.
@@ -173,7 +173,7 @@ def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
         Scene with resampled rasters; primitives are unchanged.
 
     Raises:
-        ValueError: Neither of the two resolutions is a multiple of the other.
+        ValueError: The resolution of the scene is not a multiple or a divisor of the resolution of the model.
     """
     own, wanted_m = scene.grid, spec.grid.resolution_m
     sides = {name: round(getattr(own, name) * own.resolution_m / wanted_m) for name in ("rows", "cols")}
@@ -202,10 +202,10 @@ def find_scene_label(scene: Scene, kind: str) -> str:
 
 
 class Sampler:
-    """Actor that generates and writes the scenes of one shard per row.
+    """Actor that generates and writes scenes, one shard per row.
 
-    The input row holds the number of a shard. The output row holds the number, the number of scenes and the time in
-    seconds.
+    The input row holds the number of a shard. The output row holds the number of the shard, the number of scenes and
+    the time (s).
     """
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:
@@ -240,19 +240,19 @@ class Sampler:
 def sample_scenes(
     request: SampleRequest, num_actors: int = 1, batch_size: int = 8, on_shard: Callable[[dict], None] | None = None
 ) -> int:
-    """Generate the requested scenes and write them as tables. Another call resumes an interrupted run.
+    """Generate the requested scenes and write them as tables. To resume an interrupted run, call this function again.
 
     Args:
-        request: Scenes to generate, and the dataset directory.
-        num_actors: Maximum number of actors, each with a pipeline.
-        batch_size: Scenes per batch.
+        request: Options of the scenes, and the dataset directory.
+        num_actors: Maximum number of actors; each actor holds a pipeline.
+        batch_size: Number of scenes per batch.
         on_shard: Called with the row of each finished shard.
 
     Returns:
         Number of scenes.
 
     Raises:
-        ValueError: The model does not know a label, or the output holds a run of the same name with other options.
+        ValueError: A label is unknown to the model, or the output contains a run of the same name with other options.
     """
     pipeline = load_pipeline(request.model)
     require_labels(pipeline.dit.config.label, request.labels)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def describe_machine() -> str:
-    """Return processor, cores, memory and GPUs, as in "AMD EPYC, 2 cores, 24 GiB"."""
+    """Return the processor, cores, memory and GPUs, such as "AMD EPYC, 2 cores, 24 GiB"."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     processor = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.machine())
@@ -25,7 +25,7 @@ def describe_machine() -> str:
 
 
 def find_commit() -> str:
-    """Return the commit of this code, with a + if files differ from it; "unknown" outside a git checkout."""
+    """Return the commit of this code, with "+" if files have changed, or "unknown" outside a git checkout."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(
@@ -41,7 +41,8 @@ def find_commit() -> str:
 def format_command() -> str:
     """Return the command line with shortened paths.
 
-    Paths under $PRITTI_HOME and under this checkout become relative. Other absolute paths keep their last part only.
+    Paths under $PRITTI_HOME and under this checkout become relative. All other absolute paths are reduced to their last
+    part.
     """
     roots = [(Path(os.environ.get("PRITTI_HOME") or Path.home() / "pritti"), "$PRITTI_HOME"), (ROOT, ".")]
 

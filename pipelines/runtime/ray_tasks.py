@@ -1,4 +1,4 @@
-"""Run numbered units of work as Ray Data graphs: one task per unit, or a pool of actors that keep a model loaded."""
+"""Run numbered units of work as Ray Data graphs, with one task per unit or with actors that keep a model loaded."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ import ray
 import ray.data
 from ray.util.annotations import RayDeprecationWarning
 
-# Retries of a task whose worker died. Ray replaces a killed worker. A shard that kills every worker stops the run.
+# Number of retries for a task whose worker died. Ray replaces a killed worker. If a shard kills each worker that reads
+# it, the run stops.
 MAX_RETRIES = 20
 
 
 def count_gpus_per_actor() -> int:
-    """Return 1 if the cluster has GPUs, even if the machine of the driver has none, and 0 otherwise."""
+    """Return 1 if the cluster has GPUs, otherwise 0; the machine of the driver itself needs no GPU."""
     return int(ray.cluster_resources().get("GPU", 0) > 0)
 
 
 def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:
-    """Make rows {"id": number} with one row per block, so that each row becomes a task."""
+    """Make rows {"id": number}; each row is a block of its own and becomes one task."""
     return ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
 
 
 def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **options: Any) -> ray.data.Dataset:
-    """Call `Dataset.map` with a function or an actor class that has more parameters than the row.
+    """Call `Dataset.map` with a function or an actor class that takes more arguments than the row.
 
     Args:
         dataset: Input rows.
-        function: Function of a row and of `fn_args` or `fn_kwargs`, or an actor class whose instances are such
-            functions.
-        options: Options of `Dataset.map`. The type annotations of Ray allow functions of the row only.
+        function: Function of a row and further arguments (`fn_args`, `fn_kwargs`), or an actor class whose instances
+            are such functions.
+        options: Options of `Dataset.map`. The type annotations of Ray allow only functions of the row.
 
     Returns:
         Output rows.
@@ -42,7 +43,7 @@ def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **optio
 def flat_map_dataset(
     dataset: ray.data.Dataset, function: Callable[..., list[dict]], **options: Any
 ) -> ray.data.Dataset:
-    """Call `Dataset.flat_map` with a function that has more parameters than the row; see `map_dataset`."""
+    """Call `Dataset.flat_map` with a function that takes more arguments than the row; see `map_dataset`."""
     return dataset.flat_map(cast(Any, function), **options)
 
 
@@ -53,8 +54,8 @@ def map_rows(
 
     Args:
         dataset: Input rows.
-        function: Returns the row that replaces a row.
-        num_cpus: CPUs per task.
+        function: Function that returns a new row for each row.
+        num_cpus: Number of CPUs per task.
         at_once: Maximum number of concurrent tasks (default: no limit). Tasks reuse worker processes.
 
     Returns:
@@ -69,14 +70,16 @@ def map_rows(
 def map_actors(
     numbers: Sequence[int], actor: type, arguments: tuple, num_actors: int, **resources: float
 ) -> Iterator[dict]:
-    """Yield the rows that actors return for {"id": number}, in order of completion. Without numbers, no actor starts.
+    """Yield the rows that actors return for {"id": number}, in order of completion.
+
+    If there are no numbers, no actor starts.
 
     Args:
         numbers: Numbers of the units of work.
         actor: Actor class. Its instances take a row and return a row.
         arguments: Arguments of the constructor.
         num_actors: Maximum number of actors.
-        resources: num_cpus or num_gpus of one actor (default: one GPU if the cluster has GPUs).
+        resources: num_cpus or num_gpus per actor (default: one GPU if the cluster has GPUs).
 
     Yields:
         Output rows.

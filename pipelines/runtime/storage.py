@@ -16,7 +16,7 @@ TEMPORARY = ".tmp-"
 
 
 def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
-    """Return the file system and the path of a URI or of a local path, which becomes absolute."""
+    """Return the file system and the path of a URI or of a local path; local paths are made absolute."""
     uri = os.fspath(uri)
     if "://" in uri:
         return pafs.FileSystem.from_uri(uri)
@@ -24,7 +24,7 @@ def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
 
 
 def join_uri(uri: str | os.PathLike, *parts: str) -> str:
-    """Join a URI or path and further parts with slashes."""
+    """Join a URI or path with further parts, using slashes."""
     return "/".join([os.fspath(uri).rstrip("/"), *parts])
 
 
@@ -35,14 +35,14 @@ def exists(uri: str) -> bool:
 
 
 def fingerprint_file(uri: str) -> list[str | int]:
-    """Return path, size in bytes and modification time of a file. A rewritten file has another fingerprint."""
+    """Return the path, size (bytes) and modification time of a file; they change if the file is rewritten."""
     fs, path = resolve_uri(uri)
     info = fs.get_file_info(path)
     return [path, info.size, str(info.mtime)]
 
 
 def list_files(uri: str, suffix: str) -> list[str]:
-    """Return the sorted URIs of the files under a directory, without hidden files; [] if the directory is missing."""
+    """Return the sorted URIs of all visible files under a directory, or [] if the directory does not exist."""
     fs, path = resolve_uri(uri)
     found = fs.get_file_info(pafs.FileSelector(path, recursive=True, allow_not_found=True))
     inside = [(info.path[len(path) :].lstrip("/"), info) for info in found if info.is_file]
@@ -53,16 +53,17 @@ def list_files(uri: str, suffix: str) -> list[str]:
 
 
 def write_whole(uri: str, write: Callable[[Any], None]) -> None:
-    """Create or replace a file by `write(stream)`. Readers see the old file or the new file, never an incomplete one.
+    """Create or replace a file; `write(stream)` writes its content.
 
-    Temporary files of killed writers of the same file are deleted.
+    Readers see either the old or the new file, never an incomplete file. If earlier writers of the same file were
+    killed, their temporary files are deleted.
 
     Raises:
         OSError: The file cannot be written. The message names the file and the remedy.
     """
     fs, path = resolve_uri(uri)
     parent, name = path.rsplit("/", 1)
-    # The temporary name has another suffix, because DuckDB's *.parquet patterns match hidden files too.
+    # The temporary file has another suffix, because *.parquet patterns of DuckDB also match hidden files.
     temporary = f"{parent}/{TEMPORARY}{name}-{os.getpid()}"
     try:
         fs.create_dir(parent, recursive=True)
@@ -83,8 +84,8 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
-    """Write a table as a Parquet file with zstd compression and dictionaries for string columns."""
-    # The type annotation of pyarrow allows a bool only, but its documentation allows names.
+    """Write a table as a Parquet file, with zstd compression and dictionary-encoded string columns."""
+    # The type annotation of pyarrow allows only a bool, but the documentation allows names.
     dictionaries = cast(Any, _list_dictionary_columns(table))
     write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=dictionaries))
 
@@ -98,17 +99,17 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
 
     Args:
         uri: File.
-        columns: Names of the columns to read (default: all).
-        schema: Types that the columns must have (default: any).
+        columns: Names of the columns to read (default: all columns).
+        schema: Types that the columns must have (default: no check).
 
     Returns:
         Table.
 
     Raises:
-        ValueError: The file is missing, truncated or has another schema. The message names the file.
+        ValueError: The file is missing, is truncated or has another schema. The message names the file.
     """
     fs, path = resolve_uri(uri)
-    # The type annotation of pyarrow allows a string only, but its documentation allows None.
+    # The type annotation of pyarrow allows only a string, but the documentation allows None.
     no_partitioning = cast(Any, None)
     try:
         table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=no_partitioning)
@@ -173,7 +174,7 @@ def _delete_files(fs: pafs.FileSystem, where: pafs.FileSelector, prefix: str) ->
     """Delete the files whose names begin with `prefix` and return their number."""
     stale = [info.path for info in fs.get_file_info(where) if info.is_file and info.base_name.startswith(prefix)]
     for name in stale:
-        with suppress(FileNotFoundError):  # The writer is alive and has renamed the file.
+        with suppress(FileNotFoundError):  # The writer was not killed and has renamed the file.
             fs.delete_file(name)
     return len(stale)
 

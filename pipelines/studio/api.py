@@ -1,4 +1,4 @@
-"""HTTP interface of the studio: its page, the operations of a session, downloads and access control."""
+"""HTTP interface of the studio: the page, the operations of a session, downloads and access control."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipelines.io.opendrive import export_opendrive
 from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRegionRequest, OpenRequest
 from pipelines.studio.session import Session, Studio, StudioBusyError
 
-MAX_BODY_BYTES = 256 * 1024  # Maximum size of a request.
+MAX_BODY_BYTES = 256 * 1024  # Maximum size of a request (bytes).
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PAGE_FILES = {
     "/": ("studio.html", "text/html"),
@@ -31,10 +31,10 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
     """Build the HTTP interface.
 
     Args:
-        studio: Returns the studio, which all requests share.
-        token: Token that each request must send, the first request as ?token=; "" for none.
-        hosts: Host names that requests may use. Requests with other host names are refused, because a foreign page
-            could otherwise reach the studio through its own host name.
+        studio: Function that returns the studio; all requests share it.
+        token: Token that each request must contain; the first request sends it as ?token=. "" means no token.
+        hosts: Host names that requests may use. Requests with other host names are refused. Otherwise, a page of
+            another origin could reach the studio through its own host name.
 
     Returns:
         FastAPI application.
@@ -47,7 +47,7 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
 
 
 def refuse(request: Request, token: str, hosts: tuple[str, ...]) -> Response | None:
-    """Return an error response if the request is not allowed, else None."""
+    """Return an error response if the request is not allowed, otherwise None."""
     host = urlsplit(f"//{request.headers.get('host', '')}").hostname
     if hosts and host not in hosts:
         return Response("unknown host", 421)
@@ -65,7 +65,7 @@ def refuse(request: Request, token: str, hosts: tuple[str, ...]) -> Response | N
 
 
 def add_access_control(app: FastAPI, token: str, hosts: tuple[str, ...]) -> None:
-    """Refuse requests from other origins, and give each visitor a cookie."""
+    """Refuse requests from other origins, and set a cookie for each visitor."""
 
     @app.middleware("http")
     async def guard(request: Request, call_next):
@@ -95,7 +95,7 @@ def serve_file(name: str, media_type: str) -> Callable[[], Response]:
 
 
 def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
-    """Return the routes of the page, its scripts, the labels and the list of scenes."""
+    """Return the routes for the page, its scripts, the labels and the list of scenes."""
     router = APIRouter()
     for path, (name, media_type) in PAGE_FILES.items():
         router.get(path)(serve_file(name, media_type))
@@ -112,7 +112,7 @@ def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
 
 
 def make_session_router(studio: Callable[[], Studio]) -> APIRouter:
-    """Return the routes of a visitor's session. Each operation returns the new state of the session."""
+    """Return the routes for the session of a visitor; each operation returns the new state of the session."""
     router = APIRouter()
 
     def open_session(request: Request) -> Session:

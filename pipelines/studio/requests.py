@@ -1,4 +1,4 @@
-"""Types of the requests to the studio, with the limits of all values."""
+"""Types of the requests to the studio, including the allowed range of each value."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from models.sampling.repaint import RePaintConfig
 
 
 class StudioRequest(BaseModel):
-    """Base of all requests; unknown fields are errors."""
+    """Base class of all requests; unknown fields raise an error."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -22,7 +22,7 @@ class OpenRequest(StudioRequest):
 
 
 class SamplingRequest(StudioRequest):
-    label: str = Field("", max_length=40)  # "" means the label of the scene, or else the first label of the model.
+    label: str = Field("", max_length=40)  # "": label of the scene, or first label of the model if it has none.
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
 

@@ -9,13 +9,13 @@ from ray.serve import Application
 from pipelines.studio.api import build_studio_app
 from pipelines.studio.session import Studio
 
-REQUESTS = 32  # Maximum number of concurrent requests, and of waiting requests; others are refused.
+REQUESTS = 32  # Maximum numbers of concurrent and of waiting requests; further requests are refused.
 
 
 def make_deployment(
     model: str, datasets: list[str], token: str, hosts: tuple[str, ...], threads: int | None
 ) -> Application:
-    """Return the application for ray.serve.run. The replica loads the model when it starts."""
+    """Return the application for ray.serve.run; the replica loads the model at its start."""
 
     def app() -> FastAPI:
         import torch

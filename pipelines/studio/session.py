@@ -1,7 +1,8 @@
 """Sessions of the studio, without HTTP.
 
-A visitor generates, edits, inpaints and extends one scene, and can undo each step.
-Long operations run in a thread, one at a time over all visitors. They report their progress and can be cancelled.
+A visitor generates, edits, inpaints and extends one scene, and can undo each step. Long operations run in threads. Only
+one of them runs at a time, regardless of the number of visitors. Long operations report their progress and can be
+cancelled.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from pipelines.studio.requests import (
 )
 
 MAX_SESSIONS, MAX_HISTORY, MAX_WAITING = 16, 50, 4
-MAX_SIDE_M = 512.0  # Maximum side length of an extended scene.
+MAX_SIDE_M = 512.0  # Maximum side length of an extended scene (m).
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
 
 
@@ -41,18 +42,18 @@ class Cancelled(Exception):
 
 
 class StudioBusyError(RuntimeError):
-    """Raised if the visitor already has a running task, or if too many tasks are waiting."""
+    """Raised if a task of the visitor is already running, or if too many tasks are waiting."""
 
 
 @dataclass
 class BackgroundTask:
-    """A sampling run in a thread, with its progress.
+    """A sampling run in a thread and its progress.
 
     Attributes:
         name: Name of the operation.
         total: Number of network evaluations.
         done: Number of finished network evaluations.
-        error: Error message, or "".
+        error: Error message; "" means no error.
         cancelled: Whether the visitor has cancelled the task.
         finished: Whether the thread has ended.
     """
@@ -65,27 +66,27 @@ class BackgroundTask:
     finished: bool = False
 
     def step(self, pipeline: PrITTIPipeline, number: int, timestep: int, values: dict) -> dict:
-        """Count one step of the sampler. The sampler calls this function after each step."""
+        """Count one step of the sampler, which calls this function after each step."""
         if self.cancelled:
             raise Cancelled
         self.done += 1
         return values
 
     def state(self) -> dict:
-        """Return the state as plain values."""
+        """Return the state of the task as plain values."""
         names = ("name", "total", "done", "error", "cancelled", "finished")
         return {name: getattr(self, name) for name in names}
 
 
 @dataclass
 class Session:
-    """A visitor's scene with its earlier states and its undone states.
+    """The scene of a visitor, with earlier states and undone states.
 
     Attributes:
         scene: Current scene.
-        past: Earlier states: name of the following operation, scene and edits.
+        past: Earlier states, each as (name of the next operation, scene, edits).
         future: Undone states.
-        edits: Edits after the scene was opened or generated.
+        edits: Edits since the scene was opened or generated.
         task: Last task.
     """
 
@@ -96,7 +97,7 @@ class Session:
     task: BackgroundTask | None = None
 
     def put(self, name: str, scene: Scene, edits: list) -> None:
-        """Add the state after an operation called `name`."""
+        """Store the state that results from an operation called `name`."""
         self.past = [*self.past, (name, self.scene, self.edits)][-MAX_HISTORY:]
         self.scene, self.edits, self.future = scene, edits, []
 
@@ -146,7 +147,7 @@ class Studio:
         """Load the model and read the datasets.
 
         Raises:
-            ValueError: A directory holds no model, or a dataset holds no scenes.
+            ValueError: A directory contains no model, or a dataset contains no scenes.
         """
         self.pipeline = load_pipeline(model)
         self.default_scheduler = self.pipeline.scheduler_config
@@ -155,7 +156,7 @@ class Studio:
         self.sampling, self.num_waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
     def open_session(self, visitor: str) -> Session:
-        """Return the visitor's session. Above MAX_SESSIONS, the least recently used idle session is deleted."""
+        """Return the session of a visitor; above MAX_SESSIONS, delete the least recently used idle session."""
         with self.lock:
             session = self.sessions.pop(visitor, None) or Session()
             self.sessions[visitor] = session
@@ -172,7 +173,7 @@ class Studio:
         return LABELS[self.pipeline.dit.config.label]
 
     def choose_label(self, request: SamplingRequest, scene: Scene | None) -> str:
-        """Return the requested label, the label of the scene, or the first label of the model."""
+        """Return the requested label; otherwise the label of the scene; otherwise the first label of the model."""
         kind = self.pipeline.dit.config.label
         if request.label:
             require_labels(kind, [request.label])
@@ -183,10 +184,10 @@ class Studio:
             return self.labels[0]
 
     def start_task(self, session: Session, name: str, total: int, make: Callable[[BackgroundTask], Scene]) -> None:
-        """Run `make` in a thread and put its scene into the session.
+        """Run `make` in a thread and put the resulting scene into the session.
 
         Raises:
-            StudioBusyError: The visitor already has a running task, or too many tasks are waiting.
+            StudioBusyError: A task of the visitor is already running, or too many tasks are waiting.
         """
         with self.lock:
             session.require_idle()
@@ -232,7 +233,7 @@ class Studio:
         self.start_task(session, f"generate {label}, seed {request.seed}", request.steps, make)
 
     def inpaint(self, session: Session, request: InpaintRegionRequest) -> None:
-        """Start to regenerate a region of the scene. Raises ValueError if the region contains no pixel of the scene."""
+        """Start the regeneration of a region. Raises ValueError if the region contains no pixel of the scene."""
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         region = select_polygon(scene.grid, request.polygon_m)
         if not region.any():
@@ -257,7 +258,7 @@ class Studio:
         self.start_task(session, f"inpaint {request.contents}", blocks * repaint.num_evaluations, make)
 
     def extend(self, session: Session, request: ExtendRequest) -> None:
-        """Start to extend the scene on one side. Raises ValueError if the scene already has the maximum size."""
+        """Start the extension of the scene on one side. Raises ValueError if the scene already has the maximum size."""
         small = self.pipeline.spec.grid
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
         rows, cols = scene.grid.rows, scene.grid.cols
@@ -275,7 +276,7 @@ class Studio:
         self.start_task(session, f"extend {request.side}", blocks * repaint.num_evaluations, make)
 
     def edit(self, session: Session, request: EditsRequest) -> None:
-        """Apply edits to the scene. Raises ValueError for an invalid edit and for SQL."""
+        """Apply edits to the scene. Raises ValueError if an edit is invalid or uses SQL."""
         edits = parse_edits(request.edits)
         if any(edit.select.where for edit in edits):
             raise ValueError(

@@ -1,12 +1,12 @@
-"""Load training batches from tables. Ray tasks read ahead in an order that depends on the seed alone.
+"""Load training batches from tables. Ray tasks read ahead. The order of the samples depends only on the seed.
 
-The order of the samples is fixed before the first read. Each epoch visits the shards in random order and shuffles the
-rows within a window of a few shards. Each worker computes the rows that it needs from its rank and the step. A resumed
-run therefore continues with the next batch, and two workers together read the same samples as a single worker.
+The order is fixed before the first sample is read. Each epoch visits the shards in random order and shuffles the rows
+within windows of a few shards. Each worker uses its rank and the step to compute the rows that it needs. A resumed run
+therefore continues with the next batch. Two workers together read the same samples as a single worker.
 
 The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
-polls without a pause and holds Python's global lock. On two cores, training steps then take four times as long
-(docs/experiments/reading_training_data.md).
+polls without pauses and holds the global interpreter lock of Python. On two cores, training steps then take four times
+as long (docs/experiments/reading_training_data.md).
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from pipelines.schema.tables import Shard, find_category_indices, list_ground_st
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
-AHEAD = 2  # Number of tasks that read ahead while the training consumes the samples of another task.
+AHEAD = 2  # Number of tasks that read ahead while the training uses the samples of another task.
 READER_CPUS = 0.5  # With more CPUs, a reader and a training worker would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
-Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, places in the stream) -> stacked samples.
+Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, stream places) -> stacked samples.
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Stream:
             raise ValueError("the training split has no scenes")
 
     def positions(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shard and the row of samples first .. first + count - 1 of the stream."""
+        """Return the shard and the row of each of the samples first .. first + count - 1 of the stream."""
         epoch_size = sum(self.counts)
         wanted = np.arange(first, first + count)
         shard, row = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -72,7 +72,7 @@ class Stream:
 
 @lru_cache(maxsize=4)
 def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return shard and row of each scene once, for one epoch.
+    """Return the shard and row of all scenes, in the order of one epoch.
 
     The shards are in random order. Rows are shuffled within windows of WINDOW_SHARDS shards.
     """
@@ -107,18 +107,18 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 def iterate_batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
-    """Yield the local batches of steps start_step .. stop_step - 1 of one worker. AHEAD Ray tasks read ahead.
+    """Yield the local batches of one worker for steps start_step .. stop_step - 1; AHEAD Ray tasks read ahead.
 
     Args:
         stream: Order of the samples.
-        read: Reads samples of a shard.
+        read: Function that reads samples of a shard.
         start_step: First step.
-        stop_step: Step after the last one.
-        rank: Number of the worker.
+        stop_step: Step after the last step.
+        rank: Rank of the worker.
         world: Number of workers.
 
     Yields:
-        Read-only arrays by name, (batch size / world, ...) each.
+        Dictionary of read-only arrays, each of shape (batch size / world, ...).
 
     Raises:
         ValueError: The global batch size is not a multiple of the number of workers.
@@ -146,7 +146,7 @@ class LayoutReader:
 
     Attributes:
         spec: Layout of the model.
-        augment: Augmentation; None reads the stored scenes.
+        augment: Augmentation. None: the stored scenes are not changed.
     """
 
     spec: LayoutSpec
@@ -178,7 +178,7 @@ def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLayouts:
-    """Columns of a shard that layouts need. Encoding from columns takes half the time of encoding from Scenes.
+    """Columns of a shard from which layouts are encoded. Encoding from Scenes would take twice the time.
 
     Attributes:
         first: (scenes,) row of the first primitive of each scene.
@@ -203,7 +203,7 @@ class StoredLayouts:
         return self.ground(row, spec) | primitives
 
     def ground(self, row: int, spec: LayoutSpec) -> Arrays:
-        """Encode the ground of one scene. All scenes share one table that maps stored heights to encoded heights."""
+        """Encode the ground of one scene. One table, which all scenes share, maps stored heights to encoded heights."""
         raster = {name: self.rasters[name][row].as_py() for name in self.rasters.column_names}
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = raster["ground_classes"]
@@ -219,7 +219,7 @@ class StoredLayouts:
 
 @lru_cache(maxsize=4)
 def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
-    """Return (65536,) uint16: `encode_height` of each 16-bit number of height steps."""
+    """Return (65536,) uint16: the result of `encode_height` for each 16-bit stored height."""
     steps = np.arange(2**16, dtype=np.uint16).view(np.int16)
     return encode_height(steps * np.float32(step_m), spec)
 
@@ -256,7 +256,7 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
 
 
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
-    """Return the index into LABELS[label] of each row of a scenes table, (n,) int64."""
+    """Return, for each row of a scenes table, the index of its label in LABELS[label], (n,) int64."""
     densities = zip(scenes["vegetation_density"].to_pylist(), scenes["vehicle_density"].to_pylist(), strict=True)
     names = [compose_label(label, vegetation, vehicle) for vegetation, vehicle in densities]
     return np.array([find_label_index(label, str(name)) for name in names], np.int64)
@@ -264,7 +264,7 @@ def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LatentReader:
-    """Read samples for stage 2: moments of the latents, and labels.
+    """Read samples for stage 2: labels, and moments of the latents.
 
     Attributes:
         latents_root: Directory of the latents.

@@ -1,4 +1,4 @@
-"""Encode scenes to latents: one Ray Data graph, one model per actor, one latents shard per scenes shard."""
+"""Encode scenes to latents with a Ray Data graph; each actor holds a model and writes one shard of latents per task."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipelines.schema.tables import Shard, find_shards, make_latents_schema
 
 
 def digest_weights(model: torch.nn.Module) -> str:
-    """Return the first twelve hexadecimal digits of a hash of a model's weights."""
+    """Return the first twelve hexadecimal digits of a hash of the weights of a model."""
     digest = hashlib.sha256()
     for name, value in sorted(model.state_dict().items()):
         digest.update(name.encode())
@@ -27,7 +27,7 @@ def digest_weights(model: torch.nn.Module) -> str:
 
 
 def load_lvae(directory: str) -> LayoutVAE:
-    """Load a layout VAE. Raises ValueError if the directory holds no layout VAE."""
+    """Load a layout VAE. Raises ValueError if the directory does not contain a layout VAE."""
     if not storage.exists(storage.join_uri(directory, "config.json")):
         raise ValueError(f"{directory}: no layout VAE here; run jobs/train_lvae.py first")
     try:
@@ -37,9 +37,10 @@ def load_lvae(directory: str) -> LayoutVAE:
 
 
 class Encoder:
-    """Actor that encodes and writes the latents of one shard per row.
+    """Actor that encodes scenes and writes latents, one shard per row.
 
-    The input row holds the number of a shard. The output row holds the sums of its latent means per channel.
+    The input row holds the number of a shard. The output row holds the sums of the latent means of the shard, per
+    channel.
     """
 
     def __init__(self, lvae: str, output: str, shards: list[Shard], batch_size: int) -> None:
@@ -49,7 +50,7 @@ class Encoder:
 
     @torch.no_grad()
     def encode(self, shard: Shard) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Return scene ids of a shard, and means and log-variances of its latents, float16 (n, c, h, w) each."""
+        """Return the scene ids of a shard, and latent means and log-variances, each float16 (n, c, h, w)."""
         scenes, spec = shard.scenes(), self.model.spec
         parts = []
         for start in range(0, len(scenes), self.batch_size):
@@ -88,23 +89,24 @@ def encode_latents(
     batch_size: int = 16,
     on_shard: Callable[[dict], None] | None = None,
 ) -> dict:
-    """Write latents and latents.json. Another call resumes an interrupted run.
+    """Write latents and latents.json. To resume an interrupted run, call this function again.
 
     The file latents.json records the LVAE, the digest of its weights, and the channel statistics of the training split.
 
     Args:
-        dataset: Dataset to encode.
+        dataset: Dataset with the scenes to encode.
         lvae: Directory of the layout VAE.
         output: Directory of the latents.
-        num_actors: Number of actors, each with a model.
-        batch_size: Scenes per forward pass.
+        num_actors: Number of actors; each actor holds a model.
+        batch_size: Number of scenes per forward pass.
         on_shard: Called with the row of each finished shard.
 
     Returns:
         Content of latents.json.
 
     Raises:
-        ValueError: The LayoutSpecs of LVAE and dataset differ, or the directory holds latents of another LVAE.
+        ValueError: The LVAE and the dataset have different LayoutSpecs, or the directory contains latents of another
+            LVAE.
     """
     model = load_lvae(lvae)
     dataset.spec.with_resolution(model.spec.grid.rows).require(model.spec, f"{lvae}")
