@@ -126,7 +126,7 @@ def main(config: Config) -> None:
         cluster.shutdown()
     shards = FULL_POSES / (run.scenes / run.shards) + FULL_LOGS / 2
     print(
-        f"extrapolated: all of KITTI-360 and 1,000 logs of Argoverse 2 are {shards:.0f} shards, "
+        f"extrapolation: all of KITTI-360 and 1,000 logs of Argoverse 2 are {shards:.0f} shards, "
         f"{shards * per_shard_ms / 1e3:.0f} s of the driver's CPU time for any number of nodes"
     )
 

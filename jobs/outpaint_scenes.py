@@ -44,8 +44,8 @@ class Config(RePaintOptions):
     """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
     0.5)."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Known latents of a block: encode the neighbours again in the frame of the block, or copy and shift their latents
-    (the paper)."""
+    """How to get the known latents of a block: encode the neighbours again in the frame of the block, or copy and shift
+    their latents (the paper)."""
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

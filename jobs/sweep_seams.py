@@ -29,8 +29,8 @@ class Config(GenerationOptions):
     overlap: float = 0.5
     """Overlap of neighbouring blocks, as a share of the block size."""
     neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """Known latents of a block: encode the neighbours again in the frame of the block, or copy and shift their latents
-    (the paper)."""
+    """How to get the known latents of a block: encode the neighbours again in the frame of the block, or copy and shift
+    their latents (the paper)."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     batch_size: int = 4

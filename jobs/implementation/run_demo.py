@@ -32,7 +32,7 @@ CHECKPOINTS = 8  # number of checkpoints per training run; a validation with pic
 
 
 class Stages:
-    """Run stages in sequence, print their names, and record their durations across interruptions."""
+    """Run stages in sequence, print the name of each stage, and keep records of durations across interruptions."""
 
     def __init__(self, path: str, total: int) -> None:
         self.path, self.total, self.started = path, total, time.perf_counter()

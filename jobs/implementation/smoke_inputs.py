@@ -14,5 +14,5 @@ def make_smoke_dataset(root: str) -> None:
     """Generate a town of 32 training and 16 test scenes if it does not exist."""
     if storage.exists(storage.join_uri(root, "dataset.json")):
         return
-    start_ray(training=True)  # preprocessing would start Ray without the dashboard, which training needs
+    start_ray(training=True)  # training needs Ray's dashboard, but preprocessing would start Ray without the dashboard
     main(Town(output=root, num_train=NUM_TRAIN, num_test=NUM_TEST))

@@ -40,7 +40,7 @@ START_SCENES, START_SHARDS = 96, 16  # numbers of training scenes and shards fro
 
 
 def prepare(config: Config) -> TrainingRun:
-    """Return the training run of the options; generate the smoke preset's dataset if it is missing."""
+    """Return the training run that the options describe; generate the smoke preset's dataset if it is missing."""
     row = resolve_preset(config)
     root = find_training_dataset(config, row.source)
     if needs_smoke_inputs(config):

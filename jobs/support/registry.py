@@ -60,7 +60,7 @@ def download_pipeline(reference: str) -> str:
             whole = api.download_artifacts(run_id, PIPELINE, staging)
             if compute_checksums(whole) != json.loads(Path(whole, CHECKSUMS_NAME).read_text()):
                 raise ValueError(f"{reference}: its files do not match its {CHECKSUMS_NAME}; publish it again")
-            if not os.path.exists(directory):  # another process may have finished first
+            if not os.path.exists(directory):  # another process may have finished the same download first
                 os.rename(whole, directory)
     except (MlflowException, OSError) as error:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Train with Ray Train: batches from Ray Data, checkpoints, resume, MLflow from rank 0.
+"""Train with Ray Train: read batches with Ray Data, save checkpoints, resume runs, and log to MLflow from rank 0.
 
 The same command resumes a run, because Ray Train finds the run of the same name and returns its last checkpoint.
 """

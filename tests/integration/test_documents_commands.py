@@ -11,7 +11,7 @@ import pytest
 from documents import PAGES, Block, list_blocks
 from helpers import ROOT
 
-# Pages whose blocks other tests run.
+# Pages with code blocks that other tests run.
 TESTED_ELSEWHERE = {
     "docs/reference/tables.md": "tests/unit/test_tables_docs.py",
     "CONTRIBUTING.md": "only targets of make",

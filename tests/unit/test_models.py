@@ -371,7 +371,7 @@ def test_latent_noise_is_per_sample_with_stated_scale():
     sizes = drawn.std(dim=(1, 2, 3))
     assert (
         np.isclose(float(sizes.pow(2).mean() ** 0.5), 0.2, rtol=0.1) and float(sizes.min()) < 0.02
-    )  # sizes follow |N(0, 0.2)|
+    )  # sizes have the distribution |N(0, 0.2)|
     lvae, spec = make_small_lvae(decoder="cells", shortcut=True), small_spec()
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
     noise = torch.zeros(2, *lvae.latent_shape)

@@ -195,7 +195,7 @@ def test_route_goes_straight_and_keeps_right():
     assert len(plan_drive(replace(network, roads=()))) == 0
     assert way[0, 0] < 2 and way[-1, 0] > 60  # the drive passes the side street
     inner = way[(way[:, 0] > 5) & ((way[:, 0] < 20) | (way[:, 0] > 42))]
-    assert np.abs(inner[:, 1] - 1.5).max() < 0.5  # the lane centre is 6 m / 4 to the right of y = 3 m
+    assert np.abs(inner[:, 1] - 1.5).max() < 0.5  # the lane centre is 6 m / 4 = 1.5 m to the right of y = 3 m
     assert (np.diff(way[:, 0]) > 0).all()
     left = plan_drive(network, right=-0.25)
     assert left[10:20, 1].mean() > 4
