@@ -48,7 +48,7 @@ def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray
 
 @dataclass(frozen=True)
 class Trial:
-    """Settings of one autoencoder that is trained.
+    """Settings of one trained autoencoder.
 
     Attributes:
         kind: Distribution of the boxes.

@@ -78,7 +78,7 @@ def name_settings(row: Mapping) -> str:
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row with the most steps: a row of the paper's sampler if there is one, otherwise of any sampler."""
+    """Return the row of the paper's sampler with the most steps; if there is none, search all samplers."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 

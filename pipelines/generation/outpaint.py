@@ -41,7 +41,7 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # The job prints a warning if a smaller fraction of the known pixels of a block has ground.
+HARDLY_KNOWN = 0.1  # Minimum fraction of known pixels with ground; below it, the job prints a warning.
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 

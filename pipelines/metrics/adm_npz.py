@@ -111,11 +111,11 @@ def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
         batch: Pictures per batch.
 
     Returns:
-        Iterator of uint8 arrays (batch, height, width, 3); the last one may be shorter.
+        Iterator of uint8 arrays (batch, height, width, 3); the last array may be shorter.
 
     Raises:
-        ValueError: The file is missing, is truncated, has another type or is pickled (raised immediately), or its
-            checksum is wrong (raised while it is read). The message names the file.
+        ValueError: The file is missing, is truncated, has another type, is pickled or has a wrong checksum. A wrong
+            checksum is found only while the file is read. The message names the file.
     """
     if batch < 1:
         raise ValueError(f"a batch must hold at least 1 picture, got {batch}")
@@ -199,8 +199,8 @@ def write_npz(path: str, batches: Iterable[np.ndarray], count: int) -> None:
 
     def write(file) -> None:
         written = 0
-        # Compression reduces pictures in flat colours to a thirtieth of their size. An entry may exceed 2 GiB and its
-        # size is not known at the start. The zip64 format is therefore always used.
+        # Compression reduces pictures in flat colours to a thirtieth of their size. The zip64 format is always used,
+        # because the size of an entry is not known in advance and may exceed 2 GiB.
         with (
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
             archive.open(f"{PICTURES}.npy", "w", force_zip64=True) as stream,

@@ -80,9 +80,9 @@ ENDS = np.cumsum([len(histogram) for histogram in HISTOGRAMS])
 def compute_scene_histograms(scene: Scene) -> np.ndarray:
     """Count the values of one scene over the bins of HISTOGRAMS.
 
-    Each category has four kinds of values: the extents of the primitives, the ground class under each centre, the
-    distance of each centre from the nearest road pixel, and the horizontal distance between the two centres of each
-    pair. A scene without road has no distances to the road. The last histogram holds the widths of the road.
+    Each category has four kinds of values: extents of primitives, ground classes under centres, distances of centres
+        from the nearest road pixel, and horizontal distances between pairs of centres. A scene without road has no
+        distances to the road. The last histogram holds the widths of the road.
 
     Args:
         scene: Scene to describe.

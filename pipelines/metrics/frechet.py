@@ -128,8 +128,9 @@ def compute_block_moments(features: np.ndarray) -> Moments:
 class Transport:
     """Decomposition from which the distance of two Gaussians with covariances A and B is computed.
 
-    With A = F F^T, AB has the eigenvalues s^2 of the symmetric matrix F^T B F = U s^2 U^T. Two symmetric eigenproblems
-    replace a general matrix square root, whose result may be complex. Rank-deficient covariances are allowed.
+    Let A = F F^T. Then AB has the same eigenvalues s^2 as the symmetric matrix F^T B F = U s^2 U^T. Two symmetric
+    eigenproblems replace a general matrix square root, whose result may be complex. Rank-deficient covariances are
+    allowed.
 
     Attributes:
         roots: (d,) s.

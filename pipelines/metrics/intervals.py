@@ -39,7 +39,7 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
         key: Part of the seed. The two sides of a comparison use different keys to make their draws independent.
 
     Returns:
-        (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 holds ones; the draws follow.
+        (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 is all ones; the other rows are the draws.
     """
     random = np.random.default_rng([count, key])
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)

@@ -87,8 +87,8 @@ class FeatureSet:
 
     Attributes:
         features: (n, d) features.
-        left: (n, p + 3) float32 left factors. left[i] . right[j] is the squared distance of the short vectors of i and
-            j.
+        left: (n, p + 3) float32 left factors. The dot product of left[i] and right[j] is the squared distance of short
+            vectors i and j.
         right: (n, p + 3) float32 right factors.
         length: (n,) length of the short vector of each sample.
         rest: (n,) length of the residual, the part outside the axes.
@@ -244,8 +244,8 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
     """Compute the short vectors of features for the filter.
 
     For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2. The length |r - r'| lies between the difference
-    and the sum of |r| and |r'|. With v = (c, |r|), one product of vectors gives the bound:
-    (-2 v, |v|^2, 1) . (v', 1, |v'|^2) = |v - v'|^2.
+    and the sum of |r| and |r'|. Let v = (c, |r|). The bound |v - v'|^2 is the dot product of
+    (-2 v, |v|^2, 1) and (v', 1, |v'|^2).
 
     Args:
         features: (n, d) features.

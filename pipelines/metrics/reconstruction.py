@@ -325,7 +325,7 @@ def compute_detection_scores(
 def compute_average_precision(hit: np.ndarray, num_truths: int) -> np.ndarray:
     """Compute the mean of the interpolated precision over 101 recall points.
 
-    The interpolated precision at a recall is the highest precision at this recall or a greater one. At a recall that
+    The interpolated precision at recall r is the highest precision at any recall of at least r. At a recall that
     the detections do not reach, the precision is 0.
 
     Args:

@@ -34,9 +34,9 @@ TOLERANCE_M = 0.5
 SLAB_OFFSET_M = 0.3  # Used if ground heights are slab tops (KITTI-360, town). Otherwise 0 (Argoverse 2).
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
 # Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of the primitives in these
-# categories float and 7 % are sunken. The other categories are excluded because many of their primitives are not
-# annotated on the ground in this drive:  traffic_control (100 % float), vegetation_ellipsoid (29 % float),
-# vegetation_cuboid (37 % sunken) and  construction_small (28 % sunken).
+# categories float and 7 % are sunken. The other categories are excluded. In this drive, many of their primitives are
+# not annotated on the ground:  traffic_control (100 % float), vegetation_ellipsoid (29 % float),  vegetation_cuboid (37
+# % sunken) and  construction_small (28 % sunken).
 STANDING = tuple(
     CATEGORY_INDEX[name]
     for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole", "object")

@@ -97,7 +97,7 @@ addEventListener("keydown", (event) => {
 });
 
 // Dragging moves the selected object in the horizontal plane through its centre.
-$("drag").onclick = () => { dragging = viewer.busy = !dragging; $("drag").textContent = dragging ? "Drag: press on the object" : "Drag"; };
+$("drag").onclick = () => { dragging = viewer.busy = !dragging; $("drag").textContent = dragging ? "Press on the object and drag it." : "Drag"; };
 let from = null;
 const place = (event) => { const box = $("view").getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
 $("view").addEventListener("pointerdown", (event) => {
