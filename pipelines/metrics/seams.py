@@ -24,7 +24,7 @@ MEASURES = (
     "class_changes",  # Share of pixel pairs across the line with different classes, if a pixel has ground.
     "height_step",  # Mean height difference of pixel pairs across the line (m), if both pixels have ground.
     "cut_objects",  # Share of the objects at the line that end there instead of crossing the line.
-    "doubled_objects",  # Share of the objects at the line that overlap an object beyond the line.
+    "doubled_objects",  # Share of objects at the line that overlap an object of the same category beyond it.
 )
 NEAR_M, FAR_M = 4.0, 16.0
 END_M = 0.25  # An object ends at a line if its end is at most this far from the line (m).

@@ -18,12 +18,13 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, DRIVABLE_CLASSES, ROAD_CLAS
 from pipelines.geometry.masks import label_parts
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
+# Measures of the distance or class of the ground apply only to primitives that have ground under their centre.
 MEASURES = (
     "overlapping",  # Solid primitives whose IoU3D with another solid primitive exceeds 0.05.
     "floating",  # Standing primitives whose lowest point is more than 0.5 m above the surface.
     "sunken",  # Standing primitives whose lowest point is more than 0.5 m below the surface.
     "over_unknown_ground",  # Standing primitives inside the grid that have no ground under their centre.
-    "off_road_vehicles",  # Vehicles on the ground whose centre does not lie on a drivable class.
+    "off_road_vehicles",  # Vehicles whose centre does not lie on a drivable class.
     "buildings_on_road",  # Buildings whose centre lies on the road.
     "road_connectivity",  # Share of road pixels in the largest 4-connected component, averaged over scenes with road.
 )
@@ -67,8 +68,7 @@ def find_faults(
         tolerance_m: Maximum distance of an object from the surface (m).
 
     Returns:
-        For each measure: (n,) bool, whether a primitive is implausible, and (n,) bool, whether the measure applies to
-            it.
+        For each measure, two (n,) bool arrays: implausible primitives, and primitives to which the measure applies.
     """
     category = scene.category
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
