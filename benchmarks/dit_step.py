@@ -1,12 +1,12 @@
-"""Time a denoising step of the diffusion transformer on the CPU.
+"""Measure the time of a denoising step of the diffusion transformer on the CPU.
 
 The benchmark compares this project's DiT, the original code with the same weights, and the class of diffusers.
 
     python benchmarks/dit_step.py                      # DiT-B, batch sizes 1 and 8; some minutes
     python benchmarks/dit_step.py --preset kitti360-l --batches 1
 
-Times are wall-clock seconds; the implementations are measured in turn. The benchmark also times the matrix products
-alone, which are a lower bound. The benchmark also compares guidance at scale 1 with an implementation that always
+Times are wall-clock seconds; the implementations are measured in turn. The benchmark also measures the matrix products
+alone. Their time is a lower bound. The benchmark also compares guidance at scale 1 with an implementation that always
 doubles the batch.
 """
 

@@ -1,4 +1,4 @@
-"""Time precision, recall and FID of 2048-d features, and compare with a direct implementation of ADM's formulas.
+"""Measure the time of precision, recall and FID, and compare it with a direct implementation of ADM's formulas.
 
     python benchmarks/generation.py                      # 1,000 samples per side with both, 10,000 with ours
     python benchmarks/generation.py --samples 61913      # ours only, on Ray: memory and time

@@ -66,7 +66,7 @@ def time_overlapping_pairs() -> None:
 
 
 def time_whole_scenes() -> None:
-    """Time all pairs of predicted and true boxes of a scene.
+    """Measure the time of all pairs of predicted and true boxes of a scene.
 
     Bounds exclude most pairs. In AP3D, different categories exclude more pairs.
     """

@@ -1,4 +1,4 @@
-"""Time the parts of a training step of the layout VAE, and compare the step with a plain version.
+"""Measure the parts of a training step of the layout VAE, and compare the step with a plain version.
 
 The comparison uses the paper's DETR decoder. With a cell decoder, the plain version would pad to thousands of
 proposals.

@@ -1,8 +1,8 @@
 """A direct implementation of the paper's training objective of the layout VAE, used as a baseline by benchmarks.
 
-Matching pads the true primitives to the number of proposals and fills whole cost tensors. Losses loop over samples and
-categories. The object encoder also computes padded slots. The results equal the results of this project, but the
-computation takes more time.
+Matching pads the true primitives to the number of proposals and fills whole cost tensors. The losses are computed in
+Python loops over samples and categories. The object encoder also computes padded slots. The results equal the results
+of this project, but the computation takes more time.
 """
 
 from __future__ import annotations

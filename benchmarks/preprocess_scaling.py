@@ -55,7 +55,7 @@ class Run:
 
 
 def time_ingest(tasks: list[ShardTask]) -> Run:
-    """Time one ingest on the running Ray cluster."""
+    """Measure the time of one preprocessing run on the running Ray cluster."""
     received = []
     with tempfile.TemporaryDirectory() as out:
         start, clock = time.perf_counter(), time.process_time()

@@ -54,7 +54,7 @@ class Encoding(NamedTuple):
         entries: Number of entries of the code of a box.
         encode: Maps rotation (..., 3, 3) and size_m (..., 3) to codes (..., entries).
         decode: Maps any finite codes to rotation (..., 3, 3), right-handed, and size_m (..., 3). Extents below 1 cm
-            count as 1 cm in both directions.
+            count as 1 cm, both in encoding and in decoding.
     """
 
     entries: int

@@ -115,7 +115,7 @@ def parse_options(config: dict[str, Any]) -> dict[str, Any]:
         config: Stored config.
 
     Returns:
-        Keyword arguments; the options of each branch are one dataclass.
+        Keyword arguments, with one dataclass of options per branch.
 
     Raises:
         ValueError: An option of a branch is unknown.

@@ -280,7 +280,7 @@ def test_trainer_stops_at_nonfinite_loss_before_update():
         trainer.step(batch, range(8, 16))
     assert (
         caught.value.positions == [11] and len(calls) == 1
-    )  # the wrapped model would wait for other workers, so the search for the sample does not call it
+    )  # The wrapped model would wait for other workers, so `find_nonfinite_samples` calls the inner model.
     batch["mean"][:] = float("nan")
     with pytest.raises(NonFiniteLossError, match="for all samples, because the weights are invalid"):
         trainer.step(batch, range(8))
