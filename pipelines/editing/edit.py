@@ -147,7 +147,7 @@ class Edit(ABC):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the index (m,) in `scene` of each primitive of the edited scene.
+            The edited scene with m primitives, and the index (m,) that each of them has in `scene`.
 
         Raises:
             ValueError: A primitive of the result has an invalid position or size.
@@ -378,7 +378,8 @@ class Scale(ObjectEdit):
 class Relabel(ObjectEdit):
     """Change the category.
 
-    The primitive becomes an ellipsoid for vegetation_ellipsoid, and a cuboid for all other categories.
+    If the new category is vegetation_ellipsoid, the primitive becomes an ellipsoid. Otherwise, the primitive becomes a
+    cuboid.
     """
 
     category: str = "object"
@@ -437,7 +438,7 @@ class Repair(Edit):
     """Repair faults (metrics/validity.py): snap to the ground, separate overlaps, or remove primitives."""
 
     slab_offset_m: float = SLAB_OFFSET_M
-    """Height of the ground raster above the real surface, in metres, as for snap."""
+    """Height of the ground raster above the real surface, in metres. The edit `snap` has the same option."""
     ground: GroundFaults = "both"
     """Primitives to move to the ground: floating, sunken, both or none."""
     push_m: float = 0.25

@@ -24,7 +24,7 @@ ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # Number of displacement lengths to try.
 PAIRS_AT_ONCE = 256  # Number of pairs that are processed together (50 MB).
-CANDIDATES = 6  # Number of directions, in order of displacement, that are tested against all other primitives.
+CANDIDATES = 6  # Number of displacements per pair, shortest first, that are tested against all other primitives.
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
@@ -116,7 +116,7 @@ class _Separation:
         return bool(moved.any())
 
     def ways(self, pairs: np.ndarray, scale: float) -> list[Boxes]:
-        """For each pair, find up to CANDIDATES positions (k, 2) of its boxes without overlap.
+        """For each pair of boxes, find up to CANDIDATES placements (k, 2) in which the two boxes do not overlap.
 
         The shortest displacement comes first. If two boxes overlap at both ends of a straight path, they overlap along
         the whole path, because their common volume is log-concave (Brunn-Minkowski). A direction is therefore skipped
@@ -139,7 +139,7 @@ class _Separation:
         within &= share.any(axis=1)[:, None, None]
 
         def parted(where: np.ndarray) -> np.ndarray:
-            """Return a mask (p, directions, steps) of the displacements in `where` that separate their pair."""
+            """Return a mask (p, directions, steps): the displacements in `where` that separate the two boxes."""
             pair, *_ = np.nonzero(where)
             a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
             found = where.copy()
@@ -157,7 +157,7 @@ class _Separation:
         return result
 
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
-        """For each pair of positions (k, 2), return whether a box of the pair would overlap a third box.
+        """For each placement (k, 2) of a pair, return whether one of the two boxes would overlap a third box.
 
         The overlap must exceed the limit and the current overlap.
         """

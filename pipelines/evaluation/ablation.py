@@ -55,7 +55,8 @@ class Trial:
         encoding: Encoding of a box.
         count: Number of training boxes.
         seed: Seed of boxes and weights.
-        numbers: Numbers that the autoencoder regresses: all numbers, or only the varying numbers (moving).
+        numbers: Numbers that the autoencoder regresses. all: all numbers; moving: only the numbers that vary between
+            boxes.
     """
 
     kind: str
@@ -201,7 +202,8 @@ LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # Mean IoU of a square with
 def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
     """Return the IoU of a square and its rotated copy, 1 / (sin + cos), for rotations in [0, pi/2].
 
-    The IoU3D of an upright box with a square footprint is the same. The mean over all rotations is LOST_YAW_IOU3D.
+    The formula also gives the IoU3D of an upright box with a square footprint and its rotated copy. The mean over all
+    rotations is LOST_YAW_IOU3D.
     """
     return 1 / (np.sin(turn_rad) + np.cos(turn_rad))
 
@@ -213,12 +215,13 @@ def find_ranges(encoding: str) -> np.ndarray:
 
 
 def compute_yaw_loss(row: dict, count: int) -> dict:
-    """Compute the loss of IoU3D if noise is added to the encoding of `count` boxes.
+    """Add noise to the encoding of `count` boxes, and compute the resulting loss of IoU3D.
 
     The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
-    is Gaussian. It is relative to the range of each entry over "any" boxes, and constant entries get no noise.
-    `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with the true axes minus the IoU3D of
-    the decoded box. The extents along the true axes are computed from the decoded scatter matrix.
+    is Gaussian. Its standard deviation is `noise` times the range of the entry over "any" boxes. Constant entries
+    therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with the true
+    axes minus the IoU3D of the decoded box. The extents along the true axes are computed from the decoded scatter
+    matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -244,7 +247,7 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
 
 
 def compute_yaw_losses(count: int, shares: Sequence[float] = SHARES, noises: Sequence[float] = NOISES) -> list[dict]:
-    """Return `compute_yaw_loss` of each encoding, footprint and noise; one task computes one encoding and footprint."""
+    """Run `compute_yaw_loss` for each encoding, footprint and noise, with one task per encoding and footprint."""
     rows = [{"encoding": e, "width_share": s, "noise": n} for e in ENCODINGS for s in shares for n in noises]
     graph = ray.data.from_items(rows, override_num_blocks=len(rows) // len(noises))
     found = list(map_dataset(graph, compute_yaw_loss, fn_kwargs={"count": count}, num_cpus=1).iter_rows())
@@ -349,7 +352,10 @@ def build_encoding_table(rows: Sequence[dict]) -> Table:
 
 
 def build_share_table(rows: Sequence[dict]) -> Table | None:
-    """Tabulate mean IoU3D per bin of width / length for kinds of boxes with values in all bins, or return None."""
+    """Tabulate the mean IoU3D for each bin of width / length.
+
+    Rows that lack a value in a bin are omitted. The result is None if no row remains.
+    """
     kept = [row for row in rows if None not in row["iou3d_per_share"]]
     if not kept:
         return None
@@ -364,7 +370,7 @@ def build_share_table(rows: Sequence[dict]) -> Table | None:
 
 
 def build_yaw_table(rows: Sequence[dict]) -> Table:
-    """Tabulate the loss of IoU3D from yaw errors and the mean yaw error, per encoding, footprint and noise."""
+    """Tabulate the mean yaw error and the IoU3D loss that it causes, per encoding, footprint and noise."""
     noises = sorted({row["noise"] for row in rows})
     columns = ["encoding", "width / length"]
     columns += [f"IoU3D loss, {100 * n:g} % noise" for n in noises]
@@ -436,7 +442,7 @@ def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Ch
 
 
 def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
-    """Yield the points of a whisker: mean, maximum, minimum and again mean, where the line continues."""
+    """Yield the points of a whisker: mean, maximum, minimum, and the mean again, from which the line continues."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 

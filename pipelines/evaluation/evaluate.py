@@ -1,4 +1,4 @@
-"""Score generated scenes against real scenes, or any source against another, from features of the scenes.
+"""Compare generated scenes with real scenes, or any two sources, by scores of the scenes' features.
 
 features.py computes the features. Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of
 Inception features have the usual names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have
@@ -124,8 +124,8 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
 def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
     """Compute precision, recall, density and coverage for each k, with names such as precision_k3.
 
-    The intervals resample the samples that are tested for membership in a ball. The balls are not resampled, because a
-    sample that is drawn twice would be its own neighbour.
+    For the intervals, only the samples that are tested for membership in a ball are resampled. The balls are kept,
+    because a sample that is drawn twice would be its own neighbour.
 
     Raises:
         ValueError: There are too few samples for the largest k.
@@ -180,10 +180,10 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
     """Compare the distances from generated to real samples with the distances between real samples (paper, supplement).
 
     Returns:
-        `generated` and `real`: statistics of the distance of each sample to the nearest other sample that is real.
-        `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of real samples.
-        `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real samples of
-        each generated sample, in order of distance. `distance` (m, 3): distances of these samples.
+        `generated` and `real`: statistics of the distance from each sample of this side to the nearest other real
+        sample. `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of real
+        samples. `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real
+        samples of each generated sample, in order of distance. `distance` (m, 3): distances of these samples.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
@@ -213,7 +213,7 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
     means = {side: compute_scene_means(part["statistics"]) for side, part in sides.items()}
     rates = {side: compute_pair_ratios(part["validity"]) for side, part in sides.items()}
     categories = slice(0, len(CATEGORIES))
-    # A source can hardly reach a distance lower than the distance between two halves of the real scenes.
+    # The distance between two halves of the real scenes is about the lowest distance that a source can reach.
     halves = real["statistics"][::2], real["statistics"][1::2]
     floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
     distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
@@ -238,7 +238,7 @@ def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
 
 
 def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
-    """Estimate the rates of measures from records (n, 2 * measures), where numerators and denominators alternate."""
+    """Estimate the rate of each measure from records (n, 2 * measures): alternating numerators and denominators."""
     return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 

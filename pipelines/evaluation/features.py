@@ -48,7 +48,7 @@ class FeatureConfig:
     """Options that determine the features.
 
     Attributes:
-        supersample: Square root of the number of points that are averaged per pixel.
+        supersample: Number of points per pixel along each axis; a pixel is the mean of its points.
         inception: File with the Inception weights; "" means no Inception features.
     """
 
@@ -190,10 +190,10 @@ def compute_scene_features(
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Compute the features of each scene of a side; parts that exist in `directory` are read instead.
+    """Compute the features of each scene of a side.
 
-    For scenes, a part is a shard and is computed by one Ray task. For an .npz, a part has PICTURES_PER_PART pictures
-    and is computed by one actor call.
+    If `directory` already contains the file of a part, the function reads this file. For scenes, a part is a shard and
+    is computed by one Ray task. For an .npz, a part has PICTURES_PER_PART pictures and is computed by one actor call.
 
     Args:
         side: Scenes, or pictures of an .npz.
@@ -262,7 +262,7 @@ def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> li
 
 
 def make_options_record(looks: FeatureConfig) -> dict:
-    """Return the options that determine the features; a hash identifies the weights, instead of the file name."""
+    """Return the options that determine the features. A hash of the weights replaces the name of their file."""
     return asdict(looks) | {
         "version": VERSION,
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",

@@ -1,6 +1,6 @@
-"""Measure how precision and recall depend on the number of reference scenes and on the selection by pose.
+"""Measure how the number of reference scenes and their selection by pose affect precision and recall.
 
-The paper studies this in its supplement (Precision and Recall Metrics, and the figure on sampling strategies).
+The supplement of the paper studies this effect (Precision and Recall Metrics, and the figure on sampling strategies).
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ class ReferenceSet:
 def list_references(
     xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
 ) -> Iterator[ReferenceSet]:
-    """Yield reference sets of `least` to `most` scenes, selected from poses (n, 2); sizes above n are skipped."""
+    """Yield reference sets of `least` to `most` scenes, which are selected by their poses (n, 2).
+
+    Values of `sizes` that exceed n are skipped.
+    """
     fitting = [size for size in sorted(sizes) if least <= size <= min(len(xy_m), most)]
     order = select_farthest(xy_m, world, max(fitting)) if fitting else np.zeros(0, int)
     for size in fitting:

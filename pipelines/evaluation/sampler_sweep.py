@@ -10,7 +10,7 @@ from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
-# Scores of `compare_datasets`: keys, display name and better direction ("one": close to 1 is better).
+# Scores of `compare_datasets`: keys, display name, and which values are better ("one": values close to 1).
 MEASURES = {
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),
@@ -26,9 +26,9 @@ COMMON = 3.0  # Minimum number of objects per scene. Categories with fewer objec
 
 
 def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
-    """Return the common category whose ratio of generated to real mean count differs most from 1, and this ratio.
+    """Find the category whose ratio of mean counts (generated / real) differs most from 1; return its name and ratio.
 
-    The result is None if no category has at least COMMON objects per real scene.
+    Categories with fewer than COMMON objects per real scene are ignored. The result is None if no category remains.
     """
     ratios = {}
     for name, sides in statistics.items():
@@ -45,7 +45,7 @@ def compute_deviation(ratio: float) -> float:
 def make_sampler_row(
     sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
-    """Make the row of one setting: measures with intervals, and seconds per scene and actor; None if unknown."""
+    """Make the row of one setting: measures with intervals, and seconds per scene and actor. None means unknown."""
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
@@ -59,7 +59,11 @@ def make_sampler_row(
 
 
 def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
-    """Return, for each measure of both rows, whether it is better than the reference or within its interval."""
+    """Return whether all measures of a row are at least as good as in the reference row.
+
+    A measure is as good if its value is better or if the two intervals overlap. Measures that are None in a row are
+    ignored.
+    """
 
     def good(name: str, better: str) -> bool:
         if row[name] is None or reference[name] is None:
@@ -78,7 +82,7 @@ def name_settings(row: Mapping) -> str:
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row of the paper's sampler with the most steps; if there is none, search all samplers."""
+    """Return the row of the paper's sampler (ddpm) with the most steps. Without such a row, search all samplers."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 

@@ -30,7 +30,7 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class SeamLines:
-    """Positions of seams; the default is the edges of the middle block of a scene.
+    """Positions of seams. By default, the seams are the edges of the middle block of a scene.
 
     Attributes:
         rows_m: Distances of seams from the front edge of the scene (m).
@@ -55,7 +55,7 @@ class SeamLines:
 
 
 def find_middle_m(extent_m: float) -> tuple[float, ...]:
-    """Return the two edges of the middle block along an extent (m); return nothing if the extent is a single block."""
+    """Return the two edges (m) of the middle block along an extent, or () if the extent is a single block."""
     margin_m = (extent_m - BLOCK_M) / 2
     return (margin_m, extent_m - margin_m) if margin_m > 0 else ()
 
@@ -182,7 +182,7 @@ def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines,
         f"The generated side has {scores['seams']['generated']} seams in {scores['scenes']['generated']} scenes. "
         f"The real side has {scores['seams']['real']} lines across the driving direction in "
         f"{scores['scenes']['real']} scenes. Nearby lines are parallel to a seam, {NEAR_M:g} to {FAR_M:g} m away from "
-        f"it, and at least {NEAR_M:g} m away from each seam."
+        f"it, and at least {NEAR_M:g} m away from all other seams."
     )
     pages = [table, Pictures("Generated scenes", pictures, columns=3), Text("Method", [how])]
     return render_report_html("Seams", pages)

@@ -63,7 +63,7 @@ class VoxelPair:
 
 
 def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]:
-    """Return the location of each scene by name, in a dataset (one split, or all) or in a directory of .npz files."""
+    """Map scene ids to locations in a dataset (one split or all splits) or in a directory of .npz files."""
     if storage.list_files(storage.join_uri(root, "scenes"), ".parquet"):
         shards = find_shards(root, split=split or None)
         ids = [shard.read("scenes", ["scene_id"])["scene_id"].to_pylist() for shard in shards]
@@ -81,7 +81,7 @@ def list_true_scenes(root: str, split: str = "") -> dict[str, GroundTruthVoxels]
 
 
 def group_files_by_scene(pattern: str, suffix: str = "") -> dict[str, str]:
-    """Return the URI of each file in a directory or of a pattern, by scene id."""
+    """Map scene ids to the URIs of the files in a directory, or of the files that match a pattern."""
     base, files = find_files(pattern, suffix)
     return {make_scene_id(file): storage.join_uri(base, file) for file in files}
 
@@ -94,7 +94,7 @@ def pair_files(
     Args:
         truth: True voxels by scene id.
         rebuilt: Files of the reconstructions by scene id.
-        stored: Files of the representation that the method stores, by scene id, if there are such files.
+        stored: By scene id, the file of the representation that the method stores. None: there are no such files.
         partial: Whether scenes may be missing from some sides.
 
     Returns:

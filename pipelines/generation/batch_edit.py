@@ -28,7 +28,7 @@ OUTLINE_M = 0.4  # Margin between changed objects and their outline (m).
 
 @dataclass(frozen=True)
 class EditRequest:
-    """Edits and the location of the edited scenes: source edited-<run>, in the same split as the input scene.
+    """Edits of a run. The edited scenes have the source edited-<run> and the split of the input scene.
 
     Attributes:
         edits: Edits, in the order in which they are applied.
@@ -244,7 +244,7 @@ def _draw_before_after(request: EditRequest, parts: Sequence[tuple[Shard, list[i
 def _list_changed(
     request: EditRequest, parts: Sequence[tuple[Shard, list[int]]]
 ) -> Iterator[tuple[Scene, Scene, ObjectChange]]:
-    """Yield each changed scene before the edits, after the edits, and with the changes that the first edit made."""
+    """For each changed scene, yield the input scene, the edited scene and the changes of the first edit."""
     for given, rows in parts:
         for scene in given.scenes(rows):
             with suppress(ValueError):  # Rejected scenes are skipped.

@@ -31,12 +31,11 @@ from pipelines.schema.tables import Shard
 
 @dataclass(frozen=True)
 class RegionConfig:
-    """Region that is regenerated: the union of the parts below, or its complement.
+    """Region that is regenerated: the union of polygon, half plane and objects, or the complement of this union.
 
     Attributes:
         polygon_m: Corners of a polygon as x, y, x, y, ... (m, scene frame).
-        half_plane: Direction x, y of a half plane, and the distance (m) along this direction at which the half plane
-            begins.
+        half_plane: x, y, d. The half plane begins at distance d (m) from the origin and extends in direction x, y.
         objects: Indices of primitives of a scene.
         margin_m: Margin around the objects (m).
         outside: Whether the complement of the union is regenerated.

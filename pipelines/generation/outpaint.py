@@ -41,7 +41,7 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # Minimum fraction of known pixels with ground; below it, the job prints a warning.
+HARDLY_KNOWN = 0.1  # The job prints a warning if a smaller fraction of the known pixels has ground.
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 
@@ -162,7 +162,7 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
 
 
 def write_block(block: SceneBlock, path: str) -> None:
-    """Write a block without rounding, unlike the tables; a resumed run then gives exactly the same scene.
+    """Write a block without the rounding of the tables. A resumed run then gives exactly the same scene.
 
     Args:
         block: Block.
@@ -385,7 +385,7 @@ def run_batches(
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
-    finally:  # Without kill, the actors would occupy CPUs: the traceback of an error holds references to them.
+    finally:  # The traceback of an error references the actors. Without ray.kill, they would keep their CPUs.
         for worker in workers:
             ray.kill(worker)
 
@@ -433,7 +433,7 @@ def pop_ready_task(
 
     Args:
         waiting: Batches to generate.
-        whole: Numbers of scenes whose blocks are all done; stitching these scenes has priority.
+        whole: Scene numbers of the scenes whose blocks are all done. These scenes are stitched first.
         done: Finished blocks by scene number.
 
     Returns:

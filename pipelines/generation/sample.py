@@ -123,7 +123,7 @@ def load_pipeline(directory: str) -> PrITTIPipeline:
 
 
 def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequence[str] = (), **also: object) -> None:
-    """Bind source generated-<run> of a dataset directory to one request and the weights of the model (run_guard.py).
+    """Ensure that the source generated-<run> of a dataset directory has one request and one model (run_guard.py).
 
     Args:
         request: Request of the run.
@@ -147,7 +147,7 @@ def guard_generation_run(request: Request, pipeline: PrITTIPipeline, parts: Sequ
 
 
 def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = None) -> Scene:
-    """Resample a scene to the ground classes and the grid of the model.
+    """Convert the ground of a scene to the ground classes and the grid of the model.
 
     Args:
         scene: Scene.
@@ -163,7 +163,7 @@ def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = N
 
 
 def resample_to_model_resolution(scene: Scene, spec: LayoutSpec) -> Scene:
-    """Resample a scene to the ground classes and the resolution of the model; the area of the scene is kept.
+    """Convert the ground of a scene to the ground classes and the resolution of the model; keep its area.
 
     Args:
         scene: Scene.
@@ -204,8 +204,7 @@ def find_scene_label(scene: Scene, kind: str) -> str:
 class Sampler:
     """Actor that generates and writes scenes, one shard per row.
 
-    The input row holds the number of a shard. The output row holds the number of the shard, the number of scenes and
-    the time (s).
+    The input row holds a shard number. The output row holds the shard number, the count of scenes and the duration (s).
     """
 
     def __init__(self, request: SampleRequest, batch_size: int) -> None:

@@ -332,8 +332,8 @@ def _interpolate_height(scene: Scene, shape: tuple[int, int]) -> np.ndarray:
 def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), right: float = 0.25) -> np.ndarray:
     """Plan a smooth path on the ground along the roads.
 
-    The path begins at the road end that is nearest to start_m. At each node, the path continues along an unused road:
-    the one with the smallest change of direction.
+    The path begins at the road end that is nearest to start_m. At each node, the path continues along the unused road
+    with the smallest change of direction.
 
     Args:
         network: Roads.
@@ -342,7 +342,8 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
             half.
 
     Returns:
-        (k, 3) points in the scene frame (m), with the spacing of the roads' points; (0, 3) if there are no roads.
+        (k, 3) points in the scene frame (m), as closely spaced as the points of the roads; (0, 3) if there are no
+        roads.
     """
     starts = [r for road in network.roads for r in (road, road.reverse()) if r.start == -1]
     starts = starts or [r for road in network.roads for r in (road, road.reverse())]

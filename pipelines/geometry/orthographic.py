@@ -145,7 +145,7 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
 
 
 class _Chords(NamedTuple):
-    """The m chords of ellipsoids along rows of pixel centres, as seen from a camera.
+    """Chords: m intersections of ellipsoids with rows of pixel centres, as seen from a camera.
 
     Chords are ordered by ellipsoid.
     """

@@ -1,9 +1,9 @@
 """Rasterise triangles from above. The result is exact for vertical rays through pixel centres.
 
 A vertical ray hits a triangle if the pixel centre lies inside the triangle's vertical projection. The code fills each
-triangle row by row. A row is an interval of columns, and the triangle's plane gives the heights. Each pixel keeps the
-highest hit. The same code makes the ground rasters (paper, Sec. 3.1) and the BEV images. It also makes the 3D images,
-after a rotation of the mesh.
+triangle row by row. Each row of a triangle is an interval of columns, and the triangle's plane gives the heights. Each
+pixel keeps the highest hit. The same code makes the ground rasters (paper, Sec. 3.1) and the BEV images. It also makes
+the 3D images, after a rotation of the mesh.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from models.scene import Grid
 
 # A pixel centre within this distance of an edge counts as inside. This prevents gaps between adjacent triangles.
 EDGE_PX = 1e-7
-# For steeper triangles (m per pixel), such as slivers, hits are clamped to the triangle's height range.
+# If the slope of a triangle (m per pixel) exceeds STEEP, its hits are clamped to the height range of the triangle.
 STEEP = 1e3
 
 
 def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Concatenate the integer ranges first[i] .. first[i] + count[i] - 1.
 
-    For values x per range, `np.repeat(x, count)` gives the value for each integer.
+    If x holds one value per range, `np.repeat(x, count)` holds the value of each integer.
 
     Args:
         first: (n,) first integer of each range.

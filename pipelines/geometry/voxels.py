@@ -202,10 +202,10 @@ def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
 def _list_pixels(
     middle_m: np.ndarray, low_m: np.ndarray, high_m: np.ndarray, first_m: float, step_m: float, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels along an axis with centres in the intervals [middle + low, middle + high], and the index of the
-    interval for each pixel.
+    """List the pixels along an axis whose centres lie in the intervals [middle + low, middle + high].
 
-    Pixel numbers decrease along the axis. The centre of a pixel lies at first_m - (pixel + .5) step_m.
+    The result holds the number of each pixel and the index of its interval. Pixel numbers decrease along the axis. The
+    centre of a pixel lies at first_m - (pixel + .5) step_m.
     """
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
@@ -245,11 +245,11 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
 
 
 def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper y (m,) of the vertical projection of box[i] at x offset dx_m[i] from its centre.
+    """For box[i], return the lower and upper y (m,) of its vertical projection at the x offset dx_m[i].
 
-    Both values are relative to the centre. The projection of a box with half edges (n, 3, 2) is a hexagon that is
-    point-symmetric about the centre. Its upper side starts at the rearmost corner and follows the three edges, the
-    steepest first.
+    All offsets are relative to the centre of the box. The projection of a box with half edges (n, 3, 2) is a hexagon
+    that is point-symmetric about the centre. Its upper side starts at the rearmost corner and follows the three edges,
+    the steepest first.
     """
     backward = (edges_m[..., 0] < 0) | ((edges_m[..., 0] == 0) & (edges_m[..., 1] < 0))
     edges_m = np.where(backward[..., None], -edges_m, edges_m)
@@ -303,8 +303,8 @@ class OutsideCounts:
 
     Attributes:
         ground: (2,) int64: number of columns with ground, and number of columns with ground outside the grid.
-        objects: (11, 3) int64: per category, the number of all primitives, of primitives partly or wholly outside, and
-            of primitives wholly outside.
+        objects: (11, 3) int64 numbers of primitives per category: all primitives, those at least partly outside, and
+            those wholly outside.
     """
 
     ground: np.ndarray

@@ -1,8 +1,8 @@
 """Convert a Scene to meshes: layout reconstruction (paper, supplement B.2), GLB files and PLY files.
 
 The ground is one fused surface. Each occupied pixel becomes a vertex at the pixel centre, with the colour of the
-pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles along the same diagonal. A primitive is a unit
-cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
+pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles; all blocks have the same diagonal. A primitive
+is a unit cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
 """
 
 from __future__ import annotations
@@ -173,9 +173,9 @@ def export_glb(scene: Scene) -> bytes:
     * `<category>_<index>` is the node of a primitive. Its extras hold category, class id, colour, label, instance id
       and the exact parameters.
 
-    The extras of the file hold the grid and the fields of ABOUT. From this file, mesh_import.py reads the same scene,
-    but with the fused ground only. Colours are in linear light, as glTF requires. A viewer then shows the sRGB values
-    of the palette.
+    The extras of the file hold the grid and the fields of ABOUT. mesh_import.py reads the same scene from this file,
+    with one difference: its ground is the fused ground. Colours are in linear light, as glTF requires. A viewer then
+    shows the sRGB values of the palette.
 
     Args:
         scene: Scene.

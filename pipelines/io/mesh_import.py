@@ -1,8 +1,8 @@
 """Import binary glTF meshes as Scenes: exports of this project, and meshes with class colours as in the authors' files.
 
-The extras of a file written by `mesh_export.export_glb` identify it as an export of this project. Each node is a
-primitive. The transform of the node gives centre, rotation and size; the extras give the other fields. Changes that a
-user makes in a mesh editor are therefore imported.
+The extras of a file show whether the file is an export of this project (`mesh_export.export_glb`). In an export, each
+node is a primitive. The transform of the node gives centre, rotation and size; the extras give the other fields.
+Changes that a user makes in a mesh editor are therefore imported.
 
 Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), with these assumptions:
 
@@ -58,7 +58,7 @@ from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
-# Smaller changes are rounding errors, not edits: relative change of a size, or change of a yaw (rad).
+# Changes below UNMOVED are rounding errors, not edits. Changes of a size are relative; changes of a yaw are in rad.
 UNMOVED = 1e-4
 MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid.
 

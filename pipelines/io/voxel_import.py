@@ -115,7 +115,7 @@ def export_voxels_npz(scene: Scene, grid: VoxelGrid | None = None) -> bytes:
     if voxels.shape not in SHAPES:
         raise ValueError(f"a voxel grid of shape {voxels.shape} cannot be read back; expected one of {SHAPES}")
     content = io.BytesIO()
-    # The cast is needed because of `allow_pickle` in numpy's annotation of the keyword arguments.
+    # Without the cast, the type checker compares the array with the keyword `allow_pickle` in numpy's annotation.
     np.savez_compressed(content, **cast("dict[str, Any]", {ARRAY: voxels}))
     return content.getvalue()
 

@@ -31,8 +31,8 @@ class ReferenceMoments(NamedTuple):
 
     Attributes:
         pool3: Moments of the pool3 features (2048 dimensions).
-        spatial: Moments of the spatial features (2023 dimensions). None: the file holds only `mu` and `sigma`, as those
-            of other evaluators do.
+        spatial: Moments of the spatial features (2023 dimensions). None: the file holds only `mu` and `sigma`, like the
+            files of other evaluators.
     """
 
     pool3: StoredGaussian
@@ -44,7 +44,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; if it is missing, truncated or damaged, raise ValueError with its path, also while reading."""
+    """Open an archive. Raise ValueError with its path if opening or a later read fails."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
@@ -57,7 +57,7 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Open a C-ordered array; yield a stream positioned at its first number, the shape and the type.
+    """Open a C-ordered array. Yield three values: a stream at the first number, the shape and the type.
 
     Raises:
         ValueError: The array is missing, is pickled, is in Fortran order or has the wrong size.

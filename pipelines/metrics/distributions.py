@@ -1,10 +1,10 @@
-"""Describe each layout by histograms and measure the distance between two sources from them.
+"""Describe layouts by histograms, and compute the distance between two sources from these histograms.
 
 No pictures and no network weights are needed. Each scene is described by a vector of counts over fixed bins. The sum
 over the scenes of a source is the histogram of the source. The confidence interval is computed from sums over resampled
 scenes. Two histograms are compared by the Wasserstein distance, in the unit of the histogram. Histograms whose bins
-have no order are compared by the Jensen-Shannon divergence, in bits. The bin width limits the resolution, so bins are
-narrow where objects are small.
+have no order are compared by the Jensen-Shannon divergence, in bits. The bins of small values are narrow, because the
+bin width limits the resolution.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def compute_scene_histograms(scene: Scene) -> np.ndarray:
     """Count the values of one scene over the bins of HISTOGRAMS.
 
     Each category has four kinds of values: extents of primitives, ground classes under centres, distances of centres
-        from the nearest road pixel, and horizontal distances between pairs of centres. A scene without road has no
-        distances to the road. The last histogram holds the widths of the road.
+    from the nearest road pixel, and horizontal distances between pairs of centres. A scene without road has no
+    distances to the road. The last histogram holds the widths of the road.
 
     Args:
         scene: Scene to describe.

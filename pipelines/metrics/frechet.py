@@ -180,18 +180,18 @@ def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None
 
 
 def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
-    """Return a matrix W (d, r) for each of the two sets, from which sample influences are computed.
+    """Return a matrix W (d, r) for each of the two sets. Sample influences are computed from this matrix.
 
     The derivative of the squared distance with respect to the covariance of a set is I - W W^T. Let
-    M = F^T B F = U s^2 U^T. W of A satisfies W W^T = (B F U) s^-3 (B F U)^T. W of B satisfies
-    W W^T = (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
+    M = F^T B F = U s^2 U^T. For set A, the matrix W satisfies W W^T = (B F U) s^-3 (B F U)^T. For set B, the matrix W
+    satisfies W W^T = (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
 
     Args:
         b: Moments with covariance B.
         between: Decomposition of A and B.
 
     Returns:
-        W of A and W of B, each (d, r), where r is the rank.
+        Matrices W for set A and for set B, each (d, r); r is the rank.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]
@@ -203,8 +203,8 @@ def compute_frechet_influence(
 ) -> np.ndarray:
     """Compute the first-order influence of each sample of one set on the Frechet distance.
 
-    The mean influence over a resample is an unbiased estimate of the change of the distance. The Frechet distance of
-    the resample itself is biased upwards, because few samples always cause this bias.
+    The mean influence over a resample is an unbiased estimate of the change of the distance. A Frechet distance that is
+    computed from the resample itself is biased upwards, as for any small set of samples.
 
     Args:
         features: (n, d) features of the set.

@@ -13,8 +13,8 @@ SPLIT_SAMPLES = 5000  # Samples per split, as in ADM's evaluator.
 def compute_inception_score(logits: np.ndarray) -> Estimate:
     """Compute the exponential of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
 
-    The mean divergence is the entropy of the mean distribution minus the mean entropy. The score of a resample
-    therefore needs only one product of its weights with p.
+    The mean divergence is the entropy of the mean distribution minus the mean entropy. The score of a resample is
+    therefore computed from products of its weights with p and with the entropies.
 
     Args:
         logits: (n, classes) logits pool3 @ W **without bias**, as in ADM.

@@ -1,7 +1,7 @@
 """Compute 95 % confidence intervals by the bootstrap: resample scenes with replacement and recompute the score.
 
-One resample is called a draw. It is stored as a row that counts how often each scene is sampled. If a score is a sum
-over scenes, one matrix product computes the score of all draws. Row 0 is the original sample, and its score is the
+One resample is called a draw. A draw is stored as a row that counts how often each scene is sampled. If a score is a
+sum over scenes, one matrix product computes the score of all draws. Row 0 is the original sample, and its score is the
 value of the estimate. The interval is computed from the scores of the other rows. The draws depend only on the number
 of scenes and the key.
 """
@@ -93,7 +93,7 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
     """Estimate the ratio of the column sums of two arrays that have one row per scene.
 
     One use is a share of objects: the number of faulty objects divided by the number of all objects. Another use is the
-        mean over those scenes that have a value: the sum of the values divided by their number.
+    mean over the scenes that have a value: the sum of these values divided by their number.
 
     Args:
         numerators: (n, m) numerators.

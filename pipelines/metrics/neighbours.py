@@ -217,7 +217,7 @@ def require_comparable(real: np.ndarray, generated: np.ndarray, at_least: int) -
 
 
 def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> PrincipalBasis:
-    """Compute principal axes of evenly spaced samples of both sides, which hold KEPT_VARIANCE of the variance.
+    """Compute the principal axes that hold KEPT_VARIANCE of the variance, from evenly spaced samples of both sides.
 
     Args:
         real: (n, d) features.
@@ -332,7 +332,7 @@ def find_nearest(
 def find_within(
     real: FeatureSet, generated: FeatureSet, real_radii: np.ndarray, generated_radii: np.ndarray, rows: range
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the samples that lie within balls of the other side, restricted to some of the real samples.
+    """Find the samples that lie within balls of the other side; consider only the real samples in `rows`.
 
     Args:
         real: Real samples.
@@ -343,7 +343,7 @@ def find_within(
 
     Returns:
         in_real (len(k), m), in_generated and covered (both (len(k), len(rows))). in_real counts the balls of `rows`
-        that contain each generated sample; sum it over the parts.
+        that contain each generated sample; the counts of all parts must be added.
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))

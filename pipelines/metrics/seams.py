@@ -21,10 +21,10 @@ from models.scene import Scene
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 MEASURES = (
-    "class_changes",  # Share of pixel pairs across the line with different classes, if a pixel has ground.
-    "height_step",  # Mean height difference of pixel pairs across the line (m), if both pixels have ground.
+    "class_changes",  # Share of pixel pairs across the line that differ in class, among pairs with ground.
+    "height_step",  # Mean height difference across the line (m), over pixel pairs with ground in both pixels.
     "cut_objects",  # Share of the objects at the line that end there instead of crossing the line.
-    "doubled_objects",  # Share of objects at the line that overlap an object of the same category beyond it.
+    "doubled_objects",  # Share of objects at the line that overlap an object of their category on the other side.
 )
 NEAR_M, FAR_M = 4.0, 16.0
 END_M = 0.25  # An object ends at a line if its end is at most this far from the line (m).
@@ -115,7 +115,7 @@ def measure_objects(
         low_m: (n,) lower ends of the objects (m).
         high_m: (n,) upper ends of the objects (m).
         center_m: (n,) centres of the objects (m).
-        doubles: (p, 2) pairs of indices of overlapping objects of the same category.
+        doubles: (p, 2) index pairs of objects that overlap and have the same category.
 
     Returns:
         (l, 2, 2) numerator and denominator of cut objects and of doubled objects.

@@ -18,7 +18,7 @@ from models.scene import CATEGORIES, CATEGORY_INDEX, DRIVABLE_CLASSES, ROAD_CLAS
 from pipelines.geometry.masks import label_parts
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
-# Measures of the distance or class of the ground apply only to primitives that have ground under their centre.
+# Measures that use the height or class of the ground apply only to primitives with ground under their centre.
 MEASURES = (
     "overlapping",  # Solid primitives whose IoU3D with another solid primitive exceeds 0.05.
     "floating",  # Standing primitives whose lowest point is more than 0.5 m above the surface.
@@ -36,8 +36,8 @@ SLAB_OFFSET_M = 0.3  # Used if ground heights are slab tops (KITTI-360, town). O
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
 # Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of the primitives in these
 # categories float and 7 % are sunken. The other categories are excluded. In this drive, many of their primitives are
-# not annotated on the ground:  traffic_control (100 % float), vegetation_ellipsoid (29 % float),  vegetation_cuboid (37
-# % sunken) and  construction_small (28 % sunken).
+# not annotated on the ground: traffic_control (100 % float), vegetation_ellipsoid (29 % float), vegetation_cuboid
+# (37 % sunken) and construction_small (28 % sunken).
 STANDING = tuple(
     CATEGORY_INDEX[name]
     for name in ("vehicle_big", "vehicle_small", "two_wheelers", "human", "construction_big", "pole", "object")

@@ -37,7 +37,7 @@ STAGING = ".staging"
 def _read_drive_or_reason(source: str, key: tuple) -> tuple[Drive, dict] | str:
     """Ray task that reads a drive into the object store.
 
-    All shards of the drive share the result, which is a str if reading fails.
+    All shards of the drive share the result. If reading fails, the result is the reason (str).
     """
     try:
         return read_drive(source, key)
@@ -158,8 +158,8 @@ def ingest_drives(
         options: User options, which are recorded in dataset.json.
         slots: Number of slots per category (default: 95th percentile of the category's count in the training scenes).
         grid: Raster grid of the scenes (default: the paper's).
-        skip_unreadable: Whether unreadable drives become rejects. If False, an unreadable drive is an error; it is
-            raised after all other drives are staged.
+        skip_unreadable: Whether unreadable drives become rejects. If False, an unreadable drive raises an error after
+            all other drives are staged.
         on_shard: Function that is called with the manifest of each finished shard.
 
     Returns:

@@ -57,7 +57,7 @@ def render_bev(scene: Scene, size_px: int = 256, supersample: int = 1) -> np.nda
 
 
 def render_outlined_bev(scene: Scene, region: np.ndarray, size_px: int = 512) -> np.ndarray:
-    """Render a scene from above with the border of a region as a line.
+    """Render a scene from above, and draw the border of a region as a line.
 
     Args:
         scene: Scene.
@@ -150,7 +150,7 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def average_blocks(picture: np.ndarray, factor: int) -> np.ndarray:
-    """Reduce an image by the mean of each block of factor x factor pixels.
+    """Reduce an image: replace each block of factor x factor pixels by its mean.
 
     Args:
         picture: (H, W, C) image.

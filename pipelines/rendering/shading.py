@@ -29,7 +29,7 @@ PLATE, TABLE = len(CLASS_COLORS), len(CLASS_COLORS) + 1  # Colour ids of plate a
 _SRGB = np.vstack([CLASS_COLORS, [[226, 228, 232], [243, 245, 248]]]) / 255
 LINEAR_COLORS = (_SRGB**2.2).astype(np.float32)
 
-# Direction of the sun's rays, with the angles of a camera's view direction.
+# Direction of the sun's rays. The angles are defined like the angles of a camera's view direction.
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0
 SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface.
 SKY = 1 - SUN
@@ -171,7 +171,7 @@ def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
 def _make_quads(points: np.ndarray) -> np.ndarray:
     """Return the triangles (2 (r - 1) (c - 1), 3, 3) of a grid of points (r, c, 3).
 
-    They face up if x and y decrease along the rows and columns.
+    The triangles face up if x decreases with the row index and y decreases with the column index.
     """
     here, right, below, across = points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]
     return np.stack([here, below, right, right, below, across], axis=2).reshape(-1, 3, 3)
@@ -221,7 +221,7 @@ def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray
 def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
     """Return the share (H, W) of sky light.
 
-    It decreases with the depth of a point below the mean height around the point.
+    The share decreases with the depth of a point below the mean height around the point.
     """
     grid = scene.grid
     length_m, width_m = (n * grid.resolution_m + 2 * MARGIN_M for n in (grid.rows, grid.cols))

@@ -73,7 +73,7 @@ def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Choose powers of ten around [low, high]; for at most two decades, also choose 2 and 5 times these powers."""
+    """Choose powers of ten around [low, high]. If there are at most two decades, add 2 and 5 times these powers."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
     factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)
@@ -164,7 +164,11 @@ def _draw_legend(names: list[str]) -> str:
 
 
 def format_number(value: float) -> str:
-    """Format a number with at most four significant digits, thousands separators and an exponent for extreme values."""
+    """Format a number for a chart or a table.
+
+    Numbers of at least 1000 are rounded to integers and have thousands separators. Very large and very small numbers
+    have an exponent. Other numbers have at most four significant digits.
+    """
     if not math.isfinite(value):
         return "–"
     size = abs(value)

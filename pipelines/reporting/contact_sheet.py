@@ -202,7 +202,7 @@ def draw_footprints(scene: Scene, size_px: int, supersample: int = 3) -> np.ndar
     Args:
         scene: Scene.
         size_px: Length of the longer side (px).
-        supersample: Square root of the number of points that are averaged per pixel.
+        supersample: Number of points per pixel along each axis; a pixel is the mean of its points.
 
     Returns:
         (H, W, 3) uint8 picture.

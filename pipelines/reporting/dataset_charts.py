@@ -66,7 +66,7 @@ def count_bins(counts: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, float]) -> str:
-    """Draw a histogram of scenes over their number of primitives of a category.
+    """Draw a histogram of the number of primitives of a category per scene.
 
     Args:
         category: Category.
@@ -112,7 +112,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
 
 
 def _join_mark_names(marks: Mapping[str, float]) -> dict[float, str]:
-    """Join the names of marks that have the same value; return them by value."""
+    """Map each value to the joined names of the marks that have this value."""
     names: dict[float, list[str]] = {}
     for name, value in marks.items():
         names.setdefault(value, []).append(name)
@@ -338,7 +338,7 @@ def _draw_map_legend(positions_m: Mapping[str, Mapping[str, np.ndarray]], px_per
 
 
 def _draw_scale(extent_m: np.ndarray, shelf: _Shelf) -> float:
-    """Return the largest scale (px / m) at which each sequence fits into its cell and all of them fit into the map."""
+    """Return the largest scale (px / m) at which each sequence fits into its cell and all cells fit into the map."""
     low, high = 1e-6, 20.0
     for _ in range(40):
         middle = (low * high) ** 0.5

@@ -262,9 +262,9 @@ def draw_histograms(facts: DatasetFacts) -> DrawingsSection:
     )
     if facts.description:
         note += (
-            " The mark p95 shows the 95th percentile of the training split. The mark slots shows the maximum number of "
-            "primitives of a category in a tensor. If a scene has more primitives, the tensor keeps the nearest "
-            "primitives. Over slots is the share of training scenes with more primitives than slots."
+            " The mark 'p95' shows the 95th percentile of the training split. The mark 'slots' shows the maximum "
+            "number of primitives of a category in a tensor. If a scene has more primitives, the tensor keeps the "
+            "nearest primitives. 'Over slots' is the share of training scenes with more primitives than slots."
         )
     return DrawingsSection("Primitives per scene", drawings, "small", note)
 
@@ -370,7 +370,7 @@ def make_reject_sections(facts: DatasetFacts) -> list[Section]:
 
 
 def make_reader_sections(facts: DatasetFacts) -> list[Section]:
-    """Tabulate, per sequence, label and defect, the objects that the readers of raw drives excluded."""
+    """Tabulate the objects that the readers of raw drives excluded, per sequence, label and defect."""
     reports: Mapping[str, Mapping] = (facts.description or {}).get("reports") or {}
     if not reports:
         return []

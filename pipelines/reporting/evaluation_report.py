@@ -119,8 +119,8 @@ def render_evaluation_html(
 
 INTERVALS = (
     "Brackets contain 95 % bootstrap intervals over scenes. The intervals of precision, recall, density and coverage "
-    "keep the neighbourhoods fixed. The intervals of Frechet distances are first-order approximations. They do not "
-    "include the bias of Frechet distances at small numbers of samples."
+    "keep the neighbourhoods fixed. The intervals of Frechet distances are first-order approximations. These "
+    "intervals do not include the bias that a Frechet distance has for a small number of samples."
 )
 
 

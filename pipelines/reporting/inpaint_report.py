@@ -55,8 +55,8 @@ def render_inpaint_html(
     )
     how = (
         "Outside the generated region, the latent equals the latent of the given scene. The decoders process the whole "
-        "latent, so their output may still differ there. The table shows these differences. In the pictures and "
-        "the tables of scenes, this part is copied from the given scene."
+        "latent, so their output may still differ outside the region. The table shows these differences. In the "
+        "pictures and the tables of scenes, everything outside the region is copied from the given scene."
     )
     pictures = Pictures("Scenes", shown, min(PER_ROW, 1 + num_variants), note)
     table = Table("Decoder errors outside the region", tuple(drift), [tuple(drift.values())], note=how)

@@ -1,4 +1,4 @@
-"""Describe the origin of a result: command, commit and machine, without host names and absolute paths."""
+"""Describe the origin of a result: command, commit and machine, but no host names or absolute paths."""
 
 from __future__ import annotations
 

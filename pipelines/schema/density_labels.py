@@ -13,7 +13,7 @@ from models.scene import DENSITIES
 
 @dataclass(frozen=True)
 class DensityThresholds:
-    """25th and 75th percentiles, over the training scenes, of a group's count and of its total volume."""
+    """Thresholds of a group: 25th and 75th percentiles of its count and its total volume in the training scenes."""
 
     count_p25: float
     count_p75: float

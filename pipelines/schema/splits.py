@@ -34,7 +34,7 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
 
     Then every train pose within 5 m (BEV) of a test pose becomes unused. Every test pose within 5 m of a train pose
     also becomes unused. The paper does not define the order of these two removals. In this code, both removals use the
-    splits from before the first removal. Both poses of a close pair therefore become unused.
+    original splits, which hold before the first removal. Both poses of a close pair therefore become unused.
 
     Args:
         positions_by_sequence: (p, 3) positions of each sequence in driving order (m), in one shared world frame. Pass

@@ -166,7 +166,7 @@ RASTERS = _make_schema(
 )
 
 REJECTS = _make_schema(
-    "One row per reject: a scene that preprocessing left out, or a drive that it could not read.",
+    "One row per reject: a scene that preprocessing excluded, or a drive that preprocessing could not read.",
     ("scene_id", pa.string(), "", "Name of the rejected scene; if frame is null, name of the rejected drive."),
     _SEQUENCE,
     ("frame",    pa.int64(),  "1; av2: ns", "Frame number (av2: timestamp); null if the whole drive is rejected."),

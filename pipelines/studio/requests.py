@@ -22,7 +22,7 @@ class OpenRequest(StudioRequest):
 
 
 class SamplingRequest(StudioRequest):
-    label: str = Field("", max_length=40)  # "": label of the scene, or first label of the model if it has none.
+    label: str = Field("", max_length=40)  # "": label of the scene; if there is none, the first label of the model.
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)
 

@@ -1,8 +1,8 @@
 """Sessions of the studio, without HTTP.
 
 A visitor generates, edits, inpaints and extends one scene, and can undo each step. Long operations run in threads. Only
-one of them runs at a time, regardless of the number of visitors. Long operations report their progress and can be
-cancelled.
+one long operation runs at a time, regardless of the number of visitors. Long operations report their progress and can
+be cancelled.
 """
 
 from __future__ import annotations

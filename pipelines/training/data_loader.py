@@ -1,8 +1,9 @@
-"""Load training batches from tables. Ray tasks read ahead. The order of the samples depends only on the seed.
+"""Load training batches from tables. Ray tasks read samples in advance.
 
-The order is fixed before the first sample is read. Each epoch visits the shards in random order and shuffles the rows
-within windows of a few shards. Each worker uses its rank and the step to compute the rows that it needs. A resumed run
-therefore continues with the next batch. Two workers together read the same samples as a single worker.
+The order of the samples depends only on the seed. The order is fixed before the first sample is read. Each epoch visits
+the shards in random order and shuffles the rows within windows of a few shards. Each worker uses its rank and the step
+to compute the rows that it needs. A resumed run therefore continues with the next batch. Two workers together read the
+same samples as a single worker.
 
 The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
 polls without pauses and holds the global interpreter lock of Python. On two cores, training steps then take four times
@@ -31,8 +32,8 @@ from pipelines.schema.tables import Shard, find_category_indices, list_ground_st
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
-AHEAD = 2  # Number of tasks that read ahead while the training uses the samples of another task.
-READER_CPUS = 0.5  # With more CPUs, a reader and a training worker would wait for each other on two cores.
+AHEAD = 2  # Number of tasks that read samples in advance, while the training uses the samples of another task.
+READER_CPUS = 0.5  # With more CPUs per reader, readers and training workers would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
 Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, stream places) -> stacked samples.
@@ -90,7 +91,7 @@ def shuffle_epoch(counts: tuple[int, ...], seed: int, epoch: int) -> tuple[np.nd
 
 
 def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: int, rank: int, world: int) -> Arrays:
-    """Read the samples of one rank in `count` consecutive global batches from batch `first`, in order."""
+    """Read, in order, the samples of one rank in `count` consecutive global batches, beginning with batch `first`."""
     shard, row = stream.positions(first * batch, count * batch)
     mine = (np.arange(count * batch) % batch) // (batch // world) == rank
     shard, row, place = shard[mine], row[mine], first * batch + np.flatnonzero(mine)
@@ -107,7 +108,9 @@ def read_samples(stream: Stream, read: Reader, first: int, count: int, batch: in
 def iterate_batches(
     stream: Stream, read: Reader, start_step: int, stop_step: int, rank: int = 0, world: int = 1
 ) -> Iterator[Arrays]:
-    """Yield the local batches of one worker for steps start_step .. stop_step - 1; AHEAD Ray tasks read ahead.
+    """Yield the local batches of one worker for steps start_step .. stop_step - 1.
+
+    AHEAD Ray tasks read the next samples in advance.
 
     Args:
         stream: Order of the samples.

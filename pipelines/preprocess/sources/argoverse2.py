@@ -29,7 +29,7 @@ SOURCE = "av2"
 SPLITS = ("train", "val")
 GROUND_CLASSES = ("road", "crossing")
 
-# The paper names only the seven groups. It does not state which of the 30 categories belong to each group.
+# The paper names only the seven groups. The paper does not state which of the 30 categories belong to each group.
 CATEGORY_LABELS = {
     "vehicle_big": (
         "BUS",
@@ -165,7 +165,7 @@ def _read_annotations(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_poses(path: Path, frame: np.ndarray) -> np.ndarray:
-    """Return city_from_ego (p, 3, 4) at the sorted timestamps frame (p,), in metres."""
+    """Return city_from_ego (p, 3, 4), in metres, at the timestamps `frame` (p,), which are sorted."""
     columns = _read_feather(path, integers=("timestamp_ns",), texts=(), numbers=(*QUATERNION, *TRANSLATION))
     for name in TRANSLATION:
         _check_range(path, name, columns[name], -MAX_COORDINATE_M, MAX_COORDINATE_M)

@@ -225,7 +225,10 @@ class _Table:
         return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
 
     def frames(self, missing: int | None = None) -> np.ndarray:
-        """Return frames (rows,) int64 >= 0. An absent frame becomes `missing`; if `missing` is None, it is an error."""
+        """Return frames (rows,) int64 >= 0.
+
+        An absent frame becomes `missing`. If `missing` is None, an absent frame raises an error.
+        """
         values = self._optional("frame")
         for row, value in enumerate(values):
             if value is None and missing is not None:
@@ -366,7 +369,7 @@ def _show(value: object) -> str:
     """Return a value as text for an error message, at most 40 characters."""
     if value is None:
         return "null"
-    # Python raises an error for the conversion of an integer with thousands of digits to text.
+    # Python cannot convert an integer with thousands of digits to text.
     shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of more than 40 digits"
     return shown if len(shown) <= 40 else f"{shown[:37]}..."
 
@@ -450,7 +453,7 @@ def _read_matrices(table: _Table) -> np.ndarray:
 def _is_text(value: object) -> bool:
     """Return whether a value is a str that files can store.
 
-    JSON escapes can produce half of a surrogate pair, which is not storable.
+    JSON escapes can produce a single half of a surrogate pair. Files cannot store this character.
     """
     return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
 

@@ -101,7 +101,7 @@ class SlabGround:
         """Return the triangles except undersides, and the slab of each triangle.
 
         Undersides are not needed: a vertical ray first hits the top or a side of an extruded slab. In KITTI-360's
-        format, the second half of a slab's vertices is the first half, shifted down.
+        format, the second half of a slab's vertices is a copy of the first half that is shifted down.
         """
         count = np.bincount(self.vertex_slab, minlength=len(self.slab_class))
         place = np.arange(len(self.vertex_slab)) - (np.cumsum(count) - count)[self.vertex_slab]

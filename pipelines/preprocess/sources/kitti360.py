@@ -72,8 +72,8 @@ HEADED_LABELS |= {"rider"}
 
 SPHERE_VERTICES = 63
 # Some objects occur twice, in two adjacent annotation windows. The sizes of the two copies agree to a micrometre. The
-# windows were registered separately. Real copies therefore differ by up to 0.4 m and 0.33 degrees. An object with a
-# larger shift is a different object. The same holds for a shift of more than half the object's size.
+# windows were registered separately. Real copies therefore differ by up to 0.4 m and 0.33 degrees. If the shift
+# exceeds DUPLICATE_SHIFT_M or half the size of the object, the two objects are different objects.
 DUPLICATE_SIZE_M = 1e-3
 DUPLICATE_SHIFT_M = 0.5
 DUPLICATE_TURN_RAD = 0.01
@@ -300,8 +300,8 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
 def _stream_objects(path: Path) -> Iterator[dict]:
     """Yield the fields of each <objectN> as a map from tag to element, and free the previous elements.
 
-    The function raises ValueError for a missing or malformed file. It also rejects files with a document type, because
-    entity bombs need one.
+    The function raises ValueError for a missing or malformed file. The function also rejects files with a document type
+    declaration, because entity bombs need such a declaration.
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:

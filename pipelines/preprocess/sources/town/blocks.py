@@ -1,7 +1,7 @@
 """Build the content of a block.
 
-Its sides have sidewalks and street furniture; its interior has houses, a park or a court. Positions are in local frames
-(land.py), in metres: s runs along the street, and t points away from the street.
+The sides of a block have sidewalks and street furniture. The interior has houses, a park or a court. Positions are in
+local frames (land.py), in metres: s runs along the street, and t points away from the street.
 """
 
 from __future__ import annotations

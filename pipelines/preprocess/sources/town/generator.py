@@ -200,7 +200,7 @@ def _make_poses(rng: np.random.Generator, route: Route, at: np.ndarray, land: La
 
 
 def _place_traffic(sheet: Sheet, rng: np.random.Generator, route: Route, at: np.ndarray, frame: np.ndarray) -> None:
-    """Add moving boxes: cars ahead and oncoming, a few trucks and bicycles, and pedestrians on the sidewalk.
+    """Add moving boxes: cars in both directions, a few trucks and bicycles, and pedestrians on the sidewalk.
 
     A track has boxes at a few successive poses. Each box belongs to the frame of one pose.
     """

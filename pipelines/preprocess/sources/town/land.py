@@ -254,7 +254,7 @@ def _cut(outline: np.ndarray, step: float) -> np.ndarray:
 
 
 def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
-    """Triangulate a simple counter-clockwise outline (n, 2), which need not be convex, into n - 2 index triples."""
+    """Triangulate a simple counter-clockwise outline (n, 2), convex or not, into n - 2 index triples."""
     points = outline.tolist()
 
     def turn(a: int, b: int, c: int) -> float:

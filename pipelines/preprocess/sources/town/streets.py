@@ -102,8 +102,8 @@ def lay_streets(
 ) -> tuple[Streets, list[tuple[int, int, int, int]]]:
     """Return streets with the specified spacings, and blocks as node ranges (i0, i1, j0, j1).
 
-    The share `missing` of the streets between two blocks is omitted. The two blocks then form one block, and the
-    junctions at the ends of the omitted street become T-junctions.
+    Some streets between two blocks are omitted; `missing` is their share. The blocks on both sides of an omitted street
+    form one block, and the junctions at its ends become T-junctions.
     """
     u = np.concatenate([[0.0], np.cumsum(spacing_u_m)])
     v = np.concatenate([[0.0], np.cumsum(spacing_v_m)])
