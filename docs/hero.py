@@ -50,7 +50,7 @@ def main() -> None:
     above = stack_pictures([render_3d(scene, WIDTH, HEIGHT) for scene in made.values()], 1)
     views = stack_pictures(draw_street_views(larger), 0)
     below = stack_pictures([render_3d(larger, 2 * WIDTH + GAP, len(views)), views], 1)
-    Path(__file__).with_name("pictures/hero.png").write_bytes(encode_png(stack_pictures([above, below], 0)))
+    (Path(__file__).parent / "pictures/hero.png").write_bytes(encode_png(stack_pictures([above, below], 0)))
 
 
 if __name__ == "__main__":

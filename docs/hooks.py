@@ -65,7 +65,7 @@ def write_api_page(page: str, packages: tuple[str, ...]) -> str:
     for path in list_modules(packages):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         summaries.append(f"* [`{module}`][{module}]: {read_summary(path)}")
-        sections.append(f"## `{module}`\n\n::: {module}\n    options: {{show_root_heading: false}}\n")
+        sections.append(f"::: {module}\n    options: {{heading_level: 2}}\n")
     return "\n".join([f"# {page}\n", *summaries, "", *sections])
 
 
@@ -171,6 +171,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "The pages are generated from the docstrings. `models` needs no Ray.",
         {page: ", ".join(f"`{path.stem}`" for path in list_modules(packages)) for page, packages in API.items()},
     )
+    for name in ("CONTRIBUTING", "CHANGELOG"):  # files of the repository root; links to docs/ are relative to it
+        pages[f"{name.lower()}.md"] = (ROOT / f"{name}.md").read_text().replace("](docs/", "](")
     pages |= execute_tutorials()
     for uri, content in pages.items():
         files.append(File.generated(config, uri, content=content))
@@ -180,3 +182,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Link to the executed page of a notebook, and drop the comments that tests read."""
     return re.sub(r"^<!-- (test|needs): .*-->\n", "", markdown.replace(".ipynb)", ".md)"), flags=re.MULTILINE)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Check that all references to the Python API were resolved, because mkdocs leaves others in the text.
+
+    Raises:
+        ValueError: The page refers to a module, class or function that the reference does not have.
+    """
+    if unresolved := re.findall(r"\[<code>([\w.]+)</code>\]\[\]", output):
+        raise ValueError(f"{page.file.src_uri}: unknown references {', '.join(unresolved)}")
+    return output
