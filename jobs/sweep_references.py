@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compute precision and recall for reference sets that differ in size and in the distance between poses.
+"""Compute precision and recall for reference sets of different size and pose spacing.
 
     jobs/sweep_references.py --real DIR --generated DIR
     jobs/sweep_references.py --real DIR --generated DIR --reference-sizes 1000 5000 --min-distances-m 1 2 5 10 --k 3 5
