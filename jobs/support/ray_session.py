@@ -35,7 +35,6 @@ def start_ray(training: bool = False) -> None:
 def run_packed(config: dict[str, bytes]) -> None:
     """Unpickle and call a function in a Ray Train worker.
 
-    Ray Train's controller also unpickles the training function. Because the function is packed, the controller does not
-    import the models.
+    The function is passed as bytes, so Ray Train's controller does not unpickle it and does not import the models.
     """
     cloudpickle.loads(config["packed"])()
