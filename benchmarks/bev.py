@@ -26,7 +26,7 @@ from pipelines.schema.scene_subset import SceneSubset
 
 ROUNDS = 7
 SCENES = 32
-PICTURES, CORES = 50_000, 2  # number of pictures in an evaluation at the paper's scale; number of cores
+PICTURES, CORES = 50_000, 2  # for an estimate of the time of a large evaluation
 
 
 def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
@@ -43,7 +43,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
     height, class_id = (
         np.kron(raster, np.ones((supersample, supersample), raster.dtype)) for raster in (height, class_id)
     )
-    # Draw boxes before ellipsoids and start with the last box. A later primitive is drawn only where it is higher.
+    # Draw boxes from last to first, then ellipsoids from last to first. A primitive replaces only lower content.
     for i in sorted(range(len(scene)), key=lambda i: (scene.category[i] == ELLIPSOID, -i)):
         center, rotation, half = (part[i].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m / 2))
         reach = np.abs(rotation) @ half
@@ -55,7 +55,7 @@ def render_plainly(scene: Scene, supersample: int) -> np.ndarray:
             continue
         part = slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
         dx, dy = (x[part[0]] - center[0])[:, None, None], (y[part[1]] - center[1])[:, None]
-        # The vertical line through a pixel is foot + z along, in units of the half axes of the primitive.
+        # In units of the primitive's half axes, the vertical line through a pixel has the points foot + z * along.
         foot, along = (dx * rotation[0] + dy * rotation[1]) / half, rotation[2] / half
         with np.errstate(divide="ignore", invalid="ignore"):
             if scene.category[i] == ELLIPSOID:

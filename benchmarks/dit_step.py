@@ -81,7 +81,9 @@ def compare(name: str, ours: DiT, plain: PlainDiT, theirs: DiTTransformer2DModel
     for way, found in seconds.items():
         print(f"{name}, batch {batch}, {way}: {spread(found, 1e3, 0)} ms")
     for way in list(ways)[1:]:
-        print(f"{name}, batch {batch}: ours takes {format_ratios(seconds['ours'], seconds[way], 2)} the time of {way}")
+        print(
+            f"{name}, batch {batch}: time of ours / time of {way} = {format_ratios(seconds['ours'], seconds[way], 2)}"
+        )
 
 
 def main(config: Config) -> None:

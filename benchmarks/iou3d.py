@@ -99,13 +99,13 @@ def time_whole_scenes() -> None:
             print(
                 f"{name}, {kind}: "
                 f"{spread([1e-6 * count / s for s in seconds], 1, 1)} million pairs/s/core (including excluded pairs), "
-                f"{100 * survive / count:.1f} % of {count} computed, {spread(per_scene, 1, 1)} ms per scene"
+                f"{100 * survive / count:.1f} % of {count} pairs computed, {spread(per_scene, 1, 1)} ms per scene"
             )
 
 
 def print_errors() -> None:
     """Print errors against manifold3d, or against half-space intersection if manifold3d exceeds the tolerance."""
-    print(f"{'case':36s} pairs   ours: median, largest error   off by > {TOLERANCE:g}   manifold3d off")
+    print(f"{'case':36s} pairs   our error: median, largest   error > {TOLERANCE:g}   same for manifold3d")
     total = wrong = 0
     for name, (a, b) in pairs(np.random.default_rng(0)).items():
         ours, oracle = compute_iou3d_pairs(a, b), manifold_iou(a, b)

@@ -102,7 +102,7 @@ def main(config: Config) -> None:
                 f"{part} {spread([r[part] for r in found], 1e3, 0)}" for part in found[0] if part != "loss"
             )
             print(f"{name}, batch {batch_size}, {way}: step {spread(total[way], 1e3, 0)} ms: {parts}")
-        print(f"{name}: the plain version takes {format_ratios(total['plain'], total['ours'], 2)} the time of ours")
+        print(f"{name}: time of the plain version / time of ours = {format_ratios(total['plain'], total['ours'], 2)}")
 
 
 if __name__ == "__main__":

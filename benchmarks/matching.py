@@ -49,7 +49,10 @@ def main() -> None:
     noise = torch.randn(truth.features.shape, generator=generator)
     for name, features in (
         ("untrained", torch.rand(truth.features.shape, generator=generator)),
-        ("trained (truth, shuffled, noise of 0.02)", shuffle_slots(truth.features + 0.02 * noise, spec, generator)),
+        (
+            "like trained (shuffled truth with noise of 0.02)",
+            shuffle_slots(truth.features + 0.02 * noise, spec, generator),
+        ),
     ):
         logit = torch.randn(truth.real.shape, generator=generator)
         given = (features, logit, truth.features, truth.real, spec.slots, spec.slots, PAPER_WEIGHTS)

@@ -86,7 +86,7 @@ def main(config: Config) -> None:
         for first, second in make_pairs(seed, config.pairs, lvae.spec):
             for way, found in compare(lvae, first, second).items():
                 sums.setdefault(way, []).append(found)
-    print(f"{len(sums['copy'])} pairs of {len(config.seeds)} towns, known half of the second block")
+    print(f"{len(sums['copy'])} pairs of blocks in {len(config.seeds)} towns; known half of the second block")
     for way, found in sums.items():
         print(f"{way}:", ", ".join(f"{name} {value:.4g}" for name, value in compute_drift_scores(found).items()))
 

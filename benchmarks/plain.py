@@ -115,7 +115,7 @@ def sum_cost(features, logit, truth, real, assignment, slots, proposals, weights
             chosen = assignment[sample, mine].numpy()
             cols = np.flatnonzero(chosen >= 0)
             total += cost[chosen[cols] - slot, cols].sum()
-            # The cost of a padded row does not depend on the assignment of other rows.
+            # All padded rows have equal costs, so their order does not change the sum.
             padding = int(real[sample, theirs].sum())
             rest = np.flatnonzero(chosen < 0)
             total += cost[padding:, :][:1, rest].sum() if len(rest) else 0.0

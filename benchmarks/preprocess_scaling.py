@@ -32,7 +32,7 @@ from pipelines.preprocess.sharding import ShardTask, plan_kitti360
 from pipelines.preprocess.sources import kitti360
 from pipelines.schema.tables import find_shards
 
-FULL_POSES, FULL_LOGS = 80_000, 1_000  # KITTI-360, and Argoverse 2 with two logs per shard
+FULL_POSES, FULL_LOGS = 80_000, 1_000  # poses of KITTI-360; logs of Argoverse 2, two per shard
 
 
 @dataclass(frozen=True)

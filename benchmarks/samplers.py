@@ -18,7 +18,7 @@ from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, SchedulerMixin
 from models.sampling.diffusion import Diffusion, sample_with_scheduler
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 
-DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # standard deviations of the data; latents have components of all these sizes
+DEVIATIONS = (0.02, 0.1, 0.3, 1.0)  # standard deviations of the data, as in components of the latents
 STEPS = (10, 20, 25, 50)
 
 

@@ -109,7 +109,7 @@ class Relabel(SelectOptions):
     to: str = "object"
     """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids."""
     class_name: str | None = None
-    """New class name, in the terms of the source (default: the class name of the category)."""
+    """New class name, one of the source's own labels (default: the name of the category)."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Repair(SelectOptions):
     where: str = "true"
     """Select primitives by an SQL condition on columns of the primitives table."""
     slab_offset_m: float = 0.3
-    """Height in metres of the stored ground above the real surface, as for snap."""
+    """Height in metres of the stored ground above the real surface, as for the edit `snap`."""
     ground: Literal["both", "floating", "sunken", "none"] = "both"
     """Objects to put on the ground."""
     max_push_m: float = 0.25

@@ -34,7 +34,7 @@ class Config(RePaintOptions):
     margin_m: float = 1.0
     """Margin around --primitives in metres."""
     invert_region: bool = False
-    """Regenerate the area outside the region instead of the region."""
+    """Regenerate the area outside the region instead of the area inside it."""
     contents: Literal["both", "ground", "objects"] = "both"
     """Content to regenerate in the region."""
     num_variants: int = 1

@@ -39,7 +39,8 @@ class Config:
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     start_from: str = ""
-    """Initialise with the weights of this pipeline, named as for --model of other jobs (default: random weights)."""
+    """Initialise with the weights of this pipeline; all values that --model of other jobs accepts are valid (default:
+    random weights)."""
     steps: int | None = None
     """Number of training steps (default: as in the preset)."""
     batch_size: int | None = None

@@ -37,8 +37,8 @@ class Config:
     output: str = ""
     """Directory to write the trained model to (default: $PRITTI_HOME/models/<name>)."""
     train_object_decoder_of: str = ""
-    """Train only a new object decoder for this pipeline, named as for --model of other jobs (default: train all
-    parts)."""
+    """Train only a new object decoder, for this pipeline; all values that --model of other jobs accepts are valid
+    (default: train all parts)."""
     num_workers: int = 1
     """Number of Ray Train workers; use one per GPU."""
     steps: int | None = None

@@ -169,7 +169,7 @@ class ConfiguredModel(nn.Module):
             model.load_state_dict(state)
         except RuntimeError as error:
             raise ValueError(
-                f"{path / WEIGHTS_NAME}: the weights do not fit the {CONFIG_NAME} next to them: {error}"
+                f"{path / WEIGHTS_NAME}: the weights do not fit the {CONFIG_NAME} in the same directory: {error}"
             ) from error
         return (model if torch_dtype is None else model.to(torch_dtype)).eval()
 

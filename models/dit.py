@@ -161,7 +161,7 @@ class DiT(ConfiguredModel):
         self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
         alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
-        self.register_buffer("noise_shares", shares, persistent=False)  # Factors of the latent and of v.
+        self.register_buffer("noise_shares", shares, persistent=False)  # Weights of the latent and of v in the noise.
         self.init_weights()
 
     @classmethod

@@ -29,7 +29,7 @@ INITIAL_LOGVAR = -4.0
 SOLVED_LOGVAR = -8.0  # Sigma 0.018, for a ground branch with a shortcut (models/vae/ground.py).
 
 BRANCHES = ("both", "ground", "objects")
-OBJECT_DECODER = "object_decoder."  # Prefix of the names of its parameters.
+OBJECT_DECODER = "object_decoder."  # Prefix of the object decoder's parameter names.
 EMPTY_LOGIT = -6.0  # Occupancy logit of a model without a ground branch.
 
 

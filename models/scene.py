@@ -209,7 +209,7 @@ def make_yaw_rotation(yaw_rad: np.ndarray | float) -> np.ndarray:
     return np.stack(rows, -2)
 
 
-UNSET = np.zeros(0)  # Placeholder. `Scene` replaces it by an array of defaults.
+UNSET = np.zeros(0)  # Placeholder that `Scene` replaces by an array of defaults.
 
 
 @dataclass(frozen=True, eq=False)

@@ -290,7 +290,8 @@ class Trainer:
         self.model, self.wrapped, self.loss = model, wrapped or model, loss
         self.settings, self.device, self.execution = settings, device, execution or ExecutionConfig()
         self.parameters = {name: p for name, p in model.named_parameters() if p.requires_grad}
-        rates = getattr(model, "learning_rate_factors", dict)()  # Maps prefixes of parameter names to factors.
+        # Maps prefixes of parameter names to factors of the learning rate.
+        rates = getattr(model, "learning_rate_factors", dict)()
         share = {n: next((v for part, v in rates.items() if n.startswith(part)), 1.0) for n in self.parameters}
         groups = [
             {"params": [p for n, p in self.parameters.items() if share[n] == value], "share": value}

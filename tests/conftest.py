@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-# Some virtual machines report AMX but do not support it. There oneDNN fails with an illegal instruction in bfloat16.
+# Some virtual machines report AMX but do not support it. On these machines, oneDNN fails in bfloat16 with an illegal
+# instruction.
 os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE_FP16")
 
 from jaxtyping import install_import_hook
 
-UNCHECKED = "pipelines.preprocess.sources.town.land"  # it calls a short function millions of times
+UNCHECKED = "pipelines.preprocess.sources.town.land"  # this module calls a short function millions of times
 
 
 def list_checked_modules() -> list[str]:

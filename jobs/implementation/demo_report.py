@@ -104,8 +104,8 @@ def make_introduction_sections(
             [
                 "This demo trained a layout VAE and a diffusion transformer from random weights on a procedural "
                 f"town. The whole run took {minutes:.1f} minutes on this machine. The page shows real scenes, and "
-                "generated scenes below them. The method is the paper's, but the models are small and the training is "
-                "short. Longer training gives better scenes.",
+                "generated scenes below them. The method follows the paper, but the models are small and the "
+                "training is short. Longer training gives better scenes.",
             ],
         ),
         KeyFigures(
@@ -133,7 +133,7 @@ def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene
             draw_scene_pictures(
                 "Scenes of the released model",
                 "These weights are included in the package (models/weights/town). "
-                "The training of these weights was longer than the demo's.",
+                "The training of these weights took longer than the training of this demo.",
                 select_one_per_label(list(read_scenes(home_path("released"), "generated-samples")), SHOWN),
                 "generated",
             )

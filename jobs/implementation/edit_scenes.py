@@ -34,7 +34,7 @@ def read_edits(config: SelectOptions | Replay) -> list[edit.Edit]:
     """
     if isinstance(config, Replay):
         if not config.edits:
-            raise ValueError("replay needs a JSON file with the list of edits")
+            raise ValueError("the command `replay` needs a JSON file with the list of edits")
         content = storage.read_json(make_absolute(config.edits))
         content = content.get("edits") if isinstance(content, dict) else content
         try:

@@ -159,7 +159,7 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     ]
     drawn = "" if config.supersample == 1 else f"; each pixel is the mean of {config.supersample**2} samples"
     words.append(
-        f"Scenes are drawn from above with 256 x 256 pixels, in class colours without shading, on white{drawn}."
+        f"Each picture shows a scene from above: 256 x 256 pixels, class colours, no shading, white background{drawn}."
     )
     return [*words, describe_weights(looks.inception)] if looks.inception else words
 

@@ -140,7 +140,7 @@ def read_history(experiment: str, stage: str, model: torch.nn.Module) -> list[Tr
     parameters = sum(value.numel() for value in model.parameters())
     runs = [find_training(experiment, stage, digest_weights(model), parameters)]
     while start := runs[0].options.get("start_from"):
-        runs.insert(0, find_training(experiment, stage, start, None))  # the network of the earlier run may differ
+        runs.insert(0, find_training(experiment, stage, start, None))  # None: the earlier network may have another size
     name = experiment.removeprefix("pritti-")
     later = [replace(run, name=f"{name}-{k}", stage=f"{stage}, run {k}") for k, run in enumerate(runs[1:], 2)]
     return [replace(runs[0], name=name), *later]

@@ -60,7 +60,7 @@ def run_sweep(config: Config) -> list[dict]:
         "Features: Inception pool3."
         if config.inception
         else "Features: a fixed untrained network, without Inception weights.",
-        "Brackets contain 95 % confidence intervals over scenes, with fixed neighbourhoods.",
+        "Brackets contain 95 % confidence intervals over scenes. The intervals keep the neighbourhoods fixed.",
     ]
     texts = {"sweep.html": render_sweep_html(rows, how)}
     for name, chart in zip(("apart", "farthest"), draw_sweep_charts(rows), strict=True):

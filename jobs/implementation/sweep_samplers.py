@@ -110,7 +110,7 @@ def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> fl
 
     def advance(row: dict) -> None:
         bar.advance(shown, row["scenes"])
-        if row["seconds"]:  # the value is 0 if an interrupted run wrote the shard
+        if row["seconds"]:  # the time is 0 if an earlier, interrupted run wrote the shard
             times[str(row["id"])] = [row["seconds"], row["scenes"]]
             storage.write_json(times, record)
 

@@ -15,7 +15,7 @@ import tyro
 
 from jobs.support.renames import find_renamed
 
-# Environment variables that Ray reads at import and at start. Values of the user are kept.
+# Environment variables that Ray reads at import and at start. Variables that the user has set keep their values.
 RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",

@@ -25,7 +25,7 @@ def start_ray(training: bool = False) -> None:
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False
-    context.raise_original_map_exception = True  # keep the type of a worker's ValueError for `find_root_cause`
+    context.raise_original_map_exception = True  # `find_root_cause` needs the type of a worker's error
     logging.getLogger("ray.data").setLevel(logging.WARNING)
     logging.getLogger("ray.data._internal.progress").setLevel(logging.ERROR)  # the jobs show progress bars
     for name in ("exceptions", "_internal.execution.streaming_executor_state"):  # Ray also raises these errors

@@ -32,7 +32,7 @@ from pipelines.training.data_loader import READER_CPUS, Reader, Stream, iterate_
 from pipelines.training.latents import digest_weights
 
 Wrap = Callable[[torch.nn.Module], torch.nn.Module]
-RETRIES = 2  # restarts from the last checkpoint after a worker failure
+RETRIES = 2  # maximum number of restarts from the last checkpoint after worker failures
 
 
 @dataclass(frozen=True)

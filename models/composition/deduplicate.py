@@ -12,12 +12,12 @@ from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
 from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 
 # NMS threshold per category: two objects of the same category are duplicates if their IoU3D is higher. In the town's
-# 1,000 held-out scenes, the IoU3D of two vehicles is at most 0.04 and that of two buildings at most 0.1. If they were
-# used there, the thresholds would remove 4.6 % of fences, 3.4 % of signs, 2.2 % of poles and 0.8 % of other objects.
+# 1,000 held-out scenes, the IoU3D is at most 0.04 for two vehicles and at most 0.1 for two buildings. In these scenes,
+# the thresholds would remove 4.6 % of fences, 3.4 % of signs, 2.2 % of poles and 0.8 % of other objects.
 DUPLICATE_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
-DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # Tree crowns overlap. Used only at borders of known regions.
+DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # Tree crowns overlap. The value applies only at borders of known regions.
 DUPLICATE_IOU3D[list(VEHICLES)] = 0.05
-REGENERATED_IOU3D = 0.05  # A known object and its displaced copy exceed this IoU3D.
+REGENERATED_IOU3D = 0.05  # The IoU3D of a known object and its displaced copy is higher.
 
 
 def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:

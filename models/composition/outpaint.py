@@ -29,7 +29,7 @@ from models.sampling.repaint import RePaintConfig
 from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
 from models.tensors import make_empty_scene
 
-BlockIndex = tuple[int, int]  # (i, j): steps ahead of block (0, 0), and steps to its left.
+BlockIndex = tuple[int, int]  # (i, j): i steps ahead of block (0, 0), j steps to the left.
 EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
@@ -432,7 +432,7 @@ def generate_blocks(
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
     stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
     repaint = repaint or RePaintConfig()
-    if all(condition.is_empty for condition in conditions):  # Without a known part, resampling has no effect.
+    if all(condition.is_empty for condition in conditions):  # Without a known region, resampling has no effect.
         repaint = replace(repaint, resamplings=1, pseudoinverse_guidance=0.0)
     latents = model.inpaint_latents(
         stacked,

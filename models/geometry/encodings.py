@@ -44,7 +44,7 @@ from models.geometry.cholesky import (
 )
 
 TRACE_PART = 3 / 5  # Mean of sum_j (v_j . x)^4 over the unit sphere.
-STARTS, ROUNDS = 4, 12  # Number of starts and of iterations of the axis search (checked by a test).
+STARTS, ROUNDS = 4, 12  # Numbers of starts and of iterations of the axis search; a test checks them.
 
 
 class Encoding(NamedTuple):

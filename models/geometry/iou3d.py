@@ -24,7 +24,7 @@ import numpy as np
 from models.scene import Scene
 
 GROWTH = 1e-9  # Enlargement of B as a fraction of the largest extent of the pair.
-PARALLEL = 1e-12  # Two faces count as parallel if the sine of their angle is smaller.
+PARALLEL = 1e-12  # Two faces count as parallel if the sine of their angle is below this value.
 PAIRS_PER_CHUNK = 4096  # The fastest of the tested values (256 to 16384) on two AVX2 cores.
 BALL_POINTS = 4096
 CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))

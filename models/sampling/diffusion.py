@@ -205,7 +205,7 @@ def make_keyed_generator(*key: int) -> torch.Generator:
     Returns:
         A new generator.
     """
-    # SeedSequence returns the same state for [a] and [a, 0]. The length of the key makes them differ.
+    # SeedSequence returns the same state for [a] and [a, 0]. The length of the key makes the two states differ.
     state = np.random.SeedSequence([len(key), *(k & 0xFFFFFFFF for k in key)]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 

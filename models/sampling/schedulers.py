@@ -27,9 +27,9 @@ DDPM_CONFIG = {
     "rescale_betas_zero_snr": False,
 }
 
-# Class and options of each sampler. DPM-Solver++ uses timesteps that are uniform in log signal-to-noise ratio. They
-# were tested on a Gaussian distribution with a tenth of the latent's standard deviation. With 20 of these timesteps,
-# the standard deviation of samples is 93 % of the true value. With 20 timesteps that are uniform in time, it is 31 %.
+# Class and options of each sampler. DPM-Solver++ uses timesteps that are uniform in log signal-to-noise ratio. A test
+# samples a Gaussian distribution with a tenth of the latent's standard deviation. With 20 of these timesteps, the
+# samples have 93 % of the true standard deviation. With 20 timesteps that are uniform in time, they have 31 %.
 SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ddpm": ("DDPMScheduler", {"timestep_spacing": "leading"}),
     "ddim": ("DDIMScheduler", {"timestep_spacing": "leading"}),
@@ -78,7 +78,7 @@ class SchedulerConfig:
         Raises:
             ValueError: diffusers has no scheduler with this name.
         """
-        import diffusers  # This import takes seconds. DDPM does not need it.
+        import diffusers  # DDPM does not need this import, which takes seconds.
         from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
         kind: Any = getattr(diffusers, self.class_name, None)

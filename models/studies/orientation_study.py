@@ -35,8 +35,8 @@ from models.vae.outputs import Posterior
 
 GRID, LATENT_CHANNELS = 2, 16
 NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
-MARGIN = 0.05  # Margin at both ends of an entry's range, because a sigmoid does not reach 0 and 1.
-STILL, LEAST_RANGE = 1e-6, 1.0  # If the range of an entry is below STILL, LEAST_RANGE replaces it.
+MARGIN = 0.05  # Margin at both ends of an encoded number's range, because a sigmoid does not reach 0 and 1.
+STILL, LEAST_RANGE = 1e-6, 1.0  # If the range of an encoded number is below STILL, LEAST_RANGE replaces it.
 
 
 # ------------------------------------------------------------------------------------------------------- boxes

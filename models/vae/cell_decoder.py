@@ -21,7 +21,7 @@ from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
-REACH_CELLS = 0.5  # Largest distance of a proposal's centre from its cell (in cells).
+REACH_CELLS = 0.5  # Largest distance of a proposal's centre from the border of its cell (in cells).
 MAX_PER_CELL = 4
 SPARE = 16  # Proposals per slot. The number is high because many primitives can lie in one cell.
 

@@ -80,7 +80,7 @@ class LayoutVAEConfig:
     branches: Branches = "both"
 
 
-# Maps flat names of versions before 0.2 to the branch and the current name.
+# Maps the flat option names of versions before 0.2 to a branch and the current name.
 _FLAT_NAMES = {
     **{name: ("ground", name) for name in ("channels", "norm_groups", "attention")},
     "fold": ("ground", "pixel_unshuffle"),

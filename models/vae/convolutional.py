@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-EPSILON = 1e-6  # Used by every group normalisation.
+EPSILON = 1e-6  # Epsilon of every group normalisation.
 
 
 class ResnetBlock(nn.Module):

@@ -12,7 +12,8 @@ from torch.nn import functional as F
 from models.vae.config import GroundConfig
 from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
 
-# Candidates for the factor from signed distance (pixels) to occupancy logit. `init_from_data` selects the best.
+# Candidates for the factor that converts a signed distance (pixels) to an occupancy logit. `init_from_data` selects
+# the best.
 LOGITS_PER_PX = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 HEIGHT_WEIGHT = 10.0  # Weight of normalised heights in `init_from_data`; signed distances have weight 1.
 
@@ -129,7 +130,7 @@ def init_from_data(
         )
         for logit in LOGITS_PER_PX
     }
-    # Factors from smooth maps to outputs of the decoder.
+    # Factors that convert smooth maps to outputs of the decoder.
     unit = torch.cat(
         [heights, min(error, key=lambda logit: float(error[logit])) * compute_edge_reach_px(cell) * distances]
     )

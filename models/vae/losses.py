@@ -16,7 +16,7 @@ from models.vae.outputs import LayoutOutput, Posterior
 
 OCCUPANCY_WEIGHT, HEIGHT_WEIGHT, KL_WEIGHT = 1.0, 9.0, 1e-6
 
-# Paper, supplement Tab. "object loss weights": existence, centre, Cholesky.
+# Weights of the losses of existence, centre and Cholesky parameters (paper, supplement Tab. "object loss weights").
 LOW, MEDIUM, HIGH = (1.0, 3.0, 2.0), (3.0, 9.0, 7.0), (5.0, 15.0, 12.0)
 OBJECT_WEIGHTS = {
     "vehicle_big": LOW,

@@ -24,7 +24,7 @@ ROUNDS = 4
 DIRECTIONS = 24
 STEPS = 20  # Number of displacement lengths to try.
 PAIRS_AT_ONCE = 256  # Number of pairs that are processed together (50 MB).
-CANDIDATES = 6  # Number of displacements per pair, shortest first, that are tested against all other primitives.
+CANDIDATES = 6  # Number of displacements per pair (the shortest) that are tested against all other primitives.
 
 
 GroundFaults = Literal["both", "floating", "sunken", "none"]
@@ -148,7 +148,7 @@ class _Separation:
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
         found = parted(within & parted(longest).any(axis=2, keepdims=True))
-        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS: no displacement.
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none.
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]

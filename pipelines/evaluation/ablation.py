@@ -34,7 +34,7 @@ from pipelines.runtime.ray_tasks import map_dataset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
-SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Bins of width / length; "any" boxes also have a score per bin.
+SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Edges of bins of width / length; "any" boxes also have a score per bin.
 
 
 def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray:
@@ -277,15 +277,15 @@ BRANCHES = {
     "without objects": Variant({"branches": "ground"}),
     "without ground": Variant({"branches": "objects"}),
 }
-# The paper's DETR decoder has the same branches and latents as the cell decoder. It diverges at the learning rate that
-# the cell decoder uses.
+# Both decoders use the same branches and latents. The paper's DETR decoder diverges at the learning rate of the cell
+# decoder.
 DECODERS = {
     "cells": Variant({"objects": {"decoder": "cells"}}),
     "DETR": Variant({"objects": {"decoder": "detr"}}, {"learning_rate": 5e-4}),
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
-# Variants with only the ground branch. The preset town uses pixel unshuffle by 8 and channels (32,).
-# models/vae/ground.py explains the linear start.
+# Variants with only the ground branch. The preset `town` has the options `pixel_unshuffle=8` and `channels=(32,)`.
+# The linear start (option `shortcut`) comes from a principal component analysis of the data (models/vae/ground.py).
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {

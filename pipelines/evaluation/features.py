@@ -30,7 +30,7 @@ READER_CPUS = 0.5
 PICTURES_PER_PART = 512
 VERSION = 1  # Version of the features; files with another version are computed again.
 PICTURE_PX = 256  # Paper, Sec. 4.1, Metrics.
-# Types of the columns except scene_id. Each entry is a list of numbers.
+# Types of the numbers in each column except scene_id. A column contains one list of numbers per scene.
 FEATURE_TYPES = {
     "statistics": np.float64,
     "histograms": np.uint32,

@@ -50,7 +50,7 @@ from pipelines.training.latents import load_lvae
 
 Chunk = tuple[Shard, list[int]]  # A shard and some of its rows.
 AP_VARIANTS = {
-    "ranked": {},  # Minimum existence probability for AP3D: all proposals are ranked.
+    "ranked": {},  # AP3D ranks all proposals, without a minimum existence probability.
     "ranked_100": {"max_detections": MAX_DETECTIONS},
     "threshold": {"min_score": EXISTENCE_THRESHOLD},
     "threshold_100": {"min_score": EXISTENCE_THRESHOLD, "max_detections": MAX_DETECTIONS},

@@ -19,7 +19,7 @@ MEASURES = {
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
-    "count_ratio": (("count_ratio",), "count ratio of the category that differs most from 1", "one"),
+    "count_ratio": (("count_ratio",), "count ratio of one category, the ratio farthest from 1", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
 COMMON = 3.0  # Minimum number of objects per scene. Categories with fewer objects vary too much.

@@ -19,7 +19,7 @@ from pipelines.runtime.ray_tasks import flat_map_dataset
 from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
-BLOCK_M = 64.0  # Side of the middle block of an outpainted scene.
+BLOCK_M = 64.0  # Side length of the middle block of an outpainted scene.
 MEANINGS = {
     "class_changes": "share of pixel pairs across the line with different ground classes",
     "height_step": "mean height difference of the ground at the line",

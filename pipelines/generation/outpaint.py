@@ -385,7 +385,7 @@ def run_batches(
     workers: list[Any] = [actor.remote(request, chosen) for _ in range(count)]
     try:
         schedule_batches(workers, waiting, done, on_blocks)
-    finally:  # The traceback of an error references the actors. Without ray.kill, they would keep their CPUs.
+    finally:  # The traceback of an error references the actors. Without ray.kill, the actors would keep their CPUs.
         for worker in workers:
             ray.kill(worker)
 

@@ -14,7 +14,7 @@ from models.scene import Grid
 
 # A pixel centre within this distance of an edge counts as inside. This prevents gaps between adjacent triangles.
 EDGE_PX = 1e-7
-# If the slope of a triangle (m per pixel) exceeds STEEP, its hits are clamped to the height range of the triangle.
+# If the slope of a triangle (m per pixel) exceeds STEEP, the heights of its hits are clamped to its height range.
 STEEP = 1e3
 
 

@@ -44,7 +44,7 @@ PRECEDENCE = (
     "construction_big",
 )
 EDGE_M = 1e-9  # A voxel centre within this distance of a primitive's boundary counts as inside.
-LEVEL_AXIS = 1e-12  # An axis with a smaller |z| counts as horizontal.
+LEVEL_AXIS = 1e-12  # An axis whose |z| is below this value counts as horizontal.
 NUM_CLASSES = len(CLASS_COLORS)
 CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
 MAX_LEVELS = 64  # Number of bits in the integer of a column.

@@ -24,7 +24,7 @@ from models.scene import CATEGORIES, ELLIPSOID, Scene
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, COLOR_HEX, EMPTY, list_ground_ids
 
 GROUND = -1  # Value of `primitive` for a ground triangle.
-ABOUT = (  # Scene-level fields in the extras of a file.
+ABOUT = (  # Fields of the scene in the `extras` of a glTF file.
     *("scene_id", "source", "sequence", "frame", "split", "world_xyz_m", "world_yaw_rad"),
     *("vegetation_density", "vehicle_density", "ground_classes"),
 )
@@ -266,7 +266,7 @@ def _make_unit_mesh(category: int) -> trimesh.Trimesh:
 
 
 def _paint_mesh(vertices_m: np.ndarray, triangles: np.ndarray, class_id: np.ndarray) -> trimesh.Trimesh:
-    # The material is white, because a viewer multiplies its colour by the vertex colour.
+    # The material is white, because a viewer multiplies the material's colour by the vertex colour.
     visual = trimesh.visual.TextureVisuals(material=_make_material("ground", EMPTY))
     opaque = np.full((len(vertices_m), 1), 255, np.uint8)
     visual.vertex_attributes["color"] = np.hstack([_convert_to_linear(CLASS_COLORS)[class_id], opaque])

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from models.scene import ELLIPSOID, Grid
 from pipelines.schema.palette import CATEGORY_IDS, CLASS_COLORS, CLASS_ID, EMPTY, GROUND_CLASS_ID
 
-COLOR_TOLERANCE = 12  # Tolerance per channel (0 to 255). Dark colours have errors of up to 7 as 8-bit linear light.
+COLOR_TOLERANCE = 12  # Tolerance per channel (0 to 255). Dark colours in 8-bit linear light have errors of up to 7.
 FAR = 64  # The colour distance of a vertex is clipped to this value when sRGB and linear light are compared.
 ON_GRID_PX = 0.02  # Maximum distance of a ground vertex from a pixel's corner or centre.
 MAX_MIXED = 0.5  # Maximum share of ground vertices whose colour lies between two classes.
-VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # The two classes have the same colour.
+VEGETATION = (int(CATEGORY_IDS[0]), int(CATEGORY_IDS[ELLIPSOID]))  # Both vegetation classes have the same colour.
 CLASS_IDS = np.array(sorted(set(CLASS_ID.values()) - {VEGETATION[1]}))
 IS_GROUND = np.isin(np.arange(len(CLASS_COLORS)), list(GROUND_CLASS_ID.values()))
 
@@ -154,7 +154,7 @@ def _find_primitives(
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[np.ndarray]]:
     """Return corners_m (b, 8, 3) and class ids (b,) of the boxes, and the vertices of each ellipsoid."""
     piece = _split_connected(faces, len(points_m))
-    if (np.bincount(piece) < 8).any():  # The mesh repeats vertices along edges. Merge vertices at the same position.
+    if (np.bincount(piece) < 8).any():  # Merge vertices that the mesh repeats along edges.
         keys, place = np.unique(np.column_stack([points_m, class_id]), axis=0, return_inverse=True)
         points_m, class_id, faces = keys[:, :3], keys[:, 3].astype(np.int64), place.ravel()[faces]
         piece = _split_connected(faces, len(points_m))

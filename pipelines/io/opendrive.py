@@ -23,7 +23,7 @@ KNOT_M = 5.0  # Distance between points of a reference line.
 LANE_M = 3.5  # Approximate lane width, which determines the number of lanes per side.
 LEAST_ROAD_M = 2.0  # Minimum length of a road between two junctions.
 CLEAR = 1.3  # Distance from a node to the road ends, as a multiple of the half width of the widest road.
-SAMPLES = 64  # Number of samples per cubic curve for the measurement of its length.
+SAMPLES = 64  # Number of samples that measure the length of a cubic curve.
 
 
 @dataclass(frozen=True, eq=False)

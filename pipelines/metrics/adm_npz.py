@@ -168,7 +168,7 @@ def read_reference_moments(path: str) -> ReferenceMoments | None:
 def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
     with _read_array(archive, name, path) as (stream, found, dtype):
         if found != shape or dtype.kind != "f":
-            raise ValueError(f"{path}: {name} is {dtype} {found}, but features of this network need floats {shape}")
+            raise ValueError(f"{path}: {name} has type {dtype} and shape {found}, expected floats of shape {shape}")
         numbers = np.frombuffer(stream.read(), dtype).reshape(shape).astype(np.float64)
     if not np.isfinite(numbers).all():
         raise ValueError(f"{path}: {name} holds NaN or infinite numbers")

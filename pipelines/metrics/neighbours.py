@@ -19,10 +19,10 @@ from torch import Tensor
 from pipelines.metrics.frechet import check_features
 
 BLOCK_ROWS = 1024  # Rows per block of the distance matrix; a block takes 4 kB per column.
-SPARE_NEIGHBOURS = 8  # Additional candidates; their upper bounds limit the k-th distance.
-PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances: 2 MB at 2048-d, which fits into a processor cache.
+SPARE_NEIGHBOURS = 8  # Number of additional candidates, whose upper bounds limit the k-th distance.
+PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances; a block (2 MB at 2048-d) fits into a cache.
 BASIS_SAMPLES = 512  # Number of samples from which the principal axes are computed.
-KEPT_VARIANCE = 0.997  # Share of the variance that the axes hold. With more axes, fewer pairs are verified.
+KEPT_VARIANCE = 0.997  # Share of the variance along the principal axes; more axes need fewer exact distances.
 MOST_LEFT_OVER = 0.02  # Maximum share of variance in the residual; otherwise, whole features are used.
 FLOAT32_ROUNDING = 2.0**-24
 

@@ -22,7 +22,7 @@ from pipelines.schema.palette import CLASS_ID, EMPTY
 THRESHOLDS = np.linspace(0.05, 0.50, 10)  # The ten IoU3D thresholds of Omni3D.
 RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 MAX_DETECTIONS = 100  # Maximum number of detections per scene and category, as in Omni3D.
-SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper scores all categories except VE.
+SCORED = tuple(c for c in range(len(CATEGORIES)) if c != ELLIPSOID)  # The paper does not score ellipsoids.
 
 
 # --------------------------------------------------------------------------------------------------------- ground
@@ -248,7 +248,7 @@ def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.n
     hit = np.zeros((num_detections, len(thresholds)), bool)
     if num_truths == 0:
         return hit
-    backwards = iou[:, ::-1]  # argmax returns the first maximum, but the last is needed.
+    backwards = iou[:, ::-1]  # argmax returns the first maximum, but the last maximum is needed.
     free = np.ones((len(thresholds), num_truths), bool)
     rows = np.arange(len(thresholds))
     for i in np.flatnonzero(iou.max(axis=1) >= thresholds.min()):
@@ -527,7 +527,7 @@ def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
 
 
 MEMORY = (
-    "rasters",  # Height and mask, both float32, as in the paper. The paper's 1 MB is 2^20 bytes.
+    "rasters",  # Height and mask, both float32, as in the paper. In the paper, 1 MB is 2^20 bytes.
     "vectors",  # Features (float32) and flags of all slots, as in the paper.
     "vectors_filled",  # Features of the filled slots only.
     "latent",

@@ -32,11 +32,11 @@ LABEL_MEASURES = ("vegetation_fidelity", "vehicle_fidelity", "joint_fidelity")
 
 OVERLAP_IOU3D = 0.05
 TOLERANCE_M = 0.5
-SLAB_OFFSET_M = 0.3  # Used if ground heights are slab tops (KITTI-360, town). Otherwise 0 (Argoverse 2).
+SLAB_OFFSET_M = 0.3  # Height of slab tops above the surface (KITTI-360, town). Argoverse 2 has no slabs.
 SOLID = tuple(c for c in range(len(CATEGORIES)) if c not in VEGETATION)
 # Categories whose primitives stand on the ground. In a real drive of KITTI-360, 0 % of the primitives in these
-# categories float and 7 % are sunken. The other categories are excluded. In this drive, many of their primitives are
-# not annotated on the ground: traffic_control (100 % float), vegetation_ellipsoid (29 % float), vegetation_cuboid
+# categories float and 7 % are sunken. The other categories are excluded, because many of their primitives in this drive
+# are not annotated on the ground: traffic_control (100 % float), vegetation_ellipsoid (29 % float), vegetation_cuboid
 # (37 % sunken) and construction_small (28 % sunken).
 STANDING = tuple(
     CATEGORY_INDEX[name]

@@ -159,7 +159,7 @@ def ingest_drives(
         slots: Number of slots per category (default: 95th percentile of the category's count in the training scenes).
         grid: Raster grid of the scenes (default: the paper's).
         skip_unreadable: Whether unreadable drives become rejects. If False, an unreadable drive raises an error after
-            all other drives are staged.
+            all other drives are in the staging directory.
         on_shard: Function that is called with the manifest of each finished shard.
 
     Returns:
@@ -192,8 +192,8 @@ def ingest_drives(
     if unreadable and not skip_unreadable:
         more = f" (and {len(unreadable) - 1} more)" if len(unreadable) > 1 else ""
         raise ValueError(
-            f"{unreadable[0]}{more}. All other drives are staged. Repair the file and run the same command again, "
-            "or add --skip-unreadable to skip the drive"
+            f"{unreadable[0]}{more}. All other drives are in the staging directory. Repair the file and "
+            "run the same command again, or add --skip-unreadable to skip the drive"
         )
     statistics = ray.get(ray.remote(compute_training_statistics).remote(manifests, staging, grid, slots))
     publish_shards(root, staging, manifests, statistics)

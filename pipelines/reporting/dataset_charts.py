@@ -240,7 +240,7 @@ def draw_label_matrix(title: str, counts: np.ndarray, rows: Sequence[str], colum
 # --------------------------------------------------------------------------------------------------------- map
 
 SPLIT_STYLE = {"unused": "axis", "train": "series-1", "test": "series-3"}  # Styles; splits are drawn in this order.
-MAX_NAMED = 60  # Names are drawn for at most this many sequences, because smaller frames lack space.
+MAX_NAMED = 60  # With more sequences, the frames are too small for names.
 
 
 class _Shelf(NamedTuple):

@@ -26,8 +26,8 @@ from pipelines.reporting.report import (
 DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
 # fmt: off
 MEANINGS = {
-    "fid": "Frechet distance of Inception's pool3 features; equal sources have 0. The distance falls with the number "
-           "of samples. Compare only distances that were computed from the same number of samples",
+    "fid": "Frechet distance of Inception's pool3 features; equal sources have 0. With more samples, the distance is "
+           "lower. Compare only distances that were computed from the same number of samples",
     "sfid": "Frechet distance of Inception's spatial features, which depend on the positions of objects",
     "kid": "kernel distance of the pool3 features with a cubic kernel; equal sources have 0. The expected value does "
            "not depend on the number of samples",
@@ -37,7 +37,7 @@ MEANINGS = {
     "recall": "share of real pictures that lie in the neighbourhood of a generated picture",
     "density": (
 "mean number of real neighbourhoods that contain a generated picture, divided by k. Equal sources"
-" have about 1"
+" have a density of about 1"
 ),
     "coverage": "share of real pictures whose neighbourhood contains a generated picture",
     "layout_frechet": (
@@ -187,7 +187,7 @@ def build_validity_table(validity: Mapping) -> Table:
         (words, *(format_value(validity[name][side]) for side in ("real", "generated")))
         for name, words in VALIDITY.items()
     ]
-    note = "Real scenes do not reach 0 either. Compare the shares with the shares of real scenes."
+    note = "Real scenes also have faults. Compare each share of the generated scenes with the share of the real scenes."
     return Table("Validity", ("share of", "real", "generated"), rows, note=note)
 
 
@@ -214,8 +214,8 @@ def build_distance_table(scores: Mapping) -> Table:
         for name, (found, unit) in sorted(named.items())
     ]
     note = (
-        "Rows with unit bits are Jensen-Shannon divergences. All other rows are Wasserstein distances in the given "
-        "unit. The last column is the distance between two halves of the real scenes, which is about the lowest "
+        "Rows with the unit 'bits' are Jensen-Shannon divergences. All other rows are Wasserstein distances in the "
+        "given unit. The last column is the distance between two halves of the real scenes, which is about the lowest "
         "distance that generated scenes can reach."
     )
     columns = ("distribution", "unit", "real to generated", "real to real")

@@ -136,7 +136,7 @@ class ModelCard:
         sides = generation["scenes"]
         yield (
             f"## Scores\n\nThe table compares {sides['generated']:,} generated scenes with {sides['real']:,} real "
-            f"scenes of split {self.real_split}. It also scores the layout VAE's reconstructions of "
+            f"scenes of split {self.real_split}. The table also scores the layout VAE's reconstructions of "
             f"{self.scores['reconstruction']['scenes']:,} scenes. Brackets contain 95 % intervals over scenes. "
             "`metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
         )
@@ -158,8 +158,8 @@ class ModelCard:
         yield "## Use and limits\n"
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
-            "training on other data. It is trained only on the dataset above. A procedural town does not represent "
-            "any real place, and neither do the generated scenes. The model is not tested for vehicle safety. "
+            "training on other data. It is trained only on the dataset above. If this dataset is a procedural "
+            "town, the generated scenes do not represent real places. The model is not tested for vehicle safety. "
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )
         yield "The licence of weights and code is Apache-2.0.\n"

@@ -23,7 +23,7 @@ from pipelines.runtime import storage
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit integer can store in steps.
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit integer can store.
 
 # Meanings of the categories and ground classes, used in the descriptions of columns.
 # fmt: off

@@ -36,7 +36,7 @@ AHEAD = 2  # Number of tasks that read samples in advance, while the training us
 READER_CPUS = 0.5  # With more CPUs per reader, readers and training workers would wait for each other on two cores.
 
 Arrays = dict[str, np.ndarray]
-Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, stream places) -> stacked samples.
+Reader = Callable[[Shard, np.ndarray, np.ndarray], Arrays]  # (Shard, rows, positions in the stream) -> samples.
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class LayoutReader:
         augment = self.augment
         if augment:
             if places is None:
-                raise ValueError("augmented samples need their places in the stream")
+                raise ValueError("augmentation needs the position of each sample in the stream")
             scenes = parse_scenes(*_read_scene_tables(shard), shard.source, shard.split, rows.tolist())
             layouts = (encode_layout(augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
         else:

@@ -160,7 +160,9 @@ def test_preprocess_stops_at_broken_drive_and_keeps_finished(cluster, real_data,
     whole = broken.read_bytes()
     broken.write_bytes(whole[:1000])
     out = str(tmp_path / "out")
-    with pytest.raises(ValueError, match=r"annotations.feather.*All other drives are staged. Repair the file"):
+    with pytest.raises(
+        ValueError, match=r"annotations.feather.*All other drives are in the staging directory. Repair the file"
+    ):
         ingest.ingest_drives(plan_argoverse2(str(raw)), out, {"source": "av2"})
     assert not (tmp_path / "out/scenes").exists() and not (tmp_path / "out/dataset.json").exists()
     skipped = ingest.ingest_drives(

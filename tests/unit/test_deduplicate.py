@@ -52,7 +52,7 @@ def test_find_duplicates_keeps_slightly_overlapping_neighbors():
     known = make_row_of_boxes([0, 7.3], [0.9, 0.9], "vegetation_cuboid")
     made = make_row_of_boxes(
         [3.6, -3.65], [0.9, 0.9], "vegetation_cuboid"
-    )  # the IoU is 0.053 and 0.039 with the known boxes, and 0.046 with the first box
+    )  # IoUs with the known boxes: 0.053 and 0.039 for the first box, 0.046 for the second box
     overlaps = compute_iou3d_matrix(extract_boxes(made), extract_boxes(known))
     assert (
         overlaps[0, 0] > REGENERATED_IOU3D > overlaps[1, 0] > 0
@@ -73,7 +73,7 @@ def test_suppress_duplicates_keeps_higher_confidence():
     assert find_lower_confidence_duplicates(make_row_of_boxes([0, 3], [0.6, 0.9])).tolist() == [
         False,
         False,
-    ]  # the IoU of this next part of a fence is 1 / 7
+    ]  # adjacent parts of a fence have an IoU of 1 / 7
 
 
 def test_suppress_duplicates_uses_threshold_of_category():

@@ -121,7 +121,8 @@ def test_translate_moves_along_scene_or_own_axes(scene):
     heading = np.stack([np.cos(scene.heading_rad), np.sin(scene.heading_rad)], axis=1)
     known = ~np.isnan(scene.heading_rad)
     assert np.abs(np.abs((way_m * length).sum(axis=1)) - 1).max() < 1e-4  # Objects move along their length.
-    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()  # Moves follow known headings.
+    # If the heading is known, the displacement points forward.
+    assert ((way_m[:, :2] * heading).sum(axis=1)[known] >= -1e-5).all()
     assert np.abs(way_m - length)[~known].max() < 1e-4
 
 

@@ -166,8 +166,11 @@ def test_npz_reader_rejects_incomplete_or_foreign_moments(tmp_path):
     for arrays, match in (
         ({"mu": mu}, r"holds \['mu'\] only"),
         ({"mu": mu, "sigma": sigma, "mu_s": mu}, r"only; a mean \(mu\) and its covariance"),
-        ({"mu": mu[:768], "sigma": sigma}, r"mu is float64 \(768,\), .* need floats \(2048,\)"),
-        ({"mu": mu, "sigma": sigma[:5]}, "sigma is float32"),
+        (
+            {"mu": mu[:768], "sigma": sigma},
+            r"mu has type float64 and shape \(768,\), expected floats of shape \(2048,\)",
+        ),
+        ({"mu": mu, "sigma": sigma[:5]}, "sigma has type float32"),
         ({"mu": broken, "sigma": sigma}, "mu holds NaN"),
     ):
         np.savez(path, **arrays)

@@ -26,7 +26,7 @@ def render_literally(scene: Scene, view: Grid) -> np.ndarray:
     top = np.where(class_id == EMPTY, -np.inf, height[below])
     for k in sorted(range(len(scene)), key=lambda k: (scene.category[k] == ELLIPSOID, -k)):
         center, rotation, size = (part[k].astype(float) for part in (scene.center_m, scene.rotation, scene.size_m))
-        # In units of the half extents, the line is foot + (z - center[2]) * along.
+        # In units of the half extents, the line has the points foot + (z - center[2]) * along.
         foot = 2 * ((x - center[0])[..., None] * rotation[0] + (y - center[1])[..., None] * rotation[1]) / size
         along = 2 * rotation[2] / size
         with np.errstate(divide="ignore", invalid="ignore"):

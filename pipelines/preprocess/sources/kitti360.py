@@ -41,7 +41,7 @@ CATEGORY_LABELS = {
     "traffic_control": ("trafficlight", "trafficsign", "lamp"),
     "object": ("trashbin", "box", "unknownobject"),
 }
-# Names differ in the XML: "ground" is terrain, "unknownGround" is ground, and "driveway" is parking.
+# The XML uses other names: "ground" means terrain, "unknownGround" means ground, and "driveway" means parking.
 GROUND_LABELS = {
     "road": ("road",),
     "sidewalk": ("sidewalk",),
@@ -72,8 +72,8 @@ HEADED_LABELS |= {"rider"}
 
 SPHERE_VERTICES = 63
 # Some objects occur twice, in two adjacent annotation windows. The sizes of the two copies agree to a micrometre. The
-# windows were registered separately. Real copies therefore differ by up to 0.4 m and 0.33 degrees. If the shift
-# exceeds DUPLICATE_SHIFT_M or half the size of the object, the two objects are different objects.
+# windows were registered separately. The poses of the copies therefore differ by up to 0.4 m and 0.33 degrees. If the
+# shift exceeds DUPLICATE_SHIFT_M or half the size of the object, the two objects are not copies.
 DUPLICATE_SIZE_M = 1e-3
 DUPLICATE_SHIFT_M = 0.5
 DUPLICATE_TURN_RAD = 0.01

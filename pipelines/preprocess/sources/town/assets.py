@@ -15,7 +15,7 @@ from pipelines.preprocess.sources.town.land import LocalFrame, Sheet
 
 Rect = tuple[float, float, float, float]  # s0, s1, t0, t1
 
-# Values per label: median (l, w, h); spread of a factor for all axes; spread per axis; smallest and largest (l, w, h).
+# Per label: median (l, w, h); spread of the common scale factor; spread of each axis; smallest and largest (l, w, h).
 SIZES = {
     "building": ((16, 12, 11), 0.16, 0.14, (8, 6.5, 4), (34, 22, 24)),
     "garage": ((8, 6.4, 3.4), 0.10, 0.08, (5, 3, 2.4), (12, 9, 5)),

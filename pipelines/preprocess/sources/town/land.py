@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SLAB_THICKNESS_M = 0.6  # Thickness of KITTI-360's ground slabs. Objects stand on the mid-plane of the slabs.
-EDGE_STEP_M = 10.0  # Maximum length of a slab edge. It limits the error at bends and hills.
+EDGE_STEP_M = 10.0  # Maximum length of a slab edge. Short edges have small errors at bends and hills.
 MAX_CORNERS = 40  # Maximum number of corners of a slab, as in KITTI-360.
 
 

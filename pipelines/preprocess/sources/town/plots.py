@@ -11,7 +11,7 @@ from pipelines.preprocess.sources.town.land import LocalFrame, trace_outlines
 
 NOTHING, TERRAIN, GROUND, PARKING = -1, 0, 1, 2
 CELL_CLASS = ("terrain", "ground", "parking")
-SQUEEZE = 0.4  # Maximum share of the last plot that may exceed the row. All plots then shrink to fit the row.
+SQUEEZE = 0.4  # Maximum share of the last plot beyond the end of the row. All plots then shrink to fit the row.
 
 
 @dataclass(frozen=True)
