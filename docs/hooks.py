@@ -53,7 +53,7 @@ def read_summary(path: Path) -> str:
 
 
 def list_modules(packages: tuple[str, ...]) -> list[Path]:
-    """Return the files of the public modules of some folders; of the facade `pritti` only `__init__`."""
+    """Return the files of the public modules of some folders; the facade `pritti` has only `__init__`."""
     if packages == ("pritti",):
         return [ROOT / "pritti/__init__.py"]
     return [path for package in packages for path in sorted((ROOT / package).glob("[!_]*.py"))]
@@ -135,7 +135,7 @@ def execute_tutorials() -> dict[str, str | bytes]:
 
 
 def write_index(title: str, introduction: str, pages: dict[str, str]) -> str:
-    """Return the Markdown of a page that lists others with their summaries."""
+    """Return the Markdown of a page that lists other pages with their summaries."""
     entries = [f"* [{name}]({name}.md): {text}" for name, text in pages.items()]
     return "\n".join([f"# {title}\n\n{introduction}\n", *entries])
 
@@ -185,7 +185,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Check that all references to the Python API were resolved, because mkdocs leaves others in the text.
+    """Check that all references to the Python API were resolved, because mkdocs leaves unresolved ones in the text.
 
     Raises:
         ValueError: The page refers to a module, class or function that the reference does not have.
