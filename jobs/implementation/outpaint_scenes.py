@@ -36,7 +36,8 @@ def count_blocks(config: Config) -> tuple[int, int, int, int]:
         counts = sides[0], sides[0], sides[1], sides[1]
     if min(counts) < 0 or not any(counts):
         raise ValueError(
-            f"blocks ahead, behind, left and right are {counts}: no number may be negative, and one must be positive"
+            f"--blocks-ahead, --blocks-behind, --blocks-left and --blocks-right are {counts}: "
+            "expected numbers of at least 0, and at least one block"
         )
     return counts
 
