@@ -4,8 +4,8 @@
     python benchmarks/bev.py --dataset DIRECTORY  # scenes selected evenly from a dataset
 
 The plain renderer is vectorised over the pixels inside the bounds of one primitive. It has no tolerance at edges. Times
-are CPU seconds of one thread, without the time to read scenes. Set MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1 as
-jobs/support/cli.py does, because workers of the jobs keep freed memory.
+are CPU seconds of one thread, without the time to read scenes. Set MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1, as
+jobs/support/cli.py does for the workers of jobs. With these values, a process keeps freed memory.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Measure the time of a denoising step of the diffusion transformer on the CPU.
 
-The benchmark compares this project's DiT, the original code with the same weights, and the class of diffusers.
+The benchmark compares this project's DiT, the original code with the same weights, and the DiT class of the library
+`diffusers`.
 
     python benchmarks/dit_step.py                      # DiT-B, batch sizes 1 and 8; some minutes
     python benchmarks/dit_step.py --preset kitti360-l --batches 1

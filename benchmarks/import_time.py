@@ -2,8 +2,8 @@
 
     python benchmarks/import_time.py                    # a minute
 
-The time of a Ray worker includes the start of Ray. The import of torch is listed as a reference, because its time also
-differs between machines.
+The time of a Ray worker includes the start of Ray. The benchmark also lists the import time of torch as a reference for
+the speed of the machine.
 """
 
 from __future__ import annotations

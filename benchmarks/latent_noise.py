@@ -2,8 +2,8 @@
 
     python benchmarks/latent_noise.py --lvae DIRECTORY [DIRECTORY ...] --dataset DIRECTORY
 
-The benchmark encodes held-out scenes and adds noise, in units of the standard deviation of each channel in a scene. The
-noisy latents are decoded and scored.
+The benchmark encodes held-out scenes and adds noise. The unit of the noise level is the standard deviation of each
+channel in a scene. The noisy latents are decoded and scored.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
 pa.set_io_thread_count(1)
-BATCH = 32  # scenes per timing of the rasteriser; ray casting renders one scene per timing
+BATCH = 32  # scenes that one timing of the rasteriser contains; a timing of ray casting contains one scene
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,12 @@ def measure_speed(drive: Drive, poses: np.ndarray, grid: Grid, out: str) -> dict
 
 
 def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[float, float, float]:
-    """Return the share of decisions per pixel and class that agree with rays, and the height errors of common pixels.
+    """Compare occupied pixels and heights of rasters with ray casting.
 
-    The height errors are the share of pixels with an error of at most 1 cm, and the largest error in metres.
+    Returns:
+        Share of pixels, over all ground classes, where both methods agree on the occupancy. The other two values use only
+        pixels that both methods mark as occupied: share of pixels with a height error below 1 cm, and largest height
+        error in metres.
     """
     same, within, worst = [], [], 0.0
     for index in indices:
@@ -184,7 +187,7 @@ def main(config: Config) -> None:
         print(f"speed     reading the XML, shared by {len(drive)} poses: {reading:.2f} ms per scene")
         print(
             f"speed     all stages: {spread(total)} ms per scene, "
-            f"{spread([1e3 / t for t in total], digits=0)} scenes/s and core"
+            f"{spread([1e3 / t for t in total], digits=0)} scenes/s per core"
         )
 
         some = poses[:: max(1, len(poses) // config.rays)][: config.rays]
@@ -238,7 +241,7 @@ def main(config: Config) -> None:
                 for shard in shards:
                     reader(shard, np.arange(min(256, len(poses) - 256 * shard.number)))
                 rates.append(len(poses) / (time.process_time() - clock))
-            print(f"read back training layouts of {pixels} x {pixels}: {spread(rates, digits=0)} scenes/s and core")
+            print(f"read back training layouts of {pixels} x {pixels}: {spread(rates, digits=0)} scenes/s per core")
 
     results = multiprocessing.get_context("spawn").Queue()
     for spacing_m in (10.0, 0.5):

@@ -61,7 +61,7 @@ def tilt_primitives(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 def merge_scenes(scenes: list[Scene]) -> Scene:
-    """Return one scene with primitives of several scenes; their number is the paper's number of slots."""
+    """Return one scene with PAPER_OBJECTS primitives, which come from several scenes."""
     joined = {
         name: np.concatenate([getattr(s, name) for s in scenes])
         for name in ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")

@@ -109,7 +109,7 @@ class Relabel(SelectOptions):
     to: str = "object"
     """New category; vegetation_ellipsoid makes ellipsoids, every other category makes cuboids."""
     class_name: str | None = None
-    """New class name, one of the source's own labels (default: the name of the category)."""
+    """New class name, which must be a label of the source (default: the name of the category)."""
 
 
 @dataclass(frozen=True)

@@ -60,8 +60,8 @@ class Sheet(DatasetOptions):
     """Order: drive, random, vegetation, vehicles, primitives, or a numeric column of the scenes table such as
     num_pole."""
     pick: Literal["uniform", "lowest", "highest"] = "uniform"
-    """Selection from the sorted scenes: evenly from all scenes, the scenes with the lowest or with the highest
-    values."""
+    """Scenes to select after sorting: evenly spaced scenes, the scenes with the lowest values, or the scenes with the
+    highest values."""
     view: Literal["bev", "3d"] = "bev"
     """View: bird's-eye or oblique."""
     size_px: int = 256

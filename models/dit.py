@@ -1,9 +1,9 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
-The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. In diffusers,
-`DiTTransformer2DModel` has separate timestep and label embeddings in every block, so it is 8 % larger.
-It also drops labels independently in each block, so the unconditional branch of classifier-free guidance is never
-trained. Here, each sample has one embedding and one dropout mask for the whole network.
+The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
+`DiTTransformer2DModel` of the library `diffusers` has separate timestep and label embeddings in every block, so it is
+8 % larger. This class also drops labels independently in each block, so the unconditional branch of classifier-free
+guidance is never trained. Here, each sample has one embedding and one dropout mask for the whole network.
 """
 
 from __future__ import annotations
@@ -224,7 +224,8 @@ class DiT(ConfiguredModel):
 
         Returns:
             List of tensors. For each block: (b, 6 d) shifts, scales and gates. For the output: (b, 2 d) shift and
-            scale. Last: (b, 2) factors of the latent and the network output; the noise is the sum of both products.
+            scale. The last tensor (b, 2) contains two factors a and b: the noise is a times the latent plus b times the
+            network output.
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]

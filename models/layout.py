@@ -127,8 +127,8 @@ class LayoutSpec:
             length_m: Length (metres).
 
         Returns:
-            Nine numbers: the length in the normalised units of each of the 3 centre coordinates and 6 Cholesky
-            parameters.
+            Nine numbers, one per feature (3 centre coordinates, 6 Cholesky parameters): the length in the normalised
+            unit of this feature.
         """
         return tuple(
             unit / (high - low)

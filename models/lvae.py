@@ -49,7 +49,7 @@ class LayoutVAE(ConfiguredModel):
     """Encode layouts to latents (2 c, h, w) and decode latents to layouts; h = w = pixels / `ground.cell_px`.
 
     Args:
-        layout: LayoutSpec as a dictionary. It is saved with the model and is needed to decode outputs.
+        layout: LayoutSpec as a dictionary. The dictionary is saved with the model, because decoding outputs needs it.
         latent_channels: Number c of latent channels per branch.
         ground: Options of the ground branch.
         objects: Options of the object branch.
@@ -84,8 +84,8 @@ class LayoutVAE(ConfiguredModel):
                 f"LayoutVAE: the side of the square grid must be a multiple of {ground.cell_px} px, got {spec.grid}"
             )
         size, num_classes = spec.grid.rows // ground.cell_px, len(spec.ground_classes)
-        # Units of distances in losses. The cell decoder predicts centres relative to a cell, so the unit is one cell.
-        # DETR predicts centres relative to the whole scene, so the unit is the normalised unit.
+        # Units of distances in losses. The cell decoder predicts centres relative to a cell, so its unit of distance is
+        # one cell. DETR predicts normalised centres, so it uses the normalised units.
         self.feature_unit = (
             spec.feature_unit(spec.grid.rows * spec.grid.resolution_m / size)
             if objects.decoder == "cells"
@@ -129,9 +129,9 @@ class LayoutVAE(ConfiguredModel):
     def init_from_data(self, batch: LayoutBatch) -> None:
         """Initialise the outputs to their means over a sample of training layouts.
 
-        Adam moves a bias by about the learning rate per step. Starting from zero, it would take thousands of steps to
-        learn that poles are thin and that most pixels are not road. For the initialisation of the shortcuts, see
-        models/vae/ground.py.
+        Adam moves a bias by about the learning rate per step. With initial biases of zero, training would need
+        thousands of steps to learn that poles are thin and that most pixels are not road. For the initialisation of the
+        shortcuts, see models/vae/ground.py.
 
         Args:
             batch: Training layouts.
@@ -254,8 +254,9 @@ class LayoutVAE(ConfiguredModel):
         Args:
             batch: Layouts.
             noise: Standard normal noise of the reparameterisation.
-            corruption: Noise that is added to the latent; None: no noise. The unit is the standard deviation of each
-                channel over the cells of a scene. This noise makes decoders tolerate errors in sampled latents.
+            corruption: Noise that is added to the latent; None: no noise. The unit of this noise is the standard
+                deviation of each channel over the cells of a scene. This noise makes decoders tolerate errors in
+                sampled latents.
 
         Returns:
             Output of the decoders, and the posterior.

@@ -598,8 +598,8 @@ class PrITTIPipeline:
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             generator: See `generate`.
             callback_on_step_end: See `generate`.
-            composite: If True, copy everything outside the regions from the input. If False, the area outside the
-                regions is the reconstruction by the decoders.
+            composite: If True, copy everything outside the regions from the input. If False, the decoders also
+                reconstruct the area outside the regions.
 
         Returns:
             The regenerated scenes.

@@ -77,7 +77,7 @@ LVAE_PRESETS: dict[str, LVAEPreset] = {
     "kitti360": LVAEPreset("kitti360",  256, PAPER, 32,    300_000),
     "av2":      LVAEPreset("av2",       256, PAPER, 32,    300_000),
     # This preset combines the paper's object encoder with the town's ground branch and the cell decoder.
-    # Its latent has the same shape as in the paper, but training costs less.
+    # The latent has the same shape as in the paper, but training costs less.
     "kitti360-light": LVAEPreset("kitti360", 256, replace(TOWN, objects=PAPER_CELLS), 32, 300_000,
                                  **(QUICK | LOWER_RATE)),
 }

@@ -3,8 +3,8 @@
 Real and generated scenes use the same class and the same scene frame. The origin of the scene frame is the ego vehicle.
 **x points forward, y to the left, and z up** (against gravity).
 
-The frame of the paper also has the pitch and roll of the IMU. Without them, the ground of neighbouring blocks fits
-together.
+In the paper, the frame is also tilted by the pitch and roll of the IMU. Without this tilt, the ground of neighbouring
+blocks fits together.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
         spec: LayoutSpec that defines the slots.
 
     Returns:
-        Slots (m,) and the indices (m,) of the primitives in them.
+        Indices (m,) of the occupied slots, and indices (m,) of the primitives in these slots.
     """
     position = np.full(len(CATEGORY_INDEX), -1)
     position[[CATEGORY_INDEX[name] for name in spec.categories]] = np.arange(len(spec.categories))

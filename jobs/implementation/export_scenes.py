@@ -16,7 +16,8 @@ def export(config: Config) -> tuple[str, dict[str, int], dict[str, str]]:
     """Write files.
 
     Returns:
-        The output directory, the number of files per format, and the reason by id for each scene that was not written.
+        The output directory, the number of files per format, and a mapping from the id of each unwritten scene to the
+        reason.
     """
     if not config.formats:
         raise ValueError("--formats is empty, expected one or more of glb, ply, npz, xodr")

@@ -216,7 +216,7 @@ def compute_hours(tracker, batch_size: int) -> float:
 
 
 def draw_examples(about: Mapping) -> dict[str, bytes]:
-    """Return PNG pictures of the first evaluated scenes, and of those with the most faults among JUDGED scenes."""
+    """Return PNG pictures of the first SHOWN scenes, and of the worst scenes among the first JUDGED scenes."""
     offset_m = find_slab_offset_m(Dataset.open(about["real"]).spec.surface)
     scenes = list(read_scenes(about["generated"], about["source"], limit=JUDGED))
     faults = np.array([compute_scene_validity(scene, offset_m)[:-1, 0].sum() for scene in scenes])

@@ -32,7 +32,7 @@ CHECKPOINTS = 8  # number of checkpoints per training run; a validation with pic
 
 
 class Stages:
-    """Run stages in sequence, print the name of each stage, and keep records of durations across interruptions."""
+    """Run stages in sequence, print the name of each stage, and record its duration in a file."""
 
     def __init__(self, path: str, total: int) -> None:
         self.path, self.total, self.started = path, total, time.perf_counter()

@@ -45,7 +45,7 @@ def serve_studio(config: Config) -> str:
 
 
 def require_free_port(host: str, port: int) -> None:
-    """Check that a port is free, because Ray Serve would retry forever.
+    """Raise an error if a port is in use, because Ray Serve would retry forever.
 
     Raises:
         ValueError: The port or the address cannot be used.

@@ -84,7 +84,7 @@ def sweep_samplers(config: Config) -> list[dict]:
                 guidance_scale=config.guidance_scale,
                 sampler=sampler,
                 noise_scaling=scaling,
-                # The size does not depend on the number of actors, so a run can resume with another number of actors.
+                # The shard size does not depend on the number of actors, so a resumed run may use a different number.
                 shard_scenes=max(1, config.num_scenes // 8),
             )
             seconds_per_scene = sample_and_time(config, request, bar)
@@ -103,7 +103,7 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 
 def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
-    """Generate missing scenes and return seconds per scene and actor, or None if no shard was timed."""
+    """Generate missing scenes; return the time per scene of one actor in seconds, or None if no shard was timed."""
     record = storage.join_uri(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}
     shown = bar.add_task(request.run, total=request.num_scenes)

@@ -112,7 +112,7 @@ def load_encoder(latents: dict, latents_root: str) -> LayoutVAE:
     """Return the layout VAE that encoded the latents.
 
     Raises:
-        ValueError: The weights of the layout VAE have changed since the encoding.
+        ValueError: The weights of the layout VAE have changed since the latents were encoded.
     """
     lvae = load_lvae(latents["lvae"])
     if digest_weights(lvae) != latents["lvae_digest"]:

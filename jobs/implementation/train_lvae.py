@@ -140,7 +140,7 @@ def make_run_identity(
 
 
 def train(config: Config) -> str:
-    """Train and return the directory of the model; with --train-object-decoder-of, that of the pipeline."""
+    """Train a model and return its directory; with --train-object-decoder-of, return the directory of the pipeline."""
     training = prepare(config)
     output = resolve_path(config.output, "models", training.name)
     trainer.fit(training, config.num_workers, output)
@@ -191,7 +191,7 @@ def list_kept_options(options: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def require_replaceable(name: str, kept: Kept) -> None:
-    """Check that the updated pipeline overwrites no other pipeline and not the initial pipeline.
+    """Raise an error if the updated pipeline would overwrite the initial pipeline or an unrelated pipeline.
 
     Raises:
         ValueError: The updated pipeline would overwrite a pipeline.
@@ -205,7 +205,7 @@ def require_replaceable(name: str, kept: Kept) -> None:
 
 
 def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
-    """Write a trained pipeline with another layout VAE that has the same latents, and return the directory.
+    """Write a copy of a trained pipeline with a new layout VAE for the same latents, and return the directory.
 
     Raises:
         ValueError: The pipeline has changed since the training started.

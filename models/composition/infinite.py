@@ -68,7 +68,7 @@ class InfiniteScene:
         return self.label if isinstance(self.label, str) else self.label(index)
 
     def get_block(self, index: BlockIndex) -> SceneBlock:
-        """Return a block. Generate the block and its predecessors first if they do not exist.
+        """Return a block. If the block does not exist, generate its missing predecessors and then the block.
 
         Args:
             index: Index of the block (steps ahead, steps to the left).

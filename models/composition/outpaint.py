@@ -1,7 +1,7 @@
 """Outpainting on a grid of overlapping blocks (paper, supplement B.3).
 
-The paper extends a scene to three by three blocks around it. This module also supports rectangles of any size and
-unbounded grids. Only the order of the blocks differs.
+The paper adds eight blocks around a scene, which gives a grid of three by three blocks. This module also supports
+rectangles of any size and unbounded grids. Only the order of the blocks differs.
 
 Block (i, j) lies i steps ahead of block (0, 0) and j steps to its left. A step is (1 - overlap) of a block. The rank of
 a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. Blocks of
@@ -291,12 +291,13 @@ class BlockComposer:
         """Crop a block to the area of another block.
 
         Args:
-            index: Index of the block whose area and x, y frame the result has.
+            index: Index of the block that defines the area of the result and its axes x and y.
             other: Index of the block to crop.
             block: Content of block `other`.
 
         Returns:
-            The cropped scene. Its x and y are in the frame of block `index`; its z is in the frame of block (0, 0).
+            The cropped scene. Its x and y coordinates are in the frame of block `index`, and its z coordinates are in
+            the frame of block (0, 0).
         """
         x, y = ((a - b) * self.step_m for a, b in zip(other, index, strict=True))
         return block.scene.translate(x, y, block.datum_m).crop(self.spec.grid)

@@ -2,7 +2,7 @@
 
 `cholesky` is the paper's encoding (Sec. 3.1), and `quaternion` is the paper's baseline. The paper does not have
 `octahedral`. Each box can be described in 24 ways, which differ in the order and the signs of the axes. An ideal
-encoding is continuous, and each box has exactly one code and each code exactly one box.
+encoding has three properties: it is continuous, each box has exactly one code, and each code describes exactly one box.
 
 * quaternion and size: This encoding has none of these properties. The quaternions q and -q describe the same rotation.
   Rotating the box by 180 degrees about one of its axes gives the same box but a different quaternion. A convention such
@@ -14,7 +14,7 @@ encoding is continuous, and each box has exactly one code and each code exactly 
 * octahedral: The code consists of the scatter matrix S and the frame tensor T of the box. S is sum_j s_j v_j v_j^T, and
   T is sum_j v_j (x) v_j (x) v_j (x) v_j. S and T do not depend on the order and the signs of the axes. They are
   polynomials. Each box therefore has one code, and the encoding is smooth. T is invariant only under the 24 symmetries
-  of a cube. It therefore determines the three axes, even if the box is a cube. S then gives the extent along each axis.
+  of a cube. T therefore determines the three axes, even if the box is a cube. S then gives the extent along each axis.
   The octahedral encoding has all three properties for every rotation (tests/unit/test_ablation.py).
 
 T is symmetric and has 15 distinct entries. The trace part of T is constant, because the v_j are orthonormal. The
@@ -44,7 +44,7 @@ from models.geometry.cholesky import (
 )
 
 TRACE_PART = 3 / 5  # Mean of sum_j (v_j . x)^4 over the unit sphere.
-STARTS, ROUNDS = 4, 12  # Numbers of starts and of iterations of the axis search; a test checks them.
+STARTS, ROUNDS = 4, 12  # Number of starts of the axis search, and number of iterations per start.
 
 
 class Encoding(NamedTuple):
@@ -107,9 +107,9 @@ def decode_quaternion_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
 def compute_harmonics() -> np.ndarray:
     """Compute an orthonormal basis (9, 3, 3, 3, 3) of the traceless symmetric tensors of rank four.
 
-    Their order is cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The basis is formed by the coefficients of t^k in
-    n(t)^4, where n(t) . n(t) = 0. Because of this condition, n(t)^4 is traceless. For k = 0, the coefficient is (x +
-    iy)^4.
+    The order of the basis tensors is cos 4 yaw, sin 4 yaw, cos 3 yaw, ..., sin yaw, 1. The basis is formed by the
+    coefficients of t^k in n(t)^4, where n(t) . n(t) = 0. Because of this condition, n(t)^4 is traceless. For k = 0, the
+    coefficient is (x + iy)^4.
     """
     parts = np.array([[1, 1j, 0], [0, 0, -2], [-1, 1j, 0]])  # n(t) = parts[0] + parts[1] t + parts[2] t^2
     tensors = np.zeros((9, 3, 3, 3, 3), complex)
@@ -148,8 +148,8 @@ def encode_octahedral(rotation: np.ndarray, size_m: np.ndarray) -> np.ndarray:
 def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Decode scatter matrices and frame tensors to boxes.
 
-    The decoded axes are those whose frame tensor is nearest to the code. The extents are s_j = v_j^T S v_j. They are
-    linear in S, so errors are not amplified if extents are similar.
+    The decoded axes are those whose frame tensor is nearest to the code. The extents are s_j = v_j^T S v_j. The extents
+    are linear in S, so similar extents do not amplify errors.
 
     Args:
         parameters: (..., 15) codes in the format of `encode_octahedral`.

@@ -200,8 +200,8 @@ def _compute_chunk_volume_m3(a: Boxes, b: Boxes) -> np.ndarray:
     half_b = half_b + GROWTH * np.maximum(half_a.max(axis=0), half_b.max(axis=0))
     center_b = np.einsum("ijn,jn->in", axes, offset)  # (3, n) centre of B along the axes of A.
 
-    # Skip pairs that are separated by the plane of a face. In the town, these are a fifth of the pairs whose bounds
-    # overlap.
+    # Skip pairs that are separated by the plane of a face. In the town, a fifth of the pairs with overlapping bounds
+    # are separated in this way.
     reach = np.abs(axes)
     near_a = np.abs(center_b) < half_a + np.einsum("ijn,jn->in", reach, half_b)
     near_b = np.abs(offset) < half_b + np.einsum("ijn,in->jn", reach, half_a)
@@ -297,8 +297,8 @@ def compute_ellipsoid_iou3d_pairs(a: Boxes, b: Boxes) -> np.ndarray:
     """Estimate the IoU3D of each pair of ellipsoids that are inscribed in the boxes a[i] and b[i].
 
     The estimate counts how many of BALL_POINTS fixed points in the smaller ellipsoid also lie in the larger ellipsoid.
-    The result is deterministic. A test with closed-form solutions checks that the largest error is 0.01 and the root
-    mean square error is 0.002. The paper's AP3D does not include ellipsoids.
+    The result is deterministic. A test with closed-form solutions checks that the largest error is at most 0.01 and the
+    root mean square error is at most 0.002. The paper's AP3D does not include ellipsoids.
 
     Args:
         a: Bounding boxes of n ellipsoids.

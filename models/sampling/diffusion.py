@@ -44,9 +44,9 @@ class Diffusion:
     def select_timesteps(self, num_inference_steps: int) -> np.ndarray:
         """Select ascending timesteps with "leading" spacing, for example 0, 4, ..., 996 for 250 of 1000.
 
-        A number of timesteps is rejected if the selected timesteps do not cover most of the schedule. For example, 600
-        timesteps would have a spacing of 1, so sampling would start at timestep 599. At this timestep, the network
-        expects an input with 20 % signal, but the input would be pure noise.
+        An error is raised if the selected timesteps do not cover most of the schedule. For example, 600 timesteps would
+        have a spacing of 1, so sampling would start at timestep 599. At this timestep, the network expects an input
+        with 20 % signal, but the input would be pure noise.
 
         Args:
             num_inference_steps: Number n of timesteps.

@@ -20,7 +20,7 @@ def repaint_transitions(
 
     Args:
         num_inference_steps: Number of timesteps that sampling uses.
-        jump_length: Number of states of a jump back to more noise (J in the paper).
+        jump_length: Number of states by which a jump goes back to more noise (J in the paper).
         resamplings: Number of passes over the same states (R in the paper).
 
     Returns:
@@ -49,7 +49,7 @@ class RePaintConfig:
 
     Attributes:
         num_inference_steps: Number of timesteps that sampling uses.
-        jump_length: Number of states of a jump back to more noise (J in the paper).
+        jump_length: Number of states by which a jump goes back to more noise (J in the paper).
         resamplings: Number of passes over the same states (R in the paper).
         pseudoinverse_guidance: Weight of pseudo-inverse guidance towards the known region; 0 switches it off.
         eta: Fraction of the noise of DDPM that each step adds, in [0, 1]. If the number of steps is small, this noise
@@ -69,8 +69,8 @@ class RePaintConfig:
     def guided(cls, num_inference_steps: int = 50) -> RePaintConfig:
         """Return options with pseudo-inverse guidance instead of resampling.
 
-        Compared with the options of the paper, they give fewer visible seams and more objects, and sampling is 24 times
-        as fast.
+        Compared with the paper's options, these options give fewer visible seams and more objects, and sampling is 24
+        times as fast.
 
         Args:
             num_inference_steps: Number of timesteps that sampling uses.

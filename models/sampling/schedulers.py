@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, cast
 
-# Noise schedule of the paper, as options of the class DDPMScheduler of diffusers.
+# Noise schedule of the paper, as options of the class `DDPMScheduler` of the library `diffusers`.
 DDPM_CONFIG = {
     "num_train_timesteps": 1000,
     "beta_start": 0.0015,
@@ -29,7 +29,8 @@ DDPM_CONFIG = {
 
 # Class and options of each sampler. DPM-Solver++ uses timesteps that are uniform in log signal-to-noise ratio. A test
 # samples a Gaussian distribution with a tenth of the latent's standard deviation. With 20 of these timesteps, the
-# samples have 93 % of the true standard deviation. With 20 timesteps that are uniform in time, they have 31 %.
+# samples have 93 % of the true standard deviation. With 20 timesteps that are uniform in time, the samples have 31 % of
+# the true standard deviation.
 SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ddpm": ("DDPMScheduler", {"timestep_spacing": "leading"}),
     "ddim": ("DDIMScheduler", {"timestep_spacing": "leading"}),

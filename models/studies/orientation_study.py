@@ -1,9 +1,9 @@
 """Measure how well a small autoencoder reconstructs one box (paper, supplement, "Cholesky vs. quaternion").
 
 The study compares encodings of the box (models/geometry/encodings.py). The autoencoder is a small object branch of the
-layout VAE with one slot and one query. It is trained with an L1 loss to reconstruct the code of a box. The networks of
-different encodings differ only in their first and last linear layers. Boxes are centred at the origin, and the centre
-is not predicted.
+layout VAE with one slot and one query. The autoencoder is trained with an L1 loss to reconstruct the code of a box. The
+networks of different encodings differ only in their first and last linear layers. Boxes are centred at the origin, and
+the centre is not predicted.
 
 If boxes are upright, some entries of their codes are constant: 2 of 6 (Cholesky), 2 of 7 (quaternion) and 9 of 15
 (octahedral). The L1 gradient of an entry does not shrink with its error, so constant entries disturb the training. The
@@ -36,7 +36,7 @@ from models.vae.outputs import Posterior
 GRID, LATENT_CHANNELS = 2, 16
 NETWORK = ObjectConfig(width=128, layers=1, heads=4, hidden=256, head_hidden=128)
 MARGIN = 0.05  # Margin at both ends of an encoded number's range, because a sigmoid does not reach 0 and 1.
-STILL, LEAST_RANGE = 1e-6, 1.0  # If the range of an encoded number is below STILL, LEAST_RANGE replaces it.
+STILL, LEAST_RANGE = 1e-6, 1.0  # A range of an encoded number below STILL becomes LEAST_RANGE.
 
 
 # ------------------------------------------------------------------------------------------------------- boxes
@@ -79,7 +79,7 @@ BOX_DISTRIBUTIONS = {
 def draw_boxes(distribution: BoxDistribution, count: int, *key: int) -> CenteredBoxes:
     """Draw upright boxes with yaw in [-pi, pi).
 
-    With the same key, a call with a larger `count` returns the same first boxes.
+    With the same key, a larger `count` only adds boxes at the end.
 
     Args:
         distribution: Distribution of the box sizes.

@@ -215,8 +215,8 @@ def fill_heights(
 ) -> Float[Tensor, "batch ground rows cols"]:
     """Replace the heights of unoccupied pixels by a mean height.
 
-    The mean is taken over the occupied pixels of the cell. If the cell has no occupied pixels, it is taken over the
-    scene.
+    The mean is taken over the occupied pixels of the cell. If the cell has no occupied pixels, the mean over the
+    occupied pixels of the scene is used.
 
     Args:
         height: Normalised heights.
@@ -243,7 +243,7 @@ def compute_principal_components(
         count: Number of directions.
 
     Returns:
-        Matrix whose columns are the directions; and standard deviations (at least 0.01).
+        Matrix whose columns are the directions, and vector of the standard deviations (at least 0.01).
     """
     variance, directions = torch.linalg.eigh(centred.T @ centred / len(centred))
     return directions[:, -count:], variance[-count:].clamp(min=1e-4).sqrt()

@@ -137,8 +137,8 @@ def compute_object_losses(
 def compute_kl_loss(posterior: Posterior) -> Float[Tensor, ""]:
     """Compute the KL divergence to the standard normal distribution, averaged over the batch.
 
-    The divergence is summed over channels and cells. The paper does not specify the reduction over cells; the sum is
-    that of latent diffusion.
+    The divergence is summed over channels and cells. The paper does not specify the reduction over cells; latent
+    diffusion also uses the sum.
 
     Args:
         posterior: Posterior of the encoders.

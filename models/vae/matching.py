@@ -79,8 +79,8 @@ def match_primitives(
     """Assign each proposal to a true slot or to padding.
 
     `proposals[k]` must be at least `slots[k]` for each category k. Within a category, the slots of real primitives come
-    before padded slots (tensors.py). Costs are computed on the device of the tensors and copied to the CPU all
-    together. Threads solve the samples in parallel, because scipy's solver releases Python's global interpreter lock.
+    before padded slots (tensors.py). Costs are computed on the device of the tensors and copied to the CPU in one
+    transfer. Threads solve the samples in parallel, because scipy's solver releases Python's global interpreter lock.
 
     Args:
         features: Features of the proposals.

@@ -19,7 +19,7 @@ from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
-CATEGORY_EMBEDDING = 10  # 9 features + 10 channels + padding flag = 20 inputs (paper, Sec. 3.2).
+CATEGORY_EMBEDDING = 10  # 9 features + 10 embedding channels + 1 padding flag = 20 inputs (paper, Sec. 3.2).
 
 
 class Attention(nn.Module):

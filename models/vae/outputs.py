@@ -52,8 +52,8 @@ class LayoutOutput:
         occupancy_logit: Logit of the probability that a pixel is occupied.
         features: Normalised features of the proposals, ordered by category.
         existence_logit: Logit of the existence probability of the proposals.
-        proposals: Number of proposals per category. It equals the number of slots for "detr"; for "cells", it may be
-            larger.
+        proposals: Number of proposals per category. The decoder "detr" has one proposal per slot; "cells" may have more
+            proposals.
         match_weights: Weights of the matching cost.
         feature_unit: Length unit of each normalised feature in matching and losses.
         branches: Branches of the model. The outputs of a missing branch are placeholders.

@@ -631,8 +631,8 @@ def break_xml(rng: np.random.Generator, whole: bytes) -> bytes:
 def find_rows_of_xml(whole: bytes, broken: bytes) -> Touches:
     """Return the rows that a broken XML file may change.
 
-    These are the primitives of changed objects and of their copies in other windows. They also include the rasters if a
-    changed object is ground before or after the change.
+    The result contains the primitives of changed objects and of the copies of these objects in other windows. The
+    result also contains the rasters if a changed object is ground before or after the change.
     """
     before, after = ([" ".join(b.replace("><", "> <").split()) for b in find_objects(xml)] for xml in (whole, broken))
     places = {read_field(block, "transform") for block in set(before) - set(after)}

@@ -120,7 +120,7 @@ def test_street_view_at_half_resolution_shows_same_view():
 
 
 def make_scene_of_roads(ways: list[np.ndarray], width_m: float, grid: Grid | None = None) -> Scene:
-    """Return a scene on a slope of 2 %. Its road covers all points within width_m / 2 of the lines (k, 2)."""
+    """Return a scene on a slope of 2 %. The road covers all points within width_m / 2 of the lines (k, 2)."""
     grid = grid or Grid()
     x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
     road = np.zeros(x.shape, bool)

@@ -214,7 +214,7 @@ def test_tables_page_queries_return_rows(answers, question):
 
 
 def select_answer(answers: dict[str, pd.DataFrame], words: str, *index: str) -> pd.DataFrame:
-    """Return the query result for the heading that contains `words`; the columns `index` are the index."""
+    """Return the result of the query whose heading contains `words`, indexed by the columns `index`."""
     (question,) = [q for q in QUESTIONS if words in q]
     return answers[question].set_index(list(index)).sort_index()
 

@@ -168,7 +168,7 @@ def voxelize_ground_literally(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [12, 24, 48])
 def test_voxelise_ground_is_voxel_at_surface(pixels):
-    """The test uses raster pixels that are as large as the voxels, larger, and smaller."""
+    """The raster pixels are larger than the voxels, equally large, or smaller."""
     grid = Grid(front_m=12.0, left_m=6.0, resolution_m=12.0 / pixels, rows=pixels, cols=pixels)
     voxels = VoxelGrid(replace(SMALL.columns, left_m=6.0, cols=24), -1.0, -0.2, 8)
     scene = random_scene(4, n=0, grid=grid)
