@@ -108,9 +108,9 @@ def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[fl
     """Compare occupied pixels and heights of rasters with ray casting.
 
     Returns:
-        Share of pixels, over all ground classes, where both methods agree on the occupancy. The other two values use only
-        pixels that both methods mark as occupied: share of pixels with a height error below 1 cm, and largest height
-        error in metres.
+        Share of pixels, over all ground classes, where both methods agree on the occupancy. The other two values use
+        only pixels that both methods mark as occupied: share of pixels with a height error below 1 cm, and largest
+        height error in metres.
     """
     same, within, worst = [], [], 0.0
     for index in indices:
