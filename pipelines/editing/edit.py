@@ -501,7 +501,7 @@ def _parse_category(name: str) -> int:
 
 
 class ObjectChange(NamedTuple):
-    """Changes by one edit; each changed primitive has one entry.
+    """Changes that one edit makes, with one entry per changed primitive.
 
     Attributes:
         primitive: Index of the primitive in the scene before the edit.

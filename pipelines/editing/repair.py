@@ -159,7 +159,7 @@ class _Separation:
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
         """For each placement (k, 2) of a pair, return whether one of the two boxes would overlap a third box.
 
-        The overlap must exceed the limit and the current overlap.
+        An overlap counts only if its IoU3D exceeds both the limit and the present IoU3D of the two boxes.
         """
         others = self.solid.copy()
         others[pair] = False

@@ -179,8 +179,8 @@ def make_scene_record(
 ) -> SceneRecord:
     """Compare a scene with its reconstruction. The ground is compared at the resolutions of the scene and of the model.
 
-    All true primitives count, including primitives without a slot. AP3D ranks all proposals. Pairs and voxels are
-    computed from the decoded scene, which contains only proposals above the existence threshold.
+    The scores cover all true primitives, including primitives without a slot. AP3D ranks all proposals. Pairs and
+    voxels are computed from the decoded scene, which contains only proposals above the existence threshold.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     rebuilt = decode_layout(layout, spec, truth)

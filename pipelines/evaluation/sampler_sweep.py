@@ -19,7 +19,7 @@ MEASURES = {
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
-    "count_ratio": (("count_ratio",), "count ratio of one category, the ratio farthest from 1", "one"),
+    "count_ratio": (("count_ratio",), "count ratio of the category whose ratio is farthest from 1", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
 COMMON = 3.0  # Minimum number of objects per scene. Categories with fewer objects vary too much.
@@ -124,8 +124,11 @@ def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
 
 
 def render_sampler_html(rows: Sequence[Mapping], pictures: Sequence[Picture], columns: int, how: Sequence[str]) -> str:
-    """Render the page. Each row of `pictures` shows the same `columns` scenes."""
-    note = "Each row shows one sampler and number of steps. The scene numbers and labels are the same in all rows."
+    """Render the page. All rows of `pictures` show the same scenes; `columns` is the number of scenes per row."""
+    note = (
+        "Each row shows scenes that one sampler generated with one number of steps. "
+        "The scene numbers and labels are the same in all rows."
+    )
     sections = [
         build_sampler_table(rows),
         Charts("Scores by number of steps", draw_sampler_charts(rows)),

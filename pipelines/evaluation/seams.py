@@ -23,7 +23,7 @@ BLOCK_M = 64.0  # Side length of the middle block of an outpainted scene.
 MEANINGS = {
     "class_changes": "share of pixel pairs across the line with different ground classes",
     "height_step": "mean height difference of the ground at the line",
-    "cut_objects": "share of objects at the line that end there",
+    "cut_objects": "share of objects near the line that end at the line",
     "doubled_objects": "share of objects at the line that overlap an object of the same category on the other side",
 }
 

@@ -112,7 +112,7 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
         region: (rows, cols) bool generated region.
 
     Returns:
-        Sums over pixels, squared height errors (m^2), primitives and their IoU3D.
+        Sums for `compute_drift_scores`: pixels, squared height errors (m^2), primitives, and IoU3D of matches.
     """
     given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied
@@ -163,7 +163,7 @@ def inpaint_one(
         number: Number of the scene in the run.
 
     Returns:
-        Variants, and the drift of the decoder output of each block.
+        Variants, and the results of `compute_drift` for all blocks.
 
     Raises:
         ValueError: The region contains no pixel of the scene, or the scene has no label and the request has none.

@@ -299,7 +299,7 @@ class Outpainter:
 
 
 def make_blocks_table_path(request: OutpaintRequest, number: int) -> str:
-    """Return the path of the table of the blocks of a scene.
+    """Return the path of the table that lists the blocks of a scene.
 
     Args:
         request: Options of outpainting.
@@ -433,7 +433,7 @@ def pop_ready_task(
 
     Args:
         waiting: Batches to generate.
-        whole: Scene numbers of the scenes whose blocks are all done. These scenes are stitched first.
+        whole: Numbers of the scenes in which all blocks are done. These scenes are stitched first.
         done: Finished blocks by scene number.
 
     Returns:

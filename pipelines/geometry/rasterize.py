@@ -92,8 +92,8 @@ def _find_column_intervals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest column coordinate of a triangle in each of its pixel rows (s,).
 
-    The argument spans (t,) is the number of rows per triangle. The arguments u and v (3, t) are row and column
-    coordinates of the corners, in pixels. Pixel centres have integer coordinates.
+    The argument `spans` (t,) contains the number of rows per triangle. The arguments `u` and `v` (3, t) are row and
+    column coordinates of the corners, in pixels. Pixel centres have integer coordinates.
     """
     u_end, v_end = u[[1, 2, 0]], v[[1, 2, 0]]  # Edge k leads from corner k to the next corner.
     per_row = (v_end - v) / np.where(u == u_end, 1.0, u_end - u)
@@ -110,7 +110,7 @@ def fill_triangles(
 ) -> None:
     """Draw hits into images in place: each pixel keeps the highest value and its owner.
 
-    If several hits have the same value, the last hit wins. A hit also replaces the same value in the image.
+    If several hits have the same value, the last hit wins. A hit also replaces an equal value in the image.
 
     Args:
         pixel: (m,) flat pixel index of each hit.
@@ -152,7 +152,9 @@ def cast_rays_down(
 
 
 def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
-    """Return only the heights from `cast_rays_down`. This function needs half the memory and less time.
+    """Return only the heights from `cast_rays_down`.
+
+    This function uses half of the memory of `cast_rays_down` and takes less time.
 
     Args:
         triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).

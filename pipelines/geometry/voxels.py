@@ -4,16 +4,16 @@ Tab. 1).
 These rules determine the class of a voxel:
 
 * A primitive fills a voxel if it contains the centre of the voxel. The test is exact for rotated boxes and ellipsoids
-  and includes the boundary (EDGE_M). If several primitives contain it, the finest category wins (PRECEDENCE). The order
-  of primitives has no effect.
+  and includes the boundary (EDGE_M). If several primitives contain the centre, the finest category wins (PRECEDENCE).
+  The order of primitives has no effect.
 * Ground fills one voxel per column. This voxel contains the fused surface (`Scene.surface`) at the centre of the
   column. Primitives take precedence over ground.
 * All other voxels are EMPTY. Class ids are those of the palette.
 
 The paper does not define the range in z, the thickness of the ground, or the precedence of overlapping primitives.
 
-The code stores a column of voxels as one integer with one bit per level. A primitive intersects a column in one run of
-levels. A scene therefore needs a few hundred thousand runs instead of millions of voxels.
+The code stores a column of voxels as one integer with one bit per level. In each column, a primitive fills one run of
+consecutive levels. A scene therefore needs a few hundred thousand runs instead of millions of voxels.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def voxelize(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
         voxels: Voxel grid in the scene frame.
 
     Returns:
-        (rows, cols, levels) uint8 class ids. Rows and columns have the order of the rasters; levels ascend.
+        (rows, cols, levels) uint8 class ids. Rows and columns have the order of the rasters; level 0 is the lowest.
     """
     rows, cols, levels = voxels.shape
     # In entry k, the bits of all levels below k are set.
@@ -178,7 +178,7 @@ def _voxelize_ground(scene: Scene, voxels: VoxelGrid) -> tuple[np.ndarray, np.nd
 
 
 class _Runs(NamedTuple):
-    """Intersections of m vertical lines through column centres with primitives."""
+    """Intersections of primitives with vertical lines through column centres."""
 
     column: np.ndarray  # (m,) flat index of the column.
     primitive: np.ndarray  # (m,) index of the primitive in the scene.

@@ -174,7 +174,7 @@ def export_glb(scene: Scene) -> bytes:
       and the exact parameters.
 
     The extras of the file hold the grid and the fields of ABOUT. mesh_import.py reads the same scene from this file,
-    with one difference: its ground is the fused ground. Colours are in linear light, as glTF requires. A viewer then
+    except that the ground is replaced by the fused ground. Colours are in linear light, as glTF requires. A viewer then
     shows the sRGB values of the palette.
 
     Args:

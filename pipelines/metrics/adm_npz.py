@@ -44,7 +44,7 @@ class ReferenceMoments(NamedTuple):
 
 @contextmanager
 def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """Open an archive. Raise ValueError with its path if opening or a later read fails."""
+    """Open an archive. If opening or a later read fails, raise a ValueError that names the path."""
     fs, inside = resolve_uri(path)
     try:
         with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:

@@ -2,8 +2,8 @@
 
 One resample is called a draw. A draw is stored as a row that counts how often each scene is sampled. If a score is a
 sum over scenes, one matrix product computes the score of all draws. Row 0 is the original sample, and its score is the
-value of the estimate. The interval is computed from the scores of the other rows. The draws depend only on the number
-of scenes and the key.
+value of the estimate. The interval is computed from the scores of the draws. The draws depend only on the number of
+scenes and the key.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
         key: Part of the seed. The two sides of a comparison use different keys to make their draws independent.
 
     Returns:
-        (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 is all ones; the other rows are the draws.
+        (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 contains only ones. Each
+        other row is one draw.
     """
     random = np.random.default_rng([count, key])
     picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)

@@ -308,7 +308,7 @@ def find_nearest(
         others: Set that contains the neighbours.
         rows: Samples of `side`.
         count: Number of neighbours per sample.
-        themselves: Whether both sets are the same. If so, a sample is not its own neighbour.
+        themselves: Whether both sets are the same. In this case, a sample does not count as its own neighbour.
 
     Returns:
         (rows, count) squared distances, ascending, and (rows, count) indices of the neighbours.

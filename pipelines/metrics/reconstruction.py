@@ -293,7 +293,7 @@ def compute_detection_scores(
         matches: Matches of all scenes.
         max_detections: Number of highest-scoring detections that are kept per scene and category (Omni3D: 100). None:
             all are kept.
-        min_score: Only detections with a score above this value count.
+        min_score: Detections are ignored unless their score exceeds this value.
 
     Returns:
         Scores of the dataset.
@@ -468,7 +468,7 @@ def compute_voxel_confusion(truth: np.ndarray, prediction: np.ndarray) -> np.nda
         prediction: Class ids of the predicted voxel grid, which has the same shape.
 
     Returns:
-        (classes, classes) int64 voxels, true class in rows.
+        (classes, classes) int64 number of voxels; rows are true classes, and columns are predicted classes.
 
     Raises:
         ValueError: The shapes differ.

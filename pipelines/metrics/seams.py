@@ -23,7 +23,7 @@ from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 MEASURES = (
     "class_changes",  # Share of pixel pairs across the line that differ in class, among pairs with ground.
     "height_step",  # Mean height difference across the line (m), over pixel pairs with ground in both pixels.
-    "cut_objects",  # Share of the objects at the line that end there instead of crossing the line.
+    "cut_objects",  # Share of the objects near the line that end at the line and do not cross it.
     "doubled_objects",  # Share of objects at the line that overlap an object of their category on the other side.
 )
 NEAR_M, FAR_M = 4.0, 16.0

@@ -27,7 +27,7 @@ class ShardPart:
         key: Arguments of the reader of the source (shard_writer.read_drive).
         sequence: Name of the drive.
         poses: Indices of the poses; None: all poses.
-        frames: Frames of these poses. If the drive is unreadable, the rejects list them.
+        frames: Frames of these poses. If the drive is unreadable, each of these frames becomes a reject.
     """
 
     key: tuple
@@ -131,7 +131,7 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
 def plan_argoverse2(root: str) -> list[ShardTask]:
     """Plan tasks of LOGS_PER_SHARD logs each.
 
-    The split train is kept, and val becomes test.
+    Logs of the split `train` keep this split, and logs of the split `val` get the split `test`.
 
     Args:
         root: Directory of the sensor dataset.

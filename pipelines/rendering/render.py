@@ -115,7 +115,7 @@ def render_3d(
 ) -> np.ndarray:
     """Render a scene obliquely with an orthographic camera, like a model on a table in soft light.
 
-    The camera depends only on the scene's grid. Images of scenes of the same size are therefore comparable. A
+    The camera depends only on the scene's grid. Images of two scenes with the same grid are therefore comparable. A
     light-coloured plate under the scene is visible where the scene has no ground.
 
     Args:

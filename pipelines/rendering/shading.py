@@ -48,7 +48,7 @@ class Faces(NamedTuple):
     Attributes:
         corners_m: Corners (t, 3, 3) in the scene frame (m).
         color_id: Row of LINEAR_COLORS (t,).
-        part: Part number (t,): SCENERY or 4 (primitive + 1) + face.
+        part: Part number (t,), which is SCENERY or 4 * (primitive + 1) + face.
     """
 
     corners_m: np.ndarray
@@ -62,7 +62,7 @@ class Surfaces(NamedTuple):
     Attributes:
         depth_m: z in the camera frame (m).
         color_id: Row of LINEAR_COLORS.
-        part: Part number: SCENERY or 4 (primitive + 1) + face.
+        part: Part number, which is SCENERY or 4 * (primitive + 1) + face.
         normal: Outward unit normal in the scene frame.
     """
 

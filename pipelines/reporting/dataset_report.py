@@ -331,8 +331,9 @@ def make_label_sections(facts: DatasetFacts) -> list[Section | DrawingsSection]:
         )
     note = (
         "Each cell is the number of scenes with a pair of density labels. A label depends on the number and the "
-        "total volume of the objects. The label is low if both are below the 25th percentile (p25). It is high if "
-        "both are above the 75th percentile (p75). All other scenes have the label medium."
+        "total volume of the objects. The label is low if number and volume are below their 25th percentiles (p25). "
+        "The label is high if number and volume are above their 75th percentiles (p75). All other scenes have the "
+        "label medium."
     )
     if not facts.description:
         note = "Each cell is the number of scenes with a pair of requested density labels."

@@ -162,7 +162,7 @@ def make_summary(scores: Mapping) -> KeyFigures:
 
 
 def explain_score(name: str) -> str:
-    """Explain a score in words. A name such as `random_precision_k5` is explained by its parts."""
+    """Explain a score in words. For a name such as `random_precision_k5`, explain each part of the name."""
     if name in MEANINGS:
         return MEANINGS[name]
     base, _, k = name.removeprefix("random_").rpartition("_k")

@@ -52,7 +52,7 @@ def pack_scenes(row: dict) -> list[dict]:
 def render_gallery_html(
     catalogue: Catalogue, indices: np.ndarray, title: str, on_scene: Callable[[], None] | None = None
 ) -> str:
-    """Render the page; its size is about 35 kB per scene. Each Ray task packs up to CHUNK scenes of a shard."""
+    """Render the page; its size is about 35 kB per scene. Each Ray task converts up to CHUNK scenes of a shard."""
     import ray.data
 
     tasks = [

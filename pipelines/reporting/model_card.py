@@ -136,9 +136,10 @@ class ModelCard:
         sides = generation["scenes"]
         yield (
             f"## Scores\n\nThe table compares {sides['generated']:,} generated scenes with {sides['real']:,} real "
-            f"scenes of split {self.real_split}. The table also scores the layout VAE's reconstructions of "
-            f"{self.scores['reconstruction']['scenes']:,} scenes. Brackets contain 95 % intervals over scenes. "
-            "`metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
+            f"scenes of split {self.real_split}. The table also contains scores of the layout VAE, "
+            f"which reconstructed {self.scores['reconstruction']['scenes']:,} scenes. "
+            "Brackets contain 95 % intervals over scenes. `metrics.json` contains all scores, and "
+            "docs/concepts/evaluation.md explains them.\n"
         )
         yield from render_table(
             ("score", "value"), ((name, format_value(value)) for name, value in list_headlines(self.scores))

@@ -278,7 +278,7 @@ def describe_voxel_range(scores: Mapping) -> Table:
         rows.append((spell_name(name), partly, voxels["category_outside"][name]))
     note = (
         f"The voxel grid extends from {voxels['bottom_m']:g} to {voxels['top_m']:g} m in height. Voxel scores "
-        "ignore everything outside this range. The table shows the ignored shares of the true scenes."
+        "ignore everything outside this range. The table shows which shares of the true scenes are ignored."
     )
     columns = ("content", "partly outside", "completely outside")
     return Table("Content outside the voxel grid", columns, rows, note=note)
@@ -299,7 +299,8 @@ def list_definitions(scores: Mapping) -> Text:
         "Definitions",
         [
             "Scenes: The decoder receives the mean of the latent, without noise. Reconstructions are compared at the "
-            "resolution of the true scene. All true primitives count, including those without a slot in the tensors.",
+            "resolution of the true scene. The scores cover all true primitives, including those without a slot in "
+            "the tensors.",
             "AP3D: The proposals of all scenes are ranked by existence probability. Each proposal is matched greedily "
             "with the unmatched true primitive of its scene and category that has the highest IoU3D. The average "
             "precision uses 101 recall points. The IoU3D of boxes is exact.",

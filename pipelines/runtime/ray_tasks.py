@@ -32,7 +32,7 @@ def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **optio
         dataset: Input rows.
         function: Function of a row and further arguments (`fn_args`, `fn_kwargs`), or an actor class whose instances
             are such functions.
-        options: Options of `Dataset.map`. The type annotations of Ray allow only functions of the row.
+        options: Options of `Dataset.map`. Ray's type annotations allow only functions with one argument, the row.
 
     Returns:
         Output rows.

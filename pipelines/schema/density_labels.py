@@ -46,8 +46,8 @@ def classify_density(
 ) -> Any:
     """Assign the density label low, medium or high to each scene.
 
-    The label is low if count and volume both lie below their 25th percentile. It is high if both lie above their 75th
-    percentile. It is medium otherwise (paper, supplement A, Scene Labeling).
+    The label is low if count and volume lie below their 25th percentiles. It is high if count and volume lie above
+    their 75th percentiles. Otherwise, it is medium (paper, supplement A, Scene Labeling).
 
     Args:
         count: Number of the group's primitives in each scene, or in a single scene.

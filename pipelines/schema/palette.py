@@ -1,7 +1,7 @@
 """Colours and class ids of the authors' renderings, keyed by category and ground class.
 
 A class id names either a ground class or a primitive category. One small integer therefore describes the class of a
-pixel, triangle or voxel. The authors' data contain no crossings. This project adds id 17 and a colour for them.
+pixel, triangle or voxel. The authors' data contain no crossings. This project adds id 17 and a colour for crossings.
 """
 
 from __future__ import annotations

@@ -218,8 +218,8 @@ def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
         scene: Scene whose ground heights lie within ±327.67 m.
 
     Returns:
-        (height, occupied) as bytes. Only occupied pixels have a height. It is stored as the difference to the previous
-        height.
+        (height, occupied) as bytes. Only occupied pixels have a height. Each height is stored as the difference to the
+        previous height.
 
     Raises:
         ValueError: A ground height, expressed in steps, exceeds the range of 16-bit integers.

@@ -6,8 +6,8 @@ to compute the rows that it needs. A resumed run therefore continues with the ne
 same samples as a single worker.
 
 The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
-polls without pauses and holds the global interpreter lock of Python. On two cores, training steps then take four times
-as long (docs/experiments/reading_training_data.md).
+polls without pauses and holds the global interpreter lock of Python. With Ray Data, training steps on two cores take up
+to four times as long as with this loader (docs/experiments/reading_training_data.md).
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def iterate_batches(
 ) -> Iterator[Arrays]:
     """Yield the local batches of one worker for steps start_step .. stop_step - 1.
 
-    AHEAD Ray tasks read the next samples in advance.
+    Ray tasks read the next samples in advance; AHEAD is the number of these tasks.
 
     Args:
         stream: Order of the samples.

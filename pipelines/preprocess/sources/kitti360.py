@@ -104,7 +104,7 @@ class Defect:
 
 @dataclass(frozen=True)
 class ReadReport:
-    """Number of objects in one XML file for each result of reading.
+    """Number of objects in one XML file that were read or dropped, by reason.
 
     `objects` is the sum of boxes, slabs and all dropped objects.
 
@@ -197,7 +197,7 @@ def read_drive(root: str | Path, sequence: str) -> tuple[Drive, ReadReport]:
 def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
     """Return the boxes and slabs of one XML file, and a report on dropped objects.
 
-    The order is that of the file, and duplicates are dropped.
+    Boxes and slabs have the order of the file. Duplicates are dropped.
     """
     boxes: list[_Box] = []
     slabs: list[_Slab] = []

@@ -199,7 +199,7 @@ def _write_slabs(ground: SlabGround) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _write_slab(vertices: np.ndarray, faces: np.ndarray) -> dict[str, str]:
-    """Write a slab relative to its centre. Also write its mid-plane, which is the real surface."""
+    """Write a slab and its mid-plane relative to the slab's centre. The mid-plane is the real surface."""
     n = len(vertices) // 2
     matrix = np.eye(4)
     matrix[:3, 3] = vertices.mean(axis=0)

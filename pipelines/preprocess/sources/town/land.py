@@ -282,7 +282,7 @@ def clip_ears(outline: np.ndarray) -> list[tuple[int, int, int]]:
             at, refused = (at + 1) % (n - 1), 0  # Skip one corner to avoid fans of thin triangles.
         else:
             at, refused = (at + 1) % n, refused + 1
-            if refused > n:  # Accept flat ears, because all remaining corners are collinear.
+            if refused > n:  # Accept ears without area, because all remaining corners are collinear.
                 assert slack == 0.0, "the outline must not cross itself"
                 slack, refused = 1e-6, 0
     triangles.append(tuple(left))
