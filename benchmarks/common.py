@@ -27,7 +27,7 @@ def describe_machine() -> str:
 def time_interleaved(
     ways: dict[str, Callable[[int], object]], rounds: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, list[float]]:
-    """Time each function once per round. The functions run in turn, so a busy machine slows all functions equally.
+    """Measure each function once per round. The functions run in turn, so a busy machine slows all functions equally.
 
     Each function is called with the number of the round. The result contains a list of times in seconds for each
     function: CPU time, or time measured by `clock`.

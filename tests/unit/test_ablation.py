@@ -118,7 +118,7 @@ def test_encoding_is_bi_lipschitz_only_if_octahedral():
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
 def test_encoding_is_continuous_where_length_equals_width(name):
-    """Along a path of boxes whose length and width become equal, smaller steps cause smaller changes of the code.
+    """If a box changes in smaller steps until its length equals its width, its encoding changes in smaller steps too.
 
     The path turns the box by 180 degrees, tilts it and returns to the same box.
     """
