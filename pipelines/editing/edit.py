@@ -44,7 +44,7 @@ class Select:
     category: tuple[str, ...] = ()
     """Categories of the primitives."""
     primitives: tuple[int, ...] = ()
-    """Numbers of the primitives (from 0), in the order of the scene's rows in the primitives table."""
+    """Indices of the primitives (from 0), in the order of the scene's rows in the primitives table."""
     instances: tuple[int, ...] = ()
     """Values of instance_id."""
     polygon_m: tuple[float, ...] = ()
@@ -80,7 +80,7 @@ class Select:
             (n,) bool.
 
         Raises:
-            ValueError: The conditions are invalid, or a number is not the number of a primitive in the scene.
+            ValueError: The conditions are invalid, or an index in `primitives` is outside the scene.
         """
         self._check_names()
         fits = np.ones(len(scene), bool)
@@ -411,7 +411,7 @@ class Relabel(ObjectEdit):
 
 @dataclass(frozen=True)
 class Snap(ObjectEdit):
-    """Move the lowest point to the height of the ground under the centre.
+    """Move the lowest point of each primitive to the ground height under its centre.
 
     A primitive without ground below is not moved.
     """
@@ -552,8 +552,8 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
 def replay_edits(scene: Scene, edits: Sequence[Edit]) -> tuple[Scene, list[ObjectChange]]:
     """Apply edits in order, and report the changes of each edit.
 
-    Numbers of primitives refer to the input of the respective edit. A removal therefore decreases the numbers of later
-    primitives.
+    The index of a primitive refers to the input of the respective edit. After a removal, all primitives that follow the
+    removed primitive therefore have smaller indices.
 
     Args:
         scene: Scene.

@@ -148,7 +148,7 @@ class _Separation:
 
         longest = within & (np.arange(1, STEPS + 1) == within.sum(axis=2, keepdims=True))
         found = parted(within & parted(longest).any(axis=2, keepdims=True))
-        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS means none.
+        first = np.where(found.any(axis=2), found.argmax(axis=2), STEPS)  # (p, directions); STEPS if none is found.
         result = []
         for k, steps in enumerate(first):
             best = np.argsort(steps, kind="stable")[: min(CANDIDATES, int((steps < STEPS).sum()))]

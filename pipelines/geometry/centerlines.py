@@ -35,8 +35,8 @@ class Road:
     Attributes:
         xyz_m: Points on the ground (m).
         width_m: Width of the whole road at each point (m).
-        start: Node at the first point; -1 if the road leaves the scene there or is a dead end.
-        end: Node at the last point; -1 as for `start`.
+        start: Number of the node at the first point; -1 if the road ends there at the scene's border or in a dead end.
+        end: Number of the node at the last point; -1 under the same conditions as for `start`.
         number: Number of the road in the network.
     """
 
@@ -373,6 +373,6 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
 
 
 def _compute_direction(road: Road) -> np.ndarray:
-    """Return the direction (2,) in which a road leaves its start."""
+    """Return the unit direction (2,) of a road at its first point, seen from above."""
     way = road.xyz_m[min(5, len(road.xyz_m) - 1), :2] - road.xyz_m[0, :2]
     return way / np.linalg.norm(way)

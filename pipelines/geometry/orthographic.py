@@ -125,8 +125,8 @@ def cast_ellipsoids(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> np.ndarray:
     """Find the pixels where the depth from `cast_ellipsoids` exceeds the depth in `depth_m`.
 
-    The function first compares a lower bound of the ellipsoid's depth with `depth_m`. It computes the exact depth only
-    where this bound does not exceed `depth_m`.
+    The function first compares a lower bound of the ellipsoid's depth with `depth_m`. The function computes the exact
+    depth only where this lower bound does not exceed `depth_m`.
 
     Args:
         scene: Scene.
@@ -160,8 +160,8 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
     """Return the flat pixel index (k,) and chord index (k,) of each pixel centre inside an ellipsoid, and the chords.
 
     Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| = 1. L is
-    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The positive
-    root is the third entry.
+    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The third
+    entry is the positive square root of 1 minus the squares of the other two entries.
     """
     view = camera.view
     primitive = np.flatnonzero(scene.category == ELLIPSOID)

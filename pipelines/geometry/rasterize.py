@@ -2,8 +2,8 @@
 
 A vertical ray hits a triangle if the pixel centre lies inside the triangle's vertical projection. The code fills each
 triangle row by row. Each row of a triangle is an interval of columns, and the triangle's plane gives the heights. Each
-pixel keeps the highest hit. The same code makes the ground rasters (paper, Sec. 3.1) and the BEV images. It also makes
-the 3D images, after a rotation of the mesh.
+pixel keeps the highest hit. The same code makes the ground rasters (paper, Sec. 3.1) and the BEV images. The same code
+makes the 3D images from a rotated mesh.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[n
     low, high = _find_column_intervals(row, spans, u, v)
     first, count = list_integers_between(low - EDGE_PX, high + EDGE_PX, grid.cols)
     col = concatenate_ranges(first, count)
-    # Along a row, the height is linear in the column: start + slope_v col.
+    # Along a row, the height is linear in the column: start + slope_v * col.
     start, along_u, along_v, lowest, highest = np.repeat(plane, spans, axis=1)
     height = np.repeat(start + along_u * row, count) + np.repeat(along_v, count) * col
     if np.abs(slope_u).max(initial=0) > STEEP or np.abs(slope_v).max(initial=0) > STEEP:
@@ -186,7 +186,7 @@ def fill_polygon(outline_m: np.ndarray, grid: Grid) -> np.ndarray:
     u_next, v_next = np.roll(u, -1), np.roll(v, -1)
     low, high = np.minimum(u, u_next), np.maximum(u, u_next)
     first = np.ceil(low).clip(0, grid.rows).astype(np.int64)
-    # The interval is half-open. A vertex on a row therefore counts once.
+    # The row interval of each edge is half-open. A vertex on a row therefore counts once.
     beyond = np.ceil(high).clip(0, grid.rows).astype(np.int64)
     row, edge = concatenate_ranges(first, beyond - first), np.repeat(np.arange(len(u)), beyond - first)
     crossing = v[edge] + (row - u[edge]) / (u_next[edge] - u[edge]) * (v_next[edge] - v[edge])

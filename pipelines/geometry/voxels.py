@@ -44,7 +44,7 @@ PRECEDENCE = (
     "construction_big",
 )
 EDGE_M = 1e-9  # A voxel centre within this distance of a primitive's boundary counts as inside.
-LEVEL_AXIS = 1e-12  # An axis whose |z| is below this value counts as horizontal.
+LEVEL_AXIS = 1e-12  # A unit axis with |z| below this value counts as horizontal.
 NUM_CLASSES = len(CLASS_COLORS)
 CLASS_BITS = int(NUM_CLASSES - 1).bit_length()
 MAX_LEVELS = 64  # Number of bits in the integer of a column.
@@ -248,8 +248,8 @@ def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) 
     """For box[i], return the lower and upper y (m,) of its vertical projection at the x offset dx_m[i].
 
     All offsets are relative to the centre of the box. The projection of a box with half edges (n, 3, 2) is a hexagon
-    that is point-symmetric about the centre. Its upper side starts at the rearmost corner and follows the three edges,
-    the steepest first.
+    that is point-symmetric about the centre. The upper side of the hexagon starts at the rearmost corner and follows
+    the three edges, the steepest first.
     """
     backward = (edges_m[..., 0] < 0) | ((edges_m[..., 0] == 0) & (edges_m[..., 1] < 0))
     edges_m = np.where(backward[..., None], -edges_m, edges_m)
@@ -270,8 +270,8 @@ def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     """Compute the runs of all ellipsoids.
 
     Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| <= 1. L is
-    lower triangular. Therefore x determines the first entry of s, and y then determines the second. The third entry
-    lies between the two roots of a quadratic.
+    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The third
+    entry of s lies between the two roots of a quadratic.
     """
     grid, chosen = voxels.columns, np.flatnonzero((scene.category == ELLIPSOID) & (scene.size_m > 0).all(axis=1))
     center_m = scene.center_m[chosen].astype(np.float64)

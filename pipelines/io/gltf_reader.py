@@ -1,6 +1,6 @@
 """Read binary glTF 2.0 files from untrusted sources as meshes, and apply the transforms of the nodes.
 
-The reader uses only the JSON chunk and the binary chunk. It follows no URI, decodes no texture and decompresses
+The reader uses only the JSON chunk and the binary chunk. The reader follows no URI, decodes no texture and decompresses
 nothing. Colours are returned as stored.
 """
 
@@ -31,7 +31,7 @@ class MeshPart(NamedTuple):
         extras: Extras of the node.
         file_from_mesh: Transform from the frame of the mesh to the frame of the file.
         vertices: Vertices in the frame of the file.
-        triangles: Vertex indices; (0, 3) for points.
+        triangles: Vertex indices; shape (0, 3) for a point cloud.
         color: Stored colours in [0, 1]: the vertex colour times the colour of the material.
     """
 
@@ -107,7 +107,7 @@ def _refuse(tree: dict) -> None:
 
 
 def _list_placed_nodes(tree: dict, roots: list[int]) -> Iterator[tuple[dict, np.ndarray]]:
-    """Yield the nodes with the transforms file_from_node (4, 4). Parents come first."""
+    """Yield each node with its transform file_from_node (4, 4). Parents come first."""
     seen, todo = set(), [(root, np.eye(4)) for root in reversed(roots)]
     while todo:
         index, file_from_parent = todo.pop()

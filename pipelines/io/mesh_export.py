@@ -2,7 +2,7 @@
 
 The ground is one fused surface. Each occupied pixel becomes a vertex at the pixel centre, with the colour of the
 pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles; all blocks have the same diagonal. A primitive
-is a unit cuboid or a unit ellipsoid (diameter 1) under T = [R diag(l, w, h) | t].
+is a unit cuboid or a unit ellipsoid (diameter 1), transformed by T = [R diag(l, w, h) | t].
 """
 
 from __future__ import annotations
@@ -167,11 +167,11 @@ def _add_instances(scene: Scene, primitive: np.ndarray, vertices: np.ndarray, tr
 def export_glb(scene: Scene) -> bytes:
     """Export a scene to a binary glTF 2.0 file (y up, metres).
 
-    The node `scene` holds the rotation from z up to y up. Its children are therefore in the scene frame:
+    The node `scene` holds the rotation from z up to y up. The children of this node are therefore in the scene frame:
 
-    * `ground` has vertex colours. It is absent if no pixel is occupied.
-    * `<category>_<index>` is the node of a primitive. Its extras hold category, class id, colour, label, instance id
-      and the exact parameters.
+    * `ground` has vertex colours. This node is absent if no pixel is occupied.
+    * `<category>_<index>` is the node of a primitive. The extras of the node hold category, class id, colour, label,
+      instance id and the exact parameters.
 
     The extras of the file hold the grid and the fields of ABOUT. mesh_import.py reads the same scene from this file,
     except that the ground is replaced by the fused ground. Colours are in linear light, as glTF requires. A viewer then

@@ -64,7 +64,7 @@ class MeshPieces(NamedTuple):
     """Content of a mesh in the scene frame: ground vertices, boxes and ellipsoids.
 
     Attributes:
-        ground_m: One vertex per pixel (m).
+        ground_m: Positions of the ground vertices, one per pixel (m).
         ground_id: Class id of each ground vertex.
         corners_m: Corners of each box (m).
         box_id: Class id of each box.
@@ -105,7 +105,7 @@ def segment_mesh(vertices_m: np.ndarray, triangles: np.ndarray, color: np.ndarra
     votes[:, EMPTY] = 0
     unknown = ~np.any(votes, axis=1)[piece]
     if len(triangles):
-        # Vertices outside all triangles do not need a class colour.
+        # Vertices that belong to no triangle do not need a class colour.
         unknown[np.setdiff1d(np.arange(len(unknown)), triangles)] = False
     if unknown.any():
         stored = "".join(f"{round(255 * value):02x}" for value in color[unknown][0])
@@ -193,7 +193,7 @@ def rasterize_ground(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rasterise ground vertices, which lie at the corners or at the centres of pixels.
 
-    A vertex at a corner is the far left corner of its pixel (x = front_m - row resolution_m). If a pixel has several
+    A vertex at a corner is the far left corner of its pixel (x = front_m - row * resolution_m). If a pixel has several
     vertices of one class, the highest vertex is used.
 
     Args:

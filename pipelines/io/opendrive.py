@@ -1,9 +1,9 @@
 """Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes and junctions.
 
-Each road of centerlines.py becomes an OpenDRIVE road with at least one driving lane per side. Its reference line
-consists of cubic curves through points of the centreline. Roads end before a node. At the node, a connecting road leads
-from each road to every other road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header is the
-position of the scene in the world frame. Traffic keeps to the right.
+Each road of centerlines.py becomes an OpenDRIVE road with at least one driving lane per side. The reference line of a
+road consists of cubic curves through points of the centreline. Roads end before a node. At the node, a connecting road
+leads from each road to every other road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header
+is the position of the scene in the world frame. Traffic keeps to the right.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ SAMPLES = 64  # Number of samples that measure the length of a cubic curve.
 class ReferenceLine:
     """A smooth curve through k knots.
 
-    The parameter is the chord length.
+    The curve parameter is the cumulative chord length.
 
     Attributes:
-        curve: Map from chord length to x, y and z in the scene frame (m).
-        breaks: Chord length at each knot (m).
-        lengths_m: Length of each piece, seen from above (m).
+        curve: Map from cumulative chord length to x, y and z in the scene frame (m).
+        breaks: Cumulative chord length at each knot (m).
+        lengths_m: Length of the curve between successive knots, seen from above (m).
         width_m: Width of the whole road at each knot (m).
     """
 
@@ -79,7 +79,7 @@ class ReferenceLine:
         return np.append(0, np.cumsum(self.lengths_m))
 
     def end(self, which: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position and direction of an end.
+        """Return the position and direction of the line at one end.
 
         Args:
             which: 0 for the first point, -1 for the last point.
@@ -200,7 +200,7 @@ def _make_road_body(
 ) -> None:
     """Write the plan view, elevation and lanes of a road.
 
-    For a connecting road, `links` holds the signs of the lane numbers of the previous and the next road.
+    For a connecting road, `links` holds two signs: those of the lane numbers in the previous road and in the next road.
     """
     ET.SubElement(ET.SubElement(road, "type", s="0", type="town"), "speed", max="50", unit="km/h")
     plan, profile = ET.SubElement(road, "planView"), ET.Element("elevationProfile")
@@ -259,7 +259,7 @@ def _make_widths(lane: ET.Element, line: ReferenceLine, lanes: int) -> None:
 
 
 def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[ReferenceLine], node: int) -> ET.Element:
-    """Return the element of a junction, and add its connecting roads to `root`."""
+    """Return the XML element of a junction, and add its connecting roads to `root`."""
     junction = ET.Element("junction", id=_make_junction_id(node), name="", type="default")
     ends = [
         (road.number, end)
@@ -280,8 +280,8 @@ def _make_junction(root: ET.Element, network: RoadNetwork, lines: list[Reference
         points = ["end" if come_end else "start", "end" if go_end else "start"]
         for name, other, point in zip(("predecessor", "successor"), (come, go), points, strict=True):
             ET.SubElement(link, name, elementType="road", elementId=str(other), contactPoint=point)
-        # Traffic keeps to the right. At the end of a road, traffic leaves on negative lanes. At the start of a road,
-        # traffic leaves on positive lanes.
+        # Traffic keeps to the right. At the end of a road, traffic exits on negative lanes. At the start of a road,
+        # traffic exits on positive lanes.
         signs = (-1 if come_end else 1), (1 if go_end else -1)
         _make_road_body(road, line, left=0, right=lanes, links=signs)
         about = {"incomingRoad": str(come), "connectingRoad": str(number), "contactPoint": "start"}

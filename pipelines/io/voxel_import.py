@@ -29,7 +29,7 @@ VOXEL_AXES: Axes = ("x-", "y-", "z+")
 ARRAY = "voxels"
 FULL = VoxelGrid().shape
 SHAPES = tuple(tuple(n // factor for n in FULL) for factor in (1, 2, 4))
-MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size of an array of 64-bit numbers, including the header.
+MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size in bytes of the largest array: 64-bit numbers and a header.
 
 
 def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:

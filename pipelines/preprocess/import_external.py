@@ -1,7 +1,8 @@
 """Import output files of other methods for evaluation.
 
 One Ray Data graph runs one task per batch of files. GLB meshes become scene tables with source=imported-<name>. Voxel
-grids contain no primitives. They therefore become images from above. An unreadable file becomes a row of `rejects`.
+grids contain no primitives. Each voxel grid therefore becomes an image seen from above. An unreadable file becomes
+a row of `rejects`.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def make_pictures_shard(path: str) -> np.ndarray:
 def import_files(request: ImportRequest, on_shard: Callable[[int], None] | None = None) -> dict:
     """Import all files of a request.
 
-    A second call resumes an interrupted import. It reads shards with rejects again.
+    A second call resumes an interrupted import. The second call also reads the shards with rejects again.
 
     Args:
         request: Files, name and output directory.

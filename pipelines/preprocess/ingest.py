@@ -2,8 +2,8 @@
 
 Each pass is one Ray Data graph. Pass 1 creates scenes. Each task writes the files of one shard to a staging directory,
 first under temporary names. A killed task therefore leaves no partial file, and a finished shard is not written again.
-Pass 2 needs the whole training split. Pass 2 computes density thresholds, slots per category and value bounds. It then
-labels the scenes and moves all files to the dataset directory. The file dataset.json is written last and marks the
+Pass 2 needs the whole training split. Pass 2 computes density thresholds, slots per category and value bounds. Pass 2
+then labels the scenes and moves all files to the dataset directory. The file dataset.json is written last and marks the
 dataset as complete. The driver process reads only manifests, not scenes.
 """
 
@@ -97,7 +97,7 @@ def publish_shards(root: str, staging: str, manifests: list[dict], statistics: S
     """
 
     def move(row: dict) -> dict:
-        """Move the files of the shard in the row.
+        """Move the files of the shard whose number is in the row.
 
         The scenes file is moved last, because it marks the shard as written.
         """

@@ -95,7 +95,7 @@ def _check_poses(drive: Drive, part: ShardPart, poses: tuple[int, ...]) -> Drive
 
 
 class ShardCut:
-    """Iterator over the scenes of a task. It collects rejected scenes and unreadable drives."""
+    """Iterator over the scenes of a task. The iterator collects rejected scenes and unreadable drives."""
 
     def __init__(self, task: ShardTask, grid: Grid, read: ReadDrive = read_drive) -> None:
         self.task, self.grid, self.read = task, grid, read
@@ -204,7 +204,7 @@ def write_shard(task: ShardTask, staging: str, grid: Grid, read: ReadDrive = rea
     if tables:
         joined = join_tables(tables)
         num_scenes = len(joined["scenes"])
-        # The scenes file marks the shard as written. It is therefore written last.
+        # The scenes file marks the shard as written. This file is therefore written last.
         for name in ("primitives", "rasters", "scenes"):
             storage.write_parquet(joined[name], shard.path(name))
     if cuts.rejects:

@@ -27,7 +27,7 @@ class ShardPart:
         key: Arguments of the reader of the source (shard_writer.read_drive).
         sequence: Name of the drive.
         poses: Indices of the poses; None: all poses.
-        frames: Frames of these poses. If the drive is unreadable, each of these frames becomes a reject.
+        frames: Frame number of each of these poses. If the drive is unreadable, each of these frames becomes a reject.
     """
 
     key: tuple
@@ -80,8 +80,9 @@ def plan_kitti360(root: str, split: bool = True, skip_unreadable: bool = False) 
 
     Args:
         root: Directory of KITTI-360.
-        split: Whether to use the paper's split. If False, all poses are train.
-        skip_unreadable: Whether a sequence with missing or invalid poses becomes a reject. If False, it is an error.
+        split: Whether to use the paper's split. If False, all poses get the split train.
+        skip_unreadable: Whether a sequence with missing or invalid poses becomes a reject. If False, such a sequence
+            raises an error.
 
     Returns:
         The tasks.
@@ -104,8 +105,9 @@ def plan_custom(root: str, split: bool = True, skip_unreadable: bool = False) ->
 
     Args:
         root: Directory of all drives.
-        split: Whether to use the paper's split if splits.json is absent. If False, all poses are train.
-        skip_unreadable: Whether a drive with missing or invalid poses becomes a reject. If False, it is an error.
+        split: Whether to use the paper's split if splits.json is absent. If False, all poses get the split train.
+        skip_unreadable: Whether a drive with missing or invalid poses becomes a reject. If False, such a drive raises
+            an error.
 
     Returns:
         The tasks.

@@ -124,7 +124,7 @@ class Painter:
 class StreetPainter:
     """Ray actor that generates the missing photographs of a drive.
 
-    The input row holds the number of the drive. The output row holds its number of frames.
+    The input row holds the index of the drive. The output row holds the number of frames in this drive.
     """
 
     def __init__(self, request: PhotoRequest, directories: Sequence[str]) -> None:

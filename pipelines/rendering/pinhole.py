@@ -183,7 +183,7 @@ class StreetRenderer:
 
 
 def _list_pixels(lens: Lens) -> Grid:
-    """Return the image as a Grid (rasterize.py): x = -v - 1/2, y = -u - 1/2."""
+    """Return the image as a Grid (rasterize.py), with x = -v - 1/2 and y = -u - 1/2."""
     return Grid(0.0, 0.0, 1.0, lens.height, lens.width)
 
 
@@ -251,8 +251,8 @@ def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each ellipsoid and each pixel centre on it, return the flat pixel index, the primitive and 1 / depth (m,).
 
-    A ray t d, with z = 1 in d, intersects |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d.M^T M
-    p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. The pixels of a row with a solution form
+    A ray t d, with z = 1 in d, intersects |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d^T M^T
+    M p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. The pixels of a row with a solution form
     the interval between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are skipped.
     """
     lens = camera.lens

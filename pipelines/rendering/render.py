@@ -172,7 +172,7 @@ def arrange_contact_sheet(
 ) -> np.ndarray:
     """Arrange images on a white sheet.
 
-    The caption is below each image. All cells have the size of the largest image.
+    The caption is below each image. Each image gets a cell with the size of the largest image.
 
     Args:
         pictures: Images (h, w, 3) uint8.

@@ -1,8 +1,8 @@
 """Compute the visible surface and the light of each pixel in 3D images.
 
 The scene is lit by a sun with soft shadows and by a sky. Primitives have thin outlines. The sky light is stronger on
-surfaces that face up. It is weaker near other surfaces. Class colours are kept: a horizontal surface in the sun has
-exactly its palette colour.
+surfaces that face up. The sky light is weaker near other surfaces. Class colours are kept: a horizontal surface in the
+sun has exactly its palette colour.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Faces(NamedTuple):
 
     Attributes:
         corners_m: Corners (t, 3, 3) in the scene frame (m).
-        color_id: Row of LINEAR_COLORS (t,).
+        color_id: Row index (t,) into LINEAR_COLORS.
         part: Part number (t,), which is SCENERY or 4 * (primitive + 1) + face.
     """
 
@@ -61,7 +61,7 @@ class Surfaces(NamedTuple):
 
     Attributes:
         depth_m: z in the camera frame (m).
-        color_id: Row of LINEAR_COLORS.
+        color_id: Row index into LINEAR_COLORS.
         part: Part number, which is SCENERY or 4 * (primitive + 1) + face.
         normal: Outward unit normal in the scene frame.
     """
@@ -139,7 +139,8 @@ def _make_cuboid_faces(scene: Scene) -> Faces:
 def _make_sheet(scene: Scene) -> np.ndarray:
     """Return the heights (rows, cols) of the plate, which lies just below the ground.
 
-    There is about one node per metre. Where the scene has no ground, the plate has the height of the nearest ground.
+    The plate has about one height per metre along each axis. Where the scene has no ground, the plate has the height of
+    the nearest ground.
     """
     height, winner = scene.surface()
     if (winner < 0).all():
@@ -163,7 +164,7 @@ def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
 
 
 def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
-    """Return the depth (H, 1) of the table in each image row, from scene z = up x + near depth."""
+    """Return the depth (H, 1) of the table in each image row, computed from z = up * x + near * depth."""
     up, _, near = camera.camera_from_scene[:, 2]
     return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 
@@ -254,7 +255,7 @@ def _project_flat(view: Grid, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _draw_lines(seen: Surfaces) -> np.ndarray:
     """Return the share (H, W) of light that lines remove.
 
-    A line lies on the nearer side of a border between two parts.
+    At a border between two parts, the line lies on the part that is nearer to the camera.
     """
     lost = np.zeros(seen.part.shape, np.float32)
     for axis in (0, 1):

@@ -61,7 +61,8 @@ def compute_training_statistics(
         manifests: Manifests of all shards.
         staging: Directory with the tables of the shards.
         grid: Grid of the rasters.
-        slots: Number of slots per category; in the paper, they sum to N = 514. None: the 95th percentile of each count.
+        slots: Number of slots per category; in the paper, they sum to N = 514. None: the 95th percentile of each
+            category's count per scene.
 
     Returns:
         Statistics of all training scenes.

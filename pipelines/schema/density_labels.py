@@ -13,7 +13,7 @@ from models.scene import DENSITIES
 
 @dataclass(frozen=True)
 class DensityThresholds:
-    """Thresholds of a group: 25th and 75th percentiles of its count and its total volume in the training scenes."""
+    """Percentiles (25th and 75th) of a group's count and total volume per training scene."""
 
     count_p25: float
     count_p75: float
@@ -46,8 +46,8 @@ def classify_density(
 ) -> Any:
     """Assign the density label low, medium or high to each scene.
 
-    The label is low if count and volume lie below their 25th percentiles. It is high if count and volume lie above
-    their 75th percentiles. Otherwise, it is medium (paper, supplement A, Scene Labeling).
+    The label is low if count and volume lie below their 25th percentiles. The label is high if count and volume lie
+    above their 75th percentiles. Otherwise, the label is medium (paper, supplement A, Scene Labeling).
 
     Args:
         count: Number of the group's primitives in each scene, or in a single scene.

@@ -25,7 +25,7 @@ def guard_options(
         record: Path of the JSON file with the options.
         options: Options of this run; values must be valid in JSON.
         is_in_use: Function that returns whether the run with the recorded options has results that must be kept.
-        discard: Function that deletes the incomplete results of the run with other options.
+        discard: Function that deletes the incomplete results of an earlier run with different options.
         describe: Function that returns the error message for a difference such as "seed=1, asked for 2".
 
     Raises:
@@ -48,7 +48,7 @@ def guard_run(output: str, source: str, run: str, options: Mapping[str, object],
         source: Value of the source column, such as generated-<run>.
         run: Run name.
         options: Options of this run; values must be valid in JSON.
-        parts: More directories to which the run writes. An earlier run with other options is replaced only if it wrote
+        parts: Additional output directories of the run. An earlier run with other options is replaced only if it wrote
             neither a scene nor a file in these directories.
 
     Raises:

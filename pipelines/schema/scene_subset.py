@@ -26,7 +26,7 @@ class SceneSubset:
     * spread: evenly spaced over all scenes.
     * first: the first scenes.
     * farthest: farthest point sampling of the poses (paper, supplement, Precision and Recall Metrics).
-    * apart: poses at distances of at least apart_m, then evenly subsampled to `limit` (same section of the paper).
+    * apart: poses at least apart_m apart, evenly subsampled to `limit` (paper, same section as for farthest).
     * balanced: the same number of scenes for each pair of density labels if available, evenly spaced within a pair.
 
     Attributes:
@@ -67,7 +67,7 @@ class SceneSubset:
         return self._shards
 
     def files(self) -> list[list]:
-        """Return a fingerprint of each selected file, followed by the selected rows.
+        """Return a fingerprint of each selected file, followed by the numbers of the selected rows.
 
         The result changes when the selection or a file changes.
         """
@@ -90,7 +90,7 @@ class SceneSubset:
         """Select rows of a table of all scenes.
 
         Args:
-            scenes: Columns COLUMNS of all scenes.
+            scenes: Table of all scenes with the columns COLUMNS.
             source: (n,) source of each scene.
 
         Returns:
@@ -139,26 +139,26 @@ def select_evenly(total: int, count: int) -> np.ndarray:
     """Select evenly spaced integers from 0 to total - 1.
 
     Args:
-        total: Number of candidates.
-        count: Number of candidates to select, at most `total`.
+        total: Number of integers from which to select.
+        count: Number of integers to select, at most `total`.
 
     Returns:
-        (count,) selected numbers in ascending order.
+        (count,) selected integers in ascending order.
     """
     return np.floor((np.arange(count) + 0.5) * total / max(count, 1)).astype(int)
 
 
 def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Read the position of each scene and the number of its world frame.
+    """Read the position of each scene and the index of its world frame.
 
     Callers treat poses of different world frames as infinitely far apart.
 
     Args:
-        scenes: Columns COLUMNS of the scenes.
+        scenes: Table of the n scenes with the columns COLUMNS.
         source: (n,) source of each scene.
 
     Returns:
-        (n, 2) position in the world frame (m), and (n,) number of the world frame.
+        (n, 2) position in the world frame (m), and (n,) index of the world frame.
     """
     world = np.where(np.isin(source, ONE_WORLD), "", scenes["sequence"].to_numpy().astype(str))
     world = np.unique(np.char.add(np.char.add(source.astype(str), "/"), world), return_inverse=True)[1]
@@ -172,7 +172,7 @@ def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarr
 
     Args:
         xy_m: (n, 2) position of each pose (m).
-        world: (n,) number of the world frame of each pose.
+        world: (n,) index of each pose's world frame.
         count: Number of poses to select, at most n.
 
     Returns:
@@ -199,7 +199,7 @@ def select_apart(xy_m: np.ndarray, world: np.ndarray, apart_m: float) -> np.ndar
 
     Args:
         xy_m: (n, 2) position of each pose (m).
-        world: (n,) number of the world frame of each pose.
+        world: (n,) index of each pose's world frame.
         apart_m: Minimum distance between selected poses (m).
 
     Returns:

@@ -28,13 +28,13 @@ def split_poses(positions_by_sequence: dict[str, np.ndarray]) -> dict[str, np.nd
     """Assign the split train, test or unused to every pose of every sequence.
 
     The sequences are concatenated, and the total driven distance is cut into segments of equal length. The gap between
-    two sequences counts as 0 m. A segment has the parts
+    two sequences counts as 0 m. Each segment is divided as follows:
 
         train ... | 5 m unused | 15 m test | 5 m unused
 
     Then every train pose within 5 m (BEV) of a test pose becomes unused. Every test pose within 5 m of a train pose
     also becomes unused. The paper does not define the order of these two removals. In this code, both removals use the
-    original splits, which hold before the first removal. Both poses of a close pair therefore become unused.
+    splits from before the first removal. Both poses of a close pair therefore become unused.
 
     Args:
         positions_by_sequence: (p, 3) positions of each sequence in driving order (m), in one shared world frame. Pass
@@ -99,7 +99,7 @@ def count_segments(total_m: float) -> int:
 
 
 def _compute_distance_driven(positions_m: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the driven distance at each pose of all sequences, shape (sum of p,), and the total distance (m)."""
+    """Return the distance driven up to each pose of all sequences, shape (sum of p,), and the total distance (m)."""
     steps = [
         np.concatenate([[0.0], np.linalg.norm(np.diff(np.asarray(p, np.float64), axis=0), axis=1)])
         for p in positions_m

@@ -23,7 +23,7 @@ from pipelines.runtime import storage
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
 HEIGHT_STEP_M = 0.01
-MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height that a 16-bit integer can store.
+MAX_HEIGHT_M = 32767 * HEIGHT_STEP_M  # Largest height (m) that a 16-bit integer can store.
 
 # Meanings of the categories and ground classes, used in the descriptions of columns.
 # fmt: off
@@ -222,7 +222,7 @@ def encode_ground(scene: Scene) -> tuple[bytes, bytes]:
         previous height.
 
     Raises:
-        ValueError: A ground height, expressed in steps, exceeds the range of 16-bit integers.
+        ValueError: A ground height, in units of HEIGHT_STEP_M, exceeds the range of 16-bit integers.
     """
     steps = np.round(scene.height_m[scene.occupied] / HEIGHT_STEP_M)
     if len(steps) and np.abs(steps).max() > 32767:
@@ -241,7 +241,7 @@ def decode_ground(
         height: Column `height`.
         occupied: Column `occupied`.
         shape: (G, H, W) number of ground classes, rows and columns.
-        step_m: Column `height_step_m` (m).
+        step_m: Height of one integer unit, from the column `height_step_m` (m).
 
     Returns:
         height_m (G, H, W) float32, which is 0 outside the mask; and occupied (G, H, W) bool.
@@ -253,7 +253,7 @@ def decode_ground(
 
 
 def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Decode one row of `rasters`: the heights of occupied pixels (in steps) and the mask.
+    """Decode one row of `rasters`: the heights of occupied pixels as integers, and the mask.
 
     Args:
         height: Column `height`.
@@ -261,7 +261,7 @@ def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int
         shape: (G, H, W) number of ground classes, rows and columns.
 
     Returns:
-        Heights of the occupied pixels (m,) int16 in steps of height_step_m, and occupied (G, H, W) bool.
+        Heights of the occupied pixels (m,) int16 in units of height_step_m, and occupied (G, H, W) bool.
     """
     mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
     return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
@@ -490,7 +490,7 @@ def _read_primitive_fields(primitives: pa.Table) -> dict[str, np.ndarray]:
 class Shard:
     """One shard of a dataset directory.
 
-    It has one Parquet file per table, all with the same number.
+    A shard has one Parquet file per table; all these files have the same number.
 
     Attributes:
         root: Dataset directory.

@@ -60,7 +60,7 @@ EGO_LABEL = "EGO_VEHICLE"  # Some logs contain a box for the recording car itsel
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 SIZE = ("length_m", "width_m", "height_m")
-MAX_BOX_DISTANCE_M = 1e3  # Largest valid distance of a box; real boxes lie up to 220 m away.
+MAX_BOX_DISTANCE_M = 1e3  # Largest valid distance from the ego vehicle to a box; real boxes lie up to 220 m away.
 MAX_BOX_SIZE_M = 1e2
 MIN_BOX_SIZE_M = 1e-3
 MAX_COORDINATE_M = 1e6
@@ -331,7 +331,10 @@ def _are_all_numbers(values: list, largest: float) -> bool:
 
 
 def _read_quad(edge1_m: np.ndarray, edge2_m: np.ndarray) -> np.ndarray:
-    """Return the outline (4, 2) between two edges (2, 2). The edges may have the same or opposite directions."""
+    """Return the outline (4, 2) of the area between two edges (2, 2).
+
+    The edges may have the same or opposite directions.
+    """
     if (edge1_m[1] - edge1_m[0]) @ (edge2_m[1] - edge2_m[0]) < 0:
         edge2_m = edge2_m[::-1]
     return np.concatenate([edge1_m, edge2_m[::-1]])

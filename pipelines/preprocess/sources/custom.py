@@ -63,7 +63,8 @@ MAX_EXACT_FLOAT = 2**53
 # Minimum cosine of the angle between the z axes of ego and world frame. Real roads give larger values, and camera
 # frames give smaller values.
 MIN_UP = 0.5
-# At least one pose must lie within this distance of the content. The farthest corner of a crop is 72 m away.
+# At least one pose must lie within this distance of the content. The farthest corner of a crop is 72 m from the
+# vehicle.
 SIGHT_M = 100.0
 
 
@@ -225,7 +226,7 @@ class _Table:
         return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
 
     def frames(self, missing: int | None = None) -> np.ndarray:
-        """Return frames (rows,) int64 >= 0.
+        """Return frame numbers (rows,) int64 >= 0.
 
         An absent frame becomes `missing`. If `missing` is None, an absent frame raises an error.
         """
@@ -453,7 +454,7 @@ def _read_matrices(table: _Table) -> np.ndarray:
 def _is_text(value: object) -> bool:
     """Return whether a value is a str that files can store.
 
-    JSON escapes can produce a single half of a surrogate pair. Files cannot store this character.
+    JSON escapes can produce a single half of a surrogate pair. Files cannot store such a half.
     """
     return type(value) is str and (value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value))
 

@@ -66,7 +66,7 @@ class SlabGround:
     Attributes:
         slab_class: Index of each slab's class in the drive's ground_classes.
         vertices_m: Vertices in the world frame (m).
-        vertex_slab: Slab of each vertex.
+        vertex_slab: Index of each vertex's slab.
         triangles: Vertex indices; a triangle belongs to the slab of its first vertex.
     """
 
@@ -98,7 +98,7 @@ class SlabGround:
 
     @cached_property
     def _upper(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the triangles except undersides, and the slab of each triangle.
+        """Return all triangles except those of undersides, and the slab index of each triangle.
 
         Undersides are not needed: a vertical ray first hits the top or a side of an extruded slab. In KITTI-360's
         format, the second half of a slab's vertices is a copy of the first half that is shifted down.
@@ -284,14 +284,14 @@ class Drive:
         source: Value of the source column.
         sequence: Name of the drive.
         category: Index into CATEGORIES.
-        rotation: Any proper rotation; scenes convert it to the canonical form.
+        rotation: Orientation of each box in the world frame, as any proper rotation; scenes store the canonical form.
         size_m: Full extents along the columns of `rotation`.
         heading_rad: Yaw of the direction of travel in the world frame; NaN if unknown.
         instance_id: Number of the object, or -1.
         label: Class name in the source dataset.
         timestamp: Frame in which a moving box has this position; STATIC for static boxes.
-        frame: Frame of each pose.
-        world_from_imu: Pose matrices; the x axis points forward.
+        frame: Frame number of each pose.
+        world_from_imu: Pose matrices of the IMU, whose x axis points forward.
     """
 
     source: str

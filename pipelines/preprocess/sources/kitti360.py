@@ -5,7 +5,7 @@
 
 The name of a sequence is its four digits. The z axis of the world frame points up. The axes of the IMU are x forward, y
 right and z down. The XML file (over 100 MB for the longest drives) is streamed. The reader skips and reports defective
-objects. It raises ValueError if the file itself is invalid.
+objects. The reader raises ValueError if the file itself is invalid.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class ReadReport:
     Attributes:
         dropped: Number of objects for each known label without a category.
         unknown: Number of objects for each label that is in none of the tables.
-        duplicates: Number of dropped second copies.
+        duplicates: Number of duplicate objects that were dropped.
         defects: Objects that cannot be read.
     """
 
@@ -361,7 +361,7 @@ def _read_index(fields: dict) -> int:
 
 
 def _read_floats(words: list[str]) -> np.ndarray | None:
-    """Return (n,) float64, or None if a word is not a finite number."""
+    """Return n words as (n,) float64, or None if a word is not a finite number."""
     try:
         values = np.array(words, np.float64)
     except ValueError:
@@ -385,7 +385,10 @@ def _read_matrix(fields: dict, tag: str, cols: int) -> np.ndarray:
 
 
 def _read_vertices_and_transform(fields: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return local vertices (v, 3), world_from_local (4, 4) and world vertices (v, 3). All are float64 (m)."""
+    """Return local vertices (v, 3), world_from_local (4, 4) and world vertices (v, 3).
+
+    All three arrays are float64 (m).
+    """
     world_from_local = _read_matrix(fields, "transform", 4)
     if world_from_local.shape != (4, 4) or np.abs(world_from_local[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DefectiveObject("transform is not an affine 4 x 4 matrix")
@@ -443,8 +446,8 @@ def compute_box_geometry(
 
     Args:
         world_from_local: (4, 4) transform.
-        vertices: (v, 3) local vertices. The function uses only their extent: 1 for the unit cube, 2 for the sphere of
-            radius 1.
+        vertices: (v, 3) local vertices. The function uses only the extent of the mesh: 1 for the unit cube, 2 for the
+            sphere of radius 1.
 
     Returns:
         center_m (3,), proper rotation (3, 3) and full size_m (3,) in the world frame.

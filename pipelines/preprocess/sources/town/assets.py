@@ -51,7 +51,10 @@ class Site:
 def draw_sizes(
     rng: np.random.Generator, what: str, n: int, scale: float | np.ndarray | tuple[float, float, float] = 1.0
 ) -> np.ndarray:
-    """Sample sizes (n, 3) of a kind of object (m), with length >= width. `scale` is one factor, or three factors."""
+    """Return random sizes (n, 3) of n objects of one kind (m), with length >= width.
+
+    `scale` multiplies the sizes: one factor for all axes, or one factor per axis.
+    """
     median, common, each, low, high = SIZES[what]
     factor = np.exp(common * rng.standard_normal((n, 1)) + each * rng.standard_normal((n, 3)))
     drawn = (np.array(median) * scale * factor).clip(low, high)
@@ -69,7 +72,7 @@ def plant_strip(
 
 
 def place_cars(site: Site, frame: LocalFrame, s: np.ndarray, t: float, yaw: float = np.pi) -> None:
-    """Place parked cars at s. Most cars point in the direction of the adjacent lane."""
+    """Place parked cars at the positions s along the street. Most cars point in the direction of the adjacent lane."""
     n = len(s)
     turned = yaw + np.pi * (site.rng.random(n) < 0.12) + site.rng.normal(0, 0.03, n)
     site.sheet.boxes(

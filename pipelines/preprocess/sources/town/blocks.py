@@ -148,7 +148,7 @@ def _place_curb_cars(site: Site, frame: LocalFrame, start: float, end: float) ->
 
 
 def _place_furniture(site: Site, frame: LocalFrame, start: float, end: float, depth: float, corner: bool) -> None:
-    """Place lamps, traffic signs, traffic lights, street trees and pedestrians on one side."""
+    """Place lamps, traffic signs, traffic lights, street trees and pedestrians on one side of a block."""
     length = max(0.0, end - start)
     n = site.rng.poisson(site.district.lamps_per_100m * site.mood.furniture * length / 100)
     if n:

@@ -137,16 +137,16 @@ class Sheet:
         """Add n boxes of one label.
 
         Args:
-            frame: Frame of (s, t).
+            frame: Local frame in which s and t are defined.
             label: Label of the boxes.
             s: Position along the street (m), (n,) or one value for all boxes.
             t: Distance from the street (m), (n,) or one value for all boxes.
             size_m: (n, 3) or (3,) length, width and height.
             yaw_rad: Angle from the s axis to the length axis (rad).
-            bottom_m: Height of the lower side above the surface.
+            bottom_m: Height of the underside above the surface (m).
             ellipsoid: Whether the primitives are ellipsoids.
             timestamp: Frame of a moving box; -1 for static boxes.
-            track: Number of a moving object; -1 for static objects.
+            track: Track number of a moving object; -1 for static objects.
         """
         s, t, size_m = np.atleast_1d(s), np.atleast_1d(t), np.atleast_2d(size_m)
         rows = np.empty((len(s), 11))
@@ -163,7 +163,7 @@ class Sheet:
 def trace_outlines(cells: np.ndarray, s: list[float], t: list[float]) -> list[tuple[int, list[tuple[float, float]]]]:
     """Return the outlines of the patches in a grid of cells.
 
-    A patch is a 4-connected set of cells with the same value >= 0. It must have no holes. Outlines need not be
+    A patch is a 4-connected set of cells with the same value >= 0. A patch must have no holes. Outlines need not be
     rectangles.
 
     Args:
@@ -207,7 +207,7 @@ def _trace(members: set[tuple[int, int]]) -> list[tuple[int, int]]:
     start = min(ahead)
     outline, here, step = [start], start, (0, -1)
     while True:
-        # Where two cells touch only at a corner, turn left to follow the same cell.
+        # Where two cells touch only at a corner, turn to the left to follow the same cell.
         options = ahead[here]
         there = max(options, key=lambda p: step[0] * (p[1] - here[1]) - step[1] * (p[0] - here[0]))
         options.remove(there)

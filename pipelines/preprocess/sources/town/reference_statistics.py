@@ -31,7 +31,7 @@ COUNTS = {
     "traffic_control": (4, 8, 8),
     "object": (2, 5, 6),
 }
-# Share of the scene's area (4096 m2) in scenes with low, medium and high vegetation density.
+# Share of the scene's area (4096 m2) that each class covers, in scenes with low, medium and high vegetation density.
 AREAS = {
     "road": (0.19, 0.19, 0.14),
     "sidewalk": (0.12, 0.11, 0.11),
@@ -81,9 +81,9 @@ class Sample:
     """Statistics of n scenes for `measure_town`.
 
     Attributes:
-        counts: Number of primitives per category.
-        vegetation_volume_m3: Total volume of vegetation (m3).
-        areas: Area shares, in the order of AREAS.
+        counts: Number of primitives of each category in each scene.
+        vegetation_volume_m3: Total volume of the vegetation in each scene (m3).
+        areas: Share of each scene's area that each class covers, in the order of AREAS.
         size_m: Sizes (k, 3) of all boxes for each name in SIZES_M (m).
     """
 

@@ -47,7 +47,7 @@ class Streets:
         return (min(a, b), max(a, b)) in self.edges
 
     def arms(self, node: Node) -> list[bool]:
-        """Return four values: whether a street leaves the node to the east, north, west and south."""
+        """Return four values: whether a street connects the node to its east, north, west and south neighbour."""
         return [self.has(node, (node[0] + di, node[1] + dj)) for di, dj in ARMS]
 
     def at(self, node: Node) -> np.ndarray:
@@ -257,7 +257,7 @@ def _compute_lane(streets: Streets, a: Node, b: Node) -> tuple[np.ndarray, np.nd
 
 
 def _compute_turn(start: np.ndarray, heading: np.ndarray, end: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Return a parabola (k, 2) from one lane to the next. For a U-turn, it is a straight line."""
+    """Return a parabola (k, 2) from one lane to the next. For a U-turn, the path is a straight line."""
     knee = start + heading * ((end - start) @ heading) if abs(heading @ out) < 0.5 else (start + end) / 2
     steps = max(3, int(np.linalg.norm(end - start)))
     w = np.linspace(0, 1, steps)[1:-1, None]
