@@ -1,7 +1,8 @@
 """Run the paper's ablations as Ray graphs, and build their tables and charts.
 
 There are three studies. `reconstruct_boxes` compares the encodings of a box. `compute_yaw_losses` measures the loss of
-IoU3D that yaw errors cause. Both use random boxes and read no dataset. The variants compare branches of the layout VAE.
+IoU3D that yaw errors cause. The two studies of boxes use random boxes and read no dataset. The variants compare
+branches of the layout VAE.
 """
 
 from __future__ import annotations
@@ -124,7 +125,8 @@ def reconstruct_boxes(
     parallel: int | None = None,
     on_trial: Callable[[], None] | None = None,
 ) -> list[dict]:
-    """Return the scores of all trials. Existing scores in `directory` are read, and all other trials are trained.
+    """Return the scores of all trials. If `directory` contains the scores of a trial, the scores are read. All other
+    trials are trained.
 
     Args:
         wanted: Trials.
@@ -218,10 +220,10 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     """Add noise to the encoding of `count` boxes, and compute the resulting loss of IoU3D.
 
     The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
-    is Gaussian. Its standard deviation is `noise` times the range of the entry over "any" boxes. Constant entries
-    therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with the true
-    axes minus the IoU3D of the decoded box. The extents along the true axes are computed from the decoded scatter
-    matrix.
+    is Gaussian. The standard deviation of the noise is `noise` times the range of the entry over "any" boxes. Constant
+    entries therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with
+    the true axes minus the IoU3D of the decoded box. The extents along the true axes are computed from the decoded
+    scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -429,7 +431,8 @@ def _round_values(value: float | str | None) -> float | str | None:
 
 
 def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Chart:
-    """Chart mean IoU3D over training size (paper's figure), with a line per encoding and whiskers over seeds."""
+    """Chart mean IoU3D over training size (paper's figure), with a line per encoding and whiskers from the minimum to
+    the maximum over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (kind, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):

@@ -180,10 +180,11 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
     """Compare the distances from generated to real samples with the distances between real samples (paper, supplement).
 
     Returns:
-        `generated` and `real`: statistics of the distance from each sample of this side to the nearest other real
-        sample. `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of real
-        samples. `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real
-        samples of each generated sample, in order of distance. `distance` (m, 3): distances of these samples.
+        `generated` and `real`: statistics of the distance from each generated or each real sample to the nearest other
+        real sample. `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of
+        real samples. `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real
+        samples of each generated sample, in order of distance. `distance` (m, 3): distances from each generated sample
+        to these nearest real samples.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)

@@ -108,7 +108,7 @@ def judge_labels(scene: Scene, dataset: Dataset | None) -> np.ndarray:
 def compute_part(
     number: int, parts: list[tuple[Shard, list[int]]], dataset: Dataset | None, looks: FeatureConfig, directory: str
 ) -> dict:
-    """Compute and write the features of one part (rows of a shard) in a Ray task; return the number of scenes."""
+    """Compute and write the features of some rows of a shard in a Ray task; return the number of scenes."""
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
@@ -121,7 +121,8 @@ def compute_part(
 
 
 def load_network(looks: FeatureConfig) -> inception.Inception | None:
-    """Load the Inception network, if weights are given. A process loads it once, and again if the file changes."""
+    """Load the Inception network, if weights are given. A process loads the network once, and again if the file
+    changes."""
     return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
 
 

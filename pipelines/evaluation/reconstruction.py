@@ -121,13 +121,13 @@ class SceneRecord:
     """Sums over one scene, from which reconstruction scores are computed.
 
     Attributes:
-        ground: Ground sums at the resolution of the true scene.
-        raster: Ground sums at the resolution of the model; the true scene is resampled.
+        ground: Per-class sums of ground errors, at the resolution of the true scene.
+        raster: Per-class sums of ground errors, at the resolution of the model; the true scene is resampled.
         matches: Matched detections.
-        pairs: Sums over matched primitives.
-        confusion: (classes, classes) voxels.
-        outside: Ground pixels and objects outside the voxel grid.
-        memory: Bytes of each representation of MEMORY.
+        pairs: Per-category sums over pairs of matched primitives.
+        confusion: (classes, classes) number of voxels; rows are true classes, and columns are predicted classes.
+        outside: Numbers of ground pixels and of objects outside the voxel grid.
+        memory: Size of the scene in each representation of MEMORY (bytes).
         labels: (measures, 2) label fidelity: whether the reconstruction and the true scene have the same label; zeros
             if unknown.
     """
@@ -214,7 +214,7 @@ def score_chunk(
 
 
 def draw_chunk(row: dict, chunks: list[Chunk], spec: LayoutSpec) -> list[dict]:
-    """Render (H, W, 3) uint8 pictures of equal size of each scene from an output row of a Reconstructor."""
+    """Render each scene in an output row of a Reconstructor as pictures (H, W, 3) uint8 of equal size."""
     out = []
     for _, scene, layout, _ in unstack_layouts(row, chunks):
         sides = {"truth": scene, "rebuilt": decode_layout(layout, spec, scene)}

@@ -23,7 +23,7 @@ class ReferenceSet:
     """A selection of real scenes.
 
     Attributes:
-        strategy: "farthest" or "apart".
+        strategy: Rule by which scenes are selected: "farthest" or "apart".
         setting: For "farthest", the number of scenes. For "apart", the minimum distance between scenes (m).
         rows: (n,) indices of the selected real scenes.
     """

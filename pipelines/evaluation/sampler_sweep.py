@@ -22,7 +22,7 @@ MEASURES = {
     "count_ratio": (("count_ratio",), "count ratio of the category whose ratio is farthest from 1", "one"),
 }
 CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
-COMMON = 3.0  # Minimum number of objects per scene. Categories with fewer objects vary too much.
+COMMON = 3.0  # Minimum number of objects per scene. The ratios of categories with fewer objects vary too much.
 
 
 def compute_count_ratio(statistics: Mapping) -> tuple[str, Estimate] | None:
@@ -61,8 +61,8 @@ def make_sampler_row(
 def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
     """Return whether all measures of a row are at least as good as in the reference row.
 
-    A measure is as good if its value is better or if the two intervals overlap. Measures that are None in a row are
-    ignored.
+    A measure is at least as good if its value is better or if the two intervals overlap. Measures that are None in a
+    row are ignored.
     """
 
     def good(name: str, better: str) -> bool:
@@ -82,7 +82,8 @@ def name_settings(row: Mapping) -> str:
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row of the paper's sampler (ddpm) with the most steps. Without such a row, search all samplers."""
+    """Return the row of the paper's sampler (ddpm) with the most steps. Without such a row,
+    return the row of any sampler with the most steps."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 

@@ -1,4 +1,4 @@
-"""Compare seam visibility across steps, jump lengths, resamplings and guidance, for `jobs/sweep_seams.py`."""
+"""Compare the visibility of seams by steps, jump length, resamplings and guidance, for `jobs/sweep_seams.py`."""
 
 from __future__ import annotations
 

@@ -41,7 +41,8 @@ class SeamLines:
     cols_m: tuple[float, ...] = ()
 
     def pixels(self, grid: Grid) -> tuple[list[int], list[int]]:
-        """Return the pixel rows and columns after the seams. Raises ValueError if the scene is too small for seams."""
+        """Return the indices of the pixel rows and columns that follow the seams. Raises ValueError if the scene is too
+        small for seams."""
         sides = [(self.rows_m, grid.rows), (self.cols_m, grid.cols)]
         if not (self.rows_m or self.cols_m):
             sides = [(find_middle_m(count * grid.resolution_m), count) for _, count in sides]

@@ -35,8 +35,9 @@ class RegionConfig:
 
     Attributes:
         polygon_m: Corners of a polygon as x, y, x, y, ... (m, scene frame).
-        half_plane: x, y, d. The half plane begins at distance d (m) from the origin and extends in direction x, y.
-        objects: Indices of primitives of a scene.
+        half_plane: Direction (x, y) and distance d (m). The half plane begins at distance d from the origin and extends
+            in direction (x, y).
+        objects: Indices of the primitives that belong to the union.
         margin_m: Margin around the objects (m).
         outside: Whether the complement of the union is regenerated.
     """
@@ -88,7 +89,7 @@ class InpaintRequest(Request):
         where: Region to regenerate.
         contents: Contents that are regenerated: ground, objects or both.
         variants: Number of variants per scene.
-        label: Label of the generated region. None: the label of each scene.
+        label: Label of the generated region. None: the label of each scene is used.
         seed: Seed of the noise.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
@@ -112,7 +113,8 @@ def compute_drift(scene: Scene, raw: Scene, region: np.ndarray) -> dict[str, flo
         region: (rows, cols) bool generated region.
 
     Returns:
-        Sums for `compute_drift_scores`: pixels, squared height errors (m^2), primitives, and IoU3D of matches.
+        Sums for `compute_drift_scores`: numbers of ground pixels, squared height errors (m^2), numbers of primitives,
+        and IoU3D of matched primitives.
     """
     given, made = (merge_scenes([s], [~region], s) for s in (scene, raw))
     both = given.occupied & made.occupied

@@ -41,7 +41,7 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # The job prints a warning if a smaller fraction of the known pixels has ground.
+HARDLY_KNOWN = 0.1  # Minimum fraction of known pixels with ground; below it, the job prints a warning.
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 
@@ -50,7 +50,7 @@ class OutpaintRequest(Request):
     """Options of outpainting.
 
     Attributes:
-        label: Label of the generated blocks. None: the label of each scene.
+        label: Label of the generated blocks. None: the label of each scene is used.
         seed: Seed of the noise.
         overlap: Overlap of neighbouring blocks as a fraction of a block.
         mode: Outpainting mode of `generate_blocks`.
@@ -162,7 +162,7 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
 
 
 def write_block(block: SceneBlock, path: str) -> None:
-    """Write a block without the rounding of the tables. A resumed run then gives exactly the same scene.
+    """Write a block at full precision; the tables round values. A resumed run then gives exactly the same scene.
 
     Args:
         block: Block.
@@ -433,7 +433,8 @@ def pop_ready_task(
 
     Args:
         waiting: Batches to generate.
-        whole: Numbers of the scenes in which all blocks are done. These scenes are stitched first.
+        whole: Numbers of the scenes in which all blocks are done. Complete scenes are stitched before further blocks
+            are generated.
         done: Finished blocks by scene number.
 
     Returns:

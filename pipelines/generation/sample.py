@@ -64,11 +64,11 @@ class SampleRequest(Request):
         num_scenes: Number of scenes.
         labels: Labels; scene i gets label labels[i mod len(labels)].
         seed: Seed of the noise.
-        num_inference_steps: Steps of the sampler.
+        num_inference_steps: Number of steps of the sampler.
         guidance_scale: Scale of classifier-free guidance.
         sampler: Name of the sampler.
-        noise_scaling: Noise scaling. None: the value of the model.
-        existence_threshold: Minimum existence probability. None: the value of the model.
+        noise_scaling: Noise scaling. None: the value that the model stores.
+        existence_threshold: Minimum existence probability. None: the value that the model stores.
         repair: Whether floating, sunken and overlapping primitives are moved; none are removed
             (pipelines/editing/edit.py).
         shard_scenes: Number of scenes per shard.
@@ -152,7 +152,7 @@ def resample_to_model_grid(scene: Scene, spec: LayoutSpec, grid: Grid | None = N
     Args:
         scene: Scene.
         spec: Layout of the model.
-        grid: Another grid with the same area. None: the grid of the model.
+        grid: Another grid with the same area. None: the grid of the model is used.
 
     Returns:
         Scene with resampled rasters; primitives are unchanged.

@@ -33,7 +33,8 @@ class Histogram:
 
     Attributes:
         name: Name of the histogram, such as pole.height_m.
-        edges: Edges of the bins (m). The end bins also count values beyond the outer edges. None: the bins are named.
+        edges: Edges of the bins (m). The first and last bins also count values beyond the outer edges. None: the bins
+            are named.
         bins: Names of the bins, for bins that have no order.
     """
 
@@ -183,7 +184,7 @@ def compute_count_distances(real: np.ndarray, generated: np.ndarray) -> dict[str
         generated: (m, 11) number of objects of each category in generated scenes.
 
     Returns:
-        Distance per category (number of objects).
+        Distance per category (unit: number of objects).
     """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}

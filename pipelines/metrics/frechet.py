@@ -134,7 +134,7 @@ class Transport:
 
     Attributes:
         roots: (d,) s.
-        factor: (d, d) F U.
+        factor: (d, d) matrix product F U.
     """
 
     roots: np.ndarray
@@ -169,7 +169,7 @@ def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None
     Args:
         a: Gaussian with covariance A.
         b: Gaussian with covariance B.
-        between: Decomposition of A and B. None: it is computed.
+        between: Decomposition of A and B. None: the decomposition is computed.
 
     Returns:
         Squared distance, at least 0.
@@ -183,15 +183,15 @@ def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, 
     """Return a matrix W (d, r) for each of the two sets. Sample influences are computed from this matrix.
 
     The derivative of the squared distance with respect to the covariance of a set is I - W W^T. Let
-    M = F^T B F = U s^2 U^T. For set A, the matrix W satisfies W W^T = (B F U) s^-3 (B F U)^T. For set B, the matrix W
-    satisfies W W^T = (F U) s^-1 (F U)^T = A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
+    M = F^T B F = U s^2 U^T. For the set with covariance A, W W^T is (B F U) s^-3 (B F U)^T. For the set with covariance
+    B, W W^T is (F U) s^-1 (F U)^T. The latter equals A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
 
     Args:
         b: Moments with covariance B.
         between: Decomposition of A and B.
 
     Returns:
-        Matrices W for set A and for set B, each (d, r); r is the rank.
+        Two matrices W (d, r) of rank r, for the sets with covariances A and B.
     """
     kept = between.roots > NEGLIGIBLE * between.roots.max()
     roots, factor = between.roots[kept], between.factor[:, kept]

@@ -36,7 +36,7 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
 
     Args:
         count: Number of scenes.
-        key: Part of the seed. The two sides of a comparison use different keys to make their draws independent.
+        key: Part of the random seed. The two sides of a comparison use different keys to make their draws independent.
 
     Returns:
         (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 contains only ones. Each
@@ -54,7 +54,7 @@ def compute_weights(count: int, key: int = 0) -> np.ndarray:
 
     Args:
         count: Number of scenes.
-        key: Part of the seed.
+        key: Part of the random seed.
 
     Returns:
         (1 + DRAWS, count) float64 weights.
@@ -82,7 +82,7 @@ def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
 
     Args:
         values: (n,) values.
-        key: Part of the seed.
+        key: Part of the random seed.
 
     Returns:
         Mean with its 95 % interval.
@@ -94,12 +94,12 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
     """Estimate the ratio of the column sums of two arrays that have one row per scene.
 
     One use is a share of objects: the number of faulty objects divided by the number of all objects. Another use is the
-    mean over the scenes that have a value: the sum of these values divided by their number.
+    mean of a value over the scenes in which the value is defined.
 
     Args:
         numerators: (n, m) numerators.
         denominators: (n, m) denominators.
-        key: Part of the seed.
+        key: Part of the random seed.
 
     Returns:
         m ratios with 95 % intervals. None: the denominators sum to 0.

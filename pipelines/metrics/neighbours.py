@@ -4,7 +4,7 @@ The method first discards pairs by a bound on their distance, then verifies the 
 a short vector, which holds its first principal coordinates and the length of the residual. The distance of two short
 vectors is a lower bound of the true distance. A float32 matrix product computes this bound. Only undecided pairs need
 the true distance, which is computed from differences in float64. The results, including ties, are the same as with the
-full float64 distance matrix. Time and memory are a fraction.
+full float64 distance matrix. The method needs only a fraction of the time and memory.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torch import Tensor
 from pipelines.metrics.frechet import check_features
 
 BLOCK_ROWS = 1024  # Rows per block of the distance matrix; a block takes 4 kB per column.
-SPARE_NEIGHBOURS = 8  # Number of additional candidates, whose upper bounds limit the k-th distance.
+SPARE_NEIGHBOURS = 8  # Number of candidates beyond k; their upper bounds limit the k-th distance.
 PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances; a block (2 MB at 2048-d) fits into a cache.
 BASIS_SAMPLES = 512  # Number of samples from which the principal axes are computed.
 KEPT_VARIANCE = 0.997  # Share of the variance along the principal axes; more axes need fewer exact distances.
-MOST_LEFT_OVER = 0.02  # Maximum share of variance in the residual; otherwise, whole features are used.
+MOST_LEFT_OVER = 0.02  # Maximum share of the variance in the residual; above it, whole features are used.
 FLOAT32_ROUNDING = 2.0**-24
 
 
@@ -87,13 +87,13 @@ class FeatureSet:
 
     Attributes:
         features: (n, d) features.
-        left: (n, p + 3) float32 left factors. The dot product of left[i] and right[j] is the squared distance of short
-            vectors i and j.
-        right: (n, p + 3) float32 right factors.
+        left: (n, p + 3) float32 left factors of dot products. The dot product of left[i] and right[j] is the squared
+            distance of short vectors i and j.
+        right: (n, p + 3) float32 right factors of dot products.
         length: (n,) length of the short vector of each sample.
         rest: (n,) length of the residual, the part outside the axes.
-        slack: (n,) contribution of each sample to the rounding error of a product. The error of a pair is at most the
-            sum of two contributions.
+        slack: (n,) contribution of each sample to the rounding error of a dot product. The error is at most the sum of
+            the contributions of both samples.
     """
 
     features: np.ndarray
@@ -243,9 +243,9 @@ def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> Principal
 def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
     """Compute the short vectors of features for the filter.
 
-    For axes Q and x = Q^T c + r: |x - y|^2 = |c - c'|^2 + |r - r'|^2. The length |r - r'| lies between the difference
-    and the sum of |r| and |r'|. Let v = (c, |r|). The bound |v - v'|^2 is the dot product of
-    (-2 v, |v|^2, 1) and (v', 1, |v'|^2).
+    Let Q be the axes, x = Q^T c + r and y = Q^T c' + r'. Then |x - y|^2 is the sum of |c - c'|^2 and |r - r'|^2. The
+    length |r - r'| lies between the difference and the sum of |r| and |r'|. Let v = (c, |r|). The bound |v - v'|^2 is
+    the dot product of (-2 v, |v|^2, 1) and (v', 1, |v'|^2).
 
     Args:
         features: (n, d) features.
@@ -267,8 +267,8 @@ def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
         norm[rows] = np.square(short).sum(axis=1)
         left[rows, :-2], right[rows, :-2] = -2 * short, short
     left[:, -2], left[:, -1], right[:, -2], right[:, -1] = norm, 1, 1, norm
-    # For a product of t terms, |rounding| <= t u sum |a||b| <= t u 2 (|v|^2 + |v'|^2) with unit rounding u. The bound
-    # uses t + 4 instead of t, because the terms themselves are rounded too.
+    # For a dot product of t terms with unit rounding u, the rounding error is at most t u sum |a||b|. This bound is at
+    # most 2 t u (|v|^2 + |v'|^2). The code uses t + 4 instead of t, because the terms themselves are rounded too.
     slack = 2 * (width + 6) * FLOAT32_ROUNDING * norm
     return FeatureSet(features, left, right, np.sqrt(norm), rest, slack)
 
@@ -342,8 +342,8 @@ def find_within(
         rows: Real samples to consider.
 
     Returns:
-        in_real (len(k), m), in_generated and covered (both (len(k), len(rows))). in_real counts the balls of `rows`
-        that contain each generated sample; the counts of all parts must be added.
+        Three arrays: in_real (len(k), m), and in_generated and covered, each (len(k), len(rows)). The array in_real
+        counts the balls of the samples in `rows` that contain each generated sample; add the counts of all parts.
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))

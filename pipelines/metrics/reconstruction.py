@@ -292,7 +292,7 @@ def compute_detection_scores(
     Args:
         matches: Matches of all scenes.
         max_detections: Number of highest-scoring detections that are kept per scene and category (Omni3D: 100). None:
-            all are kept.
+            all detections are kept.
         min_score: Detections are ignored unless their score exceeds this value.
 
     Returns:
@@ -502,7 +502,7 @@ def compute_voxel_scores(confusion: np.ndarray) -> VoxelScores:
     """Compute voxel scores from the summed confusion matrix of a dataset.
 
     Args:
-        confusion: (classes, classes) voxels, true class in rows.
+        confusion: (classes, classes) number of voxels; rows are true classes, and columns are predicted classes.
 
     Returns:
         Scores of the dataset.

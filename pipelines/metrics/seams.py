@@ -89,7 +89,7 @@ def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -
 
 
 def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> np.ndarray:
-    """Count class changes and sum height steps across a line.
+    """Count class changes and sum height differences across a line.
 
     Args:
         ground_class: (H, W) index of the ground class; -1 means no ground.
@@ -97,7 +97,7 @@ def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> n
         line: Index of the row after the line.
 
     Returns:
-        (2, 2) numerator and denominator of class changes and of height steps.
+        (2, 2) numerator and denominator of class changes and of height differences.
     """
     before, after = ground_class[line - 1], ground_class[line]
     either, both = (before >= 0) | (after >= 0), (before >= 0) & (after >= 0)
@@ -112,9 +112,9 @@ def measure_objects(
 
     Args:
         at_m: (l,) positions of the lines (m).
-        low_m: (n,) lower ends of the objects (m).
-        high_m: (n,) upper ends of the objects (m).
-        center_m: (n,) centres of the objects (m).
+        low_m: (n,) lower ends of the objects along the normal (m).
+        high_m: (n,) upper ends of the objects along the normal (m).
+        center_m: (n,) centres of the objects along the normal (m).
         doubles: (p, 2) index pairs of objects that overlap and have the same category.
 
     Returns:

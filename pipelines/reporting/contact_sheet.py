@@ -50,14 +50,14 @@ class View:
 
 
 def paint_scenes(row: dict, views: tuple[View, ...]) -> list[dict]:
-    """Render the scenes of a row.
+    """Render the scenes that an input row lists.
 
     Args:
         row: Dictionary with a shard, rows of the shard, and the positions of the scenes in the result.
         views: Views to render.
 
     Returns:
-        One row per picture, with its place, view, shape and bytes.
+        One row per picture: position of its scene in the result, index of the view, shape and bytes.
     """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []

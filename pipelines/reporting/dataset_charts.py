@@ -70,7 +70,7 @@ def draw_count_histogram(category: str, counts: np.ndarray, marks: Mapping[str, 
 
     Args:
         category: Category.
-        counts: (n,) primitives per scene.
+        counts: (n,) number of primitives of the category in each scene.
         marks: Counts that are marked by a line (dictionary from name to count).
 
     Returns:
@@ -244,14 +244,14 @@ MAX_NAMED = 60  # With more sequences, the frames are too small for names.
 
 
 class _Shelf(NamedTuple):
-    """Sizes for the arrangement of sequences in rows (px).
+    """Sizes for the arrangement of the maps of sequences in rows (px).
 
     Attributes:
-        least: Minimum width of a sequence.
-        below: Space below a sequence.
-        gap: Space between sequences.
-        cell: Maximum height of a sequence.
-        total: Maximum height of all rows.
+        least: Minimum width of the map of one sequence (px).
+        below: Height of the space below the map of one sequence (px).
+        gap: Space between the maps of two sequences (px).
+        cell: Maximum height of the map of one sequence (px).
+        total: Maximum combined height of all rows (px).
     """
 
     least: int
@@ -350,7 +350,8 @@ def _draw_scale(extent_m: np.ndarray, shelf: _Shelf) -> float:
 
 
 def _pack_shelves(cells_px: np.ndarray, shelf: _Shelf) -> tuple[np.ndarray, float]:
-    """Arrange cells (n, 2) in bottom-aligned rows; return their top left corners (n, 2) and the total height."""
+    """Arrange cells of sizes (n, 2) in bottom-aligned rows; return their top left corners (n, 2) and the total
+    height."""
     places, rows, x = np.zeros_like(cells_px), [[]], PADDING_PX + 1.0
     for k, (width, _) in enumerate(cells_px):
         if rows[-1] and x + width > PAGE_PX - PADDING_PX - 1:

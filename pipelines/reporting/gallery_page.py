@@ -1,6 +1,6 @@
 """Render a gallery of scenes as one self-contained HTML page, with a 3D view and filters.
 
-The page needs no download and no installation. It can be published as one file or sent by mail.
+The page needs no download and no installation. The page can be published as one file or sent by mail.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ CAPTIONS = ("vegetation_density", "vehicle_density", "num_primitives")
 
 
 def pack_scenes(row: dict) -> list[dict]:
-    """Render and pack the scenes of a row.
+    """Render the scenes that an input row lists, and pack them for the viewer.
 
     Args:
         row: Dictionary with a shard, rows of the shard, and the positions of the scenes in the result.
 
     Returns:
-        One row per scene, with its place, picture and viewer content.
+        One row per scene, with its position in the result, its picture and its viewer content.
     """
     shard = Shard(row["root"], row["source"], row["split"], row["number"])
     out = []

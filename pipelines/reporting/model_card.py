@@ -12,7 +12,7 @@ from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_h
 
 HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; other parts of the card contain them.
 
-Points = Sequence[Sequence[float]]  # Training steps and values.
+Points = Sequence[Sequence[float]]  # Training steps and loss values.
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class ModelCard:
         yield "## Use and limits\n"
         yield (
             "The model is intended for research on layouts, for tests of the tools, and as initial weights for "
-            "training on other data. It is trained only on the dataset above. If this dataset is a procedural "
+            "training on other data. The model is trained only on the dataset above. If this dataset is a procedural "
             "town, the generated scenes do not represent real places. The model is not tested for vehicle safety. "
             "`jobs/edit_scenes.py repair` repairs faults.\n"
         )

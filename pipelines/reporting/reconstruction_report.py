@@ -50,8 +50,8 @@ def render_reconstruction_html(
     Args:
         scores: Scores of a `Reconstruction`.
         scenes: Scores of each scene; the best scene is first.
-        best: Pictures of the first scenes (`draw_scenes`).
-        worst: Pictures of the last scenes (`draw_scenes`).
+        best: Pictures of the best scenes, from `draw_scenes`.
+        worst: Pictures of the worst scenes, from `draw_scenes`.
         subtitle: Text below the title.
 
     Returns:
@@ -194,7 +194,7 @@ def build_overall_table(scores: Mapping) -> Table:
             "share of reconstructed boxes that are matched with an overlapping true box",
         ),
         ("voxel IoU", voxels["iou"], PAPER["voxel_iou"], "filled against empty voxels"),
-        ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over classes without the empty class"),
+        ("voxel mIoU", voxels["miou"], PAPER["voxel_miou"], "mean over all classes except the empty class"),
         (
             "label fidelity",
             scores["label_fidelity"]["joint_fidelity"],

@@ -1,7 +1,7 @@
 """Render a report as one self-contained HTML page with text, key figures, pictures, charts and tables.
 
-The page contains its style, charts and pictures. It uses no scripts and downloads nothing. The file can be mailed,
-archived and opened offline. All inserted text is escaped.
+The page contains its style, charts and pictures. The page uses no scripts and downloads nothing. The file can be
+mailed, archived and opened offline. All inserted text is escaped.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Pictures:
     Attributes:
         title: Heading.
         pictures: Pictures in reading order.
-        columns: Pictures per row; narrow screens show fewer. None: as many as fit.
+        columns: Number of pictures per row; narrow screens show fewer. None: as many pictures as fit.
         note: Text above the pictures.
     """
 
@@ -229,7 +229,7 @@ def _render_cell(value: Cell) -> str:
 
 
 def format_cell(value: Cell) -> str:
-    """Format a cell for display."""
+    """Format the value of a table cell for display."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool):

@@ -54,7 +54,7 @@ def map_rows(
 
     Args:
         dataset: Input rows.
-        function: Function that returns a new row for each row.
+        function: Function that takes an input row and returns an output row.
         num_cpus: Number of CPUs per task.
         at_once: Maximum number of concurrent tasks (default: no limit). Tasks reuse worker processes.
 
@@ -76,7 +76,7 @@ def map_actors(
 
     Args:
         numbers: Numbers of the units of work.
-        actor: Actor class. Its instances take a row and return a row.
+        actor: Actor class. Its instances are called with a row and return a row.
         arguments: Arguments of the constructor.
         num_actors: Maximum number of actors.
         resources: num_cpus or num_gpus per actor (default: one GPU if the cluster has GPUs).

@@ -22,7 +22,8 @@ class OpenRequest(StudioRequest):
 
 
 class SamplingRequest(StudioRequest):
-    # An empty string selects the label of the scene. If the scene has no label, it selects the model's first label.
+    # An empty string selects the label of the scene. If the scene has no label, an empty string selects the model's
+    # first label.
     label: str = Field("", max_length=40)
     seed: int = Field(0, ge=0, lt=2**31)
     steps: int = Field(20, ge=1, le=1000)

@@ -51,7 +51,7 @@ class BackgroundTask:
 
     Attributes:
         name: Name of the operation.
-        total: Number of network evaluations.
+        total: Total number of network evaluations of the operation.
         done: Number of finished network evaluations.
         error: Error message; "" means no error.
         cancelled: Whether the visitor has cancelled the task.
@@ -173,7 +173,7 @@ class Studio:
         return LABELS[self.pipeline.dit.config.label]
 
     def choose_label(self, request: SamplingRequest, scene: Scene | None) -> str:
-        """Return the requested label; otherwise the label of the scene; otherwise the first label of the model."""
+        """Return the requested label; if it is missing, the label of the scene or the first label of the model."""
         kind = self.pipeline.dit.config.label
         if request.label:
             require_labels(kind, [request.label])

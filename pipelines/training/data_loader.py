@@ -181,10 +181,10 @@ def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLayouts:
-    """Columns of a shard from which layouts are encoded. Encoding from Scenes would take twice the time.
+    """Columns of a shard from which layouts are encoded. Encoding from Scene objects would take twice the time.
 
     Attributes:
-        first: (scenes,) row of the first primitive of each scene.
+        first: (scenes,) index of the first primitive of each scene.
         count: (scenes,) number of primitives of each scene.
         category: (n,) int8 category of each primitive.
         center_m: (n, 3) centre of each primitive (m, scene frame).
@@ -259,7 +259,7 @@ def _read_latents(shard: Shard, latents_root: str, label: str) -> Arrays:
 
 
 def label_indices(scenes: pa.Table, label: str) -> np.ndarray:
-    """Return, for each row of a scenes table, the index of its label in LABELS[label], (n,) int64."""
+    """Return (n,) int64: for each row of a scenes table, the index of its label in LABELS[label]."""
     densities = zip(scenes["vegetation_density"].to_pylist(), scenes["vehicle_density"].to_pylist(), strict=True)
     names = [compose_label(label, vegetation, vehicle) for vegetation, vehicle in densities]
     return np.array([find_label_index(label, str(name)) for name in names], np.int64)
