@@ -124,8 +124,8 @@ class NonFiniteLossError(ValueError):
 
     Attributes:
         step: Index of the step.
-        positions: Positions (in the global batch) of the samples whose loss is not finite; empty if no sample has a
-            finite loss.
+        positions: Positions (in the global batch) of the samples whose loss is not finite. If this is the case for all
+            samples, the list is empty.
     """
 
     def __init__(self, step: int, positions: list[int]) -> None:

@@ -27,7 +27,7 @@ SHOWN = 6
 
 
 def evaluate_seams(config: Config) -> dict:
-    """Measure seams, write all files, and return the ratios of generated and real scenes."""
+    """Measure seams, write all files, and return the seam ratios, separately for generated and for real scenes."""
     output = resolve_path(config.output, "evaluations", "seams")
     source = f"generated-{config.run}" if config.run else None
     sides = {

@@ -78,8 +78,8 @@ def require_positive(config: object, *names: str) -> None:
 def find_root_cause(error: BaseException) -> BaseException:
     """Return the exception that the user should read. Ray wraps this exception in other exceptions.
 
-    The outermost ValueError or OSError that is not a wrapper comes from this package. The message of this exception
-    names the file and the remedy; the messages of deeper causes do not.
+    The function skips exceptions of Ray that wrap another exception. The next ValueError or OSError comes from this
+    package. The message of this exception names the file and the remedy; the messages of deeper causes do not.
     """
     seen: set[int] = set()
     while id(error) not in seen:

@@ -149,7 +149,7 @@ def decode_octahedral_boxes(parameters: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Decode scatter matrices and frame tensors to boxes.
 
     The decoded axes are those whose frame tensor is nearest to the code. The extents are s_j = v_j^T S v_j. The extents
-    are linear in S, so similar extents do not amplify errors.
+    are linear in S. Errors are therefore not amplified if two extents are similar.
 
     Args:
         parameters: (..., 15) codes in the format of `encode_octahedral`.

@@ -68,8 +68,8 @@ def import_glb(
 ) -> Scene:
     """Import a .glb file as a Scene.
 
-    For an export of this project, ids, grid, ground classes and the fused ground are restored. The fused ground has one
-    class per pixel. Any other mesh gets source "imported" and split "generated".
+    If this project exported the file, ids, grid, ground classes and the fused ground are restored. The fused ground has
+    one class per pixel. Any other mesh gets source "imported" and split "generated".
 
     Args:
         source: Content of the file as bytes, or its path or URI.

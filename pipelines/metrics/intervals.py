@@ -113,7 +113,8 @@ def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int =
 def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> Estimate:
     """Estimate a score from the influences of all samples on it.
 
-    To first order, a resample changes the score by the mean influence of its samples, summed over the sides.
+    To first order, a resample changes the score by the mean influence of its samples. If both sets are resampled, the
+    two means are added.
 
     Args:
         value: Score of the original sample.
