@@ -1,9 +1,10 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
 The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
-`DiTTransformer2DModel` of the library `diffusers` has separate timestep and label embeddings in every block, so it is
-8 % larger. This class also drops labels independently in each block, so the unconditional branch of classifier-free
-guidance is never trained. Here, each sample has one embedding and one dropout mask for the whole network.
+`DiTTransformer2DModel` of the library `diffusers` has separate timestep and label embeddings in every block, so this
+class is 8 % larger. `DiTTransformer2DModel` also drops labels independently in each block, so the unconditional branch
+of classifier-free guidance is never trained. In this module, each sample has one embedding and one dropout mask for the
+whole network.
 """
 
 from __future__ import annotations
@@ -233,7 +234,8 @@ class DiT(ConfiguredModel):
     def loss_weight(self, timestep: Int[Tensor, " batch"]) -> Float[Tensor, " batch"]:
         """Return the weight of the squared noise error in the training loss.
 
-        With this weight, the squared error of the network output (noise or v) has weight 1 at every timestep.
+        The weight is chosen such that the squared error of the network output (noise or v) has weight 1 at every
+        timestep.
 
         Args:
             timestep: Timesteps.
@@ -264,8 +266,8 @@ class DiT(ConfiguredModel):
     def precompute_conditioning(self, timesteps: Sequence[int], labels: Iterable[int]) -> Denoiser:
         """Precompute the modulations for timesteps and labels, and return a faster `forward` for them.
 
-        The modulation layers hold a third of the weights. Without precomputation, each step reads all these weights to
-        compute only one or two rows.
+        The modulation layers hold a third of the weights. Without precomputation, each step reads all weights of these
+        layers to compute only one or two rows.
 
         Args:
             timesteps: All timesteps that the denoiser will receive.

@@ -127,8 +127,8 @@ class LayoutSpec:
             length_m: Length (metres).
 
         Returns:
-            Nine numbers, one per feature (3 centre coordinates, 6 Cholesky parameters): the length in the normalised
-            unit of this feature.
+            The length in the normalised unit of each feature: nine numbers (3 centre coordinates, 6 Cholesky
+            parameters).
         """
         return tuple(
             unit / (high - low)

@@ -247,8 +247,8 @@ class LayoutVAE(ConfiguredModel):
     ) -> tuple[LayoutOutput, Posterior]:
         """Sample latents from the posterior and decode them.
 
-        The paper adds no corruption to the latent. Zheng et al. (RAE, 2025) also train decoders with noisy latents.
-        Here, encoders are trained together with the decoders, and each scene has its own noise level
+        The paper adds no corruption to the latent. Zheng et al. (RAE, 2025) also train decoders with noisy latents. In
+        this project, encoders and decoders are trained together, and each scene has its own noise level
         (`models.training.sample_corruption`).
 
         Args:

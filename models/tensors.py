@@ -57,8 +57,8 @@ def select_ground_classes(scene: Scene, ground_classes: tuple[str, ...]) -> tupl
 def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Resample rasters to another grid that covers the same area.
 
-    On a coarser grid, a pixel is occupied if at least half of its area is occupied. The height of such a pixel is the
-    mean height of its occupied part. On a finer grid, each pixel has the value of the nearest input pixel.
+    On a coarser grid, a pixel is occupied if at least half of its area is occupied. The height of an occupied coarse
+    pixel is the mean height of its occupied part. On a finer grid, each pixel has the value of the nearest input pixel.
 
     Args:
         height: (G, H, W) heights, in metres or as unsigned integers.

@@ -1,8 +1,8 @@
 """Training of both stages in torch: optimisation steps, EMA, learning-rate schedule and checkpoints.
 
 This module does not use Ray, so it can also train in a single process. Random numbers depend only on the seed, the step
-and the position of the sample in the global batch. They are therefore the same in a resumed run and for any number of
-workers.
+and the position of the sample in the global batch. The random numbers are therefore the same in a resumed run and for
+any number of workers.
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
     """Convert uniform random numbers to training timesteps.
 
     The paper uses "uniform". "logit_normal" prefers middle timesteps, as in SD3 (Esser et al., 2024). The existence of
-    objects is decided between timesteps 126 and 467. This interval contains a third of the timesteps with "uniform" and
-    half with "logit_normal".
+    objects is decided between timesteps 126 and 467. With "uniform", a third of all timesteps lies between 126 and 467.
+    With "logit_normal", half of all timesteps lie between 126 and 467.
 
     Args:
         uniform: Random numbers between 0 and 1.
@@ -359,7 +359,8 @@ class Trainer:
 
     @torch.no_grad()
     def _find_nonfinite_samples(self, arrays: dict[str, Tensor], positions: list[int]) -> list[int]:
-        """Return the positions of the samples whose loss is not finite; the list is empty if no loss is finite.
+        """Return the positions of the samples whose loss is not finite. If all losses are non-finite, the list is
+        empty.
 
         The model is called without its wrapper, because DistributedDataParallel would wait for the other workers.
         """

@@ -103,7 +103,7 @@ def sweep_samplers(config: Config) -> list[dict]:
 
 
 def sample_and_time(config: Config, request: SampleRequest, bar: Progress) -> float | None:
-    """Generate missing scenes; return the time per scene of one actor in seconds, or None if no shard was timed."""
+    """Generate missing scenes; return the seconds that one actor needs per scene (None if no shard was timed)."""
     record = storage.join_uri(request.output, "times", f"{request.run}.json")
     times = storage.read_json(record) if storage.exists(record) else {}
     shown = bar.add_task(request.run, total=request.num_scenes)

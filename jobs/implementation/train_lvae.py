@@ -205,7 +205,7 @@ def require_replaceable(name: str, kept: Kept) -> None:
 
 
 def write_updated_pipeline(model: str, lvae: str, training: TrainingRun) -> str:
-    """Write a copy of a trained pipeline with a new layout VAE for the same latents, and return the directory.
+    """Copy a trained pipeline, replace the layout VAE by one that has the same latents, and return the directory.
 
     Raises:
         ValueError: The pipeline has changed since the training started.

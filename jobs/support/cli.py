@@ -79,7 +79,8 @@ def find_root_cause(error: BaseException) -> BaseException:
     """Return the exception that the user should read. Ray wraps this exception in other exceptions.
 
     The function skips exceptions of Ray that wrap another exception. The next ValueError or OSError comes from this
-    package. The message of this exception names the file and the remedy; the messages of deeper causes do not.
+    package. The function returns this error, because its message names the file and the remedy. The messages of deeper
+    causes name neither.
     """
     seen: set[int] = set()
     while id(error) not in seen:

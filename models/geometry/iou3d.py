@@ -1,8 +1,8 @@
 """Exact IoU3D of arbitrarily rotated boxes (vectorised over pairs), and estimated IoU3D of ellipsoids.
 
 The volume of a convex polytope follows from its edges by two applications of the divergence theorem. Let d be the
-distance of a face's plane from the origin. Let r be the distance of an edge from the projection of the origin onto that
-face. Then
+distance of a face's plane from the origin. Let r be the distance of an edge of the face from the projection of the
+origin onto the plane of the face. Then
 
     V = 1/3 sum_faces d A_face = 1/6 sum_faces d sum_edges r |edge|.
 
@@ -225,7 +225,7 @@ def _clip_own_edges(
     """Return the sum (n,) of d d' |edge inside the other box| over the 12 edges of one box.
 
     `other_center` (3, n) is the vector from this box to the other box along the axes of the other box. The two faces at
-    an edge are perpendicular, so r on one face equals d of the other face.
+    an edge are perpendicular, so the distance r for one face equals the distance d of the other face.
     """
     total = np.zeros(half.shape[1])
     for along, second, third in CYCLIC:

@@ -45,8 +45,8 @@ class Diffusion:
         """Select ascending timesteps with "leading" spacing, for example 0, 4, ..., 996 for 250 of 1000.
 
         An error is raised if the selected timesteps do not cover most of the schedule. For example, 600 timesteps would
-        have a spacing of 1, so sampling would start at timestep 599. At this timestep, the network expects an input
-        with 20 % signal, but the input would be pure noise.
+        have a spacing of 1, so sampling would start at timestep 599. At timestep 599, the network expects an input with
+        20 % signal, but the input would be pure noise.
 
         Args:
             num_inference_steps: Number n of timesteps.
@@ -237,7 +237,7 @@ def scale_noise(model: Denoiser, noise_scaling: float) -> Denoiser:
     """Divide the predicted noise of a model by a number near 1.
 
     This is epsilon scaling (Ning et al., ICLR 2024). During sampling, a network interprets errors of earlier steps as
-    noise. The division compensates for this effect, so samples have the standard deviation of the data.
+    noise. The division compensates for these errors, so samples have the standard deviation of the data.
 
     Args:
         model: Model that predicts the noise.

@@ -97,8 +97,8 @@ def init_from_data(
     The shortcuts become the principal components of the smooth maps (`compute_smooth_maps`) of cells, scaled to unit
     variance. The decoder's shortcut converts signed distances to logits. The outputs of the networks are initially
     zero. For the town with 256 pixels per side, the initial ground IoU is 99.4 %
-    (docs/experiments/linear_ground_start.md). If the shortcut of the decoder reads the joint latent, its weights for
-    the object channels become zero.
+    (docs/experiments/linear_ground_start.md). If the shortcut of the decoder reads the joint latent, the weights of
+    this shortcut for the object channels become zero.
 
     Args:
         encoder: Encoder to initialise.

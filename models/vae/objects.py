@@ -147,9 +147,9 @@ class ObjectEncoder(nn.Module):
     The value of a cell is a learned value plus the mean of the features of its primitives. Padded slots are masked in
     the attention and are not written to the latent grid.
 
-    With `shortcut`, a small network computes an additional term of the mean from each primitive. The inputs of this
-    network are the position in the cell, the shape and the category. The shortcut avoids the loss of numerical
-    precision in the normalisations of the transformer. The paper has no shortcut.
+    With `shortcut`, a small network computes an additional term of the mean from each primitive. The inputs of the
+    small network are the position in the cell, the shape and the category of the primitive. The shortcut avoids the
+    loss of numerical precision in the normalisations of the transformer. The paper has no shortcut.
     """
 
     slot_category: Tensor

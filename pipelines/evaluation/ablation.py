@@ -212,7 +212,7 @@ def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
 
 @cache
 def find_ranges(encoding: str) -> np.ndarray:
-    """Return the range (entries,) of each number of an encoding, measured on "any" boxes."""
+    """Return the range (entries,) of each number of an encoding, measured on boxes of the distribution "any"."""
     return np.ptp(ENCODINGS[encoding].encode(*draw_boxes(BOX_DISTRIBUTIONS["any"], 10_000, TRAIN_KEY, 0)), axis=0)
 
 
@@ -220,10 +220,10 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     """Add noise to the encoding of `count` boxes, and compute the resulting loss of IoU3D.
 
     The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
-    is Gaussian. The standard deviation of the noise is `noise` times the range of the entry over "any" boxes. Constant
-    entries therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error alone causes: the IoU3D with
-    the true axes minus the IoU3D of the decoded box. The extents along the true axes are computed from the decoded
-    scatter matrix.
+    is Gaussian. The standard deviation of the noise is `noise` times the range of the entry over boxes of the
+    distribution "any". Constant entries therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error
+    alone causes: the IoU3D of a box with the true axes minus the IoU3D of the decoded box. The extents along the true
+    axes are computed from the decoded scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -417,7 +417,7 @@ def build_variant_table(rows: Sequence[dict]) -> Table:
 
 
 def draw_curve_chart(scores: Sequence[dict]) -> Chart:
-    """Chart AP3D on the first held-out scenes over the training time (minutes), with a line per variant and seed."""
+    """Draw AP3D on the first held-out scenes against the training time (minutes), with a line per variant and seed."""
     series = {}
     for row in scores:
         per_step = row["training_seconds"] / 60 / row["steps"]
@@ -431,8 +431,8 @@ def _round_values(value: float | str | None) -> float | str | None:
 
 
 def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Chart:
-    """Chart mean IoU3D over training size (paper's figure), with a line per encoding and whiskers from the minimum to
-    the maximum over seeds."""
+    """Draw the mean IoU3D against the training size (paper's figure), with a line per encoding. Whiskers show the
+    minimum and the maximum over seeds."""
     rows = [row for row in rows if (row["boxes"], row["numbers"]) == (kind, numbers)]
     series = {}
     for k, encoding in enumerate(ENCODINGS):
@@ -462,7 +462,7 @@ def draw_share_chart(rows: Sequence[dict], kind: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """Chart the IoU3D loss from yaw errors: Cholesky at each noise, the other encodings only at the largest noise."""
+    """Draw the IoU3D loss from yaw errors: Cholesky at each noise, the other encodings only at the largest noise."""
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"

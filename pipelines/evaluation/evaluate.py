@@ -1,9 +1,9 @@
 """Compare generated scenes with real scenes, or any two sources, by scores of the scenes' features.
 
 features.py computes the features. Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of
-Inception features have the usual names (fid, sfid, kid, inception_score, precision, ...). Scores of other features have
-a prefix. The prefix is `layout_` for layout statistics and `random_` for a network with random weights.
-reconstruction.py scores reconstructions.
+Inception features have the usual names (fid, sfid, kid, inception_score, precision, ...). The names of other scores
+have a prefix: `layout_` for layout statistics, and `random_` for a network with random weights. reconstruction.py
+scores reconstructions.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def compare_datasets(
         generated: Features of the generated scenes (dictionary from name to array).
         ground_classes: Names of the ground classes in the layout statistics.
         k: Neighbourhood sizes of precision and recall.
-        reference: Moments of all real pictures. If given, fid and sfid are computed against these moments, as in ADM's
-            evaluator.
+        reference: Moments of all real pictures. If these moments are given, fid and sfid are computed against them, as
+            in ADM's evaluator.
 
     Returns:
         Nested scores. Scores with an interval are Estimates.
@@ -180,11 +180,11 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
     """Compare the distances from generated to real samples with the distances between real samples (paper, supplement).
 
     Returns:
-        `generated` and `real`: statistics of the distance from each generated or each real sample to the nearest other
-        real sample. `memorised`: share of generated samples with a distance below the 1 % quantile of the distances of
-        real samples. `copies`: share of generated samples at distance 0. `nearest` (m, 3): indices of the nearest real
-        samples of each generated sample, in order of distance. `distance` (m, 3): distances from each generated sample
-        to these nearest real samples.
+        `generated`: statistics of the distance from each generated sample to the nearest real sample. `real`:
+        statistics of the distance from each real sample to the nearest other real sample. `memorised`: share of
+        generated samples with a distance below the 1 % quantile of the distances of real samples. `copies`: share of
+        generated samples at distance 0. `nearest` (m, 3): indices of the nearest real samples of each generated sample,
+        in order of distance. `distance` (m, 3): distances from each generated sample to these nearest real samples.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)

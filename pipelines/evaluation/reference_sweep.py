@@ -70,7 +70,7 @@ def score_reference(
 
 
 def draw_sweep_charts(rows: Sequence[dict]) -> list[Chart]:
-    """Chart precision and recall over the number of scenes, one chart per strategy, as in the paper's figure."""
+    """Draw precision and recall against the number of scenes, with one chart per strategy, as in the paper's figure."""
     charts = []
     for strategy, title in (
         ("apart", "Poses with a minimum distance"),

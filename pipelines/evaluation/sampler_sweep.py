@@ -82,8 +82,8 @@ def name_settings(row: Mapping) -> str:
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
-    """Return the row of the paper's sampler (ddpm) with the most steps. Without such a row,
-    return the row of any sampler with the most steps."""
+    """Return the row of the paper's sampler (ddpm) with the most steps. If there is no ddpm row, return the row with
+    the most steps among all samplers."""
     return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 

@@ -1,4 +1,4 @@
-"""Compare the visibility of seams by steps, jump length, resamplings and guidance, for `jobs/sweep_seams.py`."""
+"""Compare the visibility of seams between settings of RePaint and guidance, for `jobs/sweep_seams.py`."""
 
 from __future__ import annotations
 

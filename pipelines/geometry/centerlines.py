@@ -151,7 +151,7 @@ def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) ->
 def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
     """Convert a skeleton to a graph.
 
-    Forks and ends become nodes with the attribute `place` (2,): row and column. The lines between them become edges
+    Forks and ends become nodes with the attribute `place` (2,): row and column. The lines between nodes become edges
     with the attribute `path` (k, 2), which leads from u to v with u < v.
     """
     neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1

@@ -126,7 +126,7 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
     """Find the pixels where the depth from `cast_ellipsoids` exceeds the depth in `depth_m`.
 
     The function first compares a lower bound of the ellipsoid's depth with `depth_m`. The function computes the exact
-    depth only where this lower bound does not exceed `depth_m`.
+    depth only where the lower bound does not exceed `depth_m`.
 
     Args:
         scene: Scene.
@@ -161,7 +161,7 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
     Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| = 1. L is
     lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The third
-    entry is the positive square root of 1 minus the squares of the other two entries.
+    entry of s is the positive square root of 1 minus the squares of the other two entries.
     """
     view = camera.view
     primitive = np.flatnonzero(scene.category == ELLIPSOID)

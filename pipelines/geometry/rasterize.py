@@ -21,7 +21,7 @@ STEEP = 1e3
 def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Concatenate the integer ranges first[i] .. first[i] + count[i] - 1.
 
-    If x holds one value per range, `np.repeat(x, count)` holds the value of each integer.
+    If x holds one value per range, `np.repeat(x, count)` assigns each integer the value of its range.
 
     Args:
         first: (n,) first integer of each range.

@@ -49,8 +49,8 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
 def fit_boxes_to_corners(corners_m: np.ndarray) -> Shapes:
     """Fit boxes to their eight corners.
 
-    The two shortest vectors from a corner to the other corners are edges. The third edge is the vector to the opposite
-    corner, minus these two edges.
+    The two shortest vectors from a corner to the other corners are edges. The third edge is the difference between the
+    vector to the opposite corner and the sum of these two edges.
 
     Args:
         corners_m: (n, 8, 3) corners of each box in any order (m).

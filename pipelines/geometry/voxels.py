@@ -3,9 +3,9 @@ Tab. 1).
 
 These rules determine the class of a voxel:
 
-* A primitive fills a voxel if it contains the centre of the voxel. The test is exact for rotated boxes and ellipsoids
-  and includes the boundary (EDGE_M). If several primitives contain the centre, the finest category wins (PRECEDENCE).
-  The order of primitives has no effect.
+* A primitive fills a voxel if it contains the centre of the voxel. This test of the centre is exact for rotated boxes
+  and ellipsoids and includes the boundary (EDGE_M). If several primitives contain the centre, the finest category wins
+  (PRECEDENCE). The order of primitives has no effect.
 * Ground fills one voxel per column. This voxel contains the fused surface (`Scene.surface`) at the centre of the
   column. Primitives take precedence over ground.
 * All other voxels are EMPTY. Class ids are those of the palette.
@@ -13,7 +13,7 @@ These rules determine the class of a voxel:
 The paper does not define the range in z, the thickness of the ground, or the precedence of overlapping primitives.
 
 The code stores a column of voxels as one integer with one bit per level. In each column, a primitive fills one run of
-consecutive levels. A scene therefore needs a few hundred thousand runs instead of millions of voxels.
+consecutive levels. A scene is therefore stored as a few hundred thousand runs instead of millions of voxels.
 """
 
 from __future__ import annotations
@@ -189,7 +189,8 @@ class _Runs(NamedTuple):
 def _split_parts(scene: Scene, voxels: VoxelGrid) -> Iterator[Scene]:
     """Yield the scene in parts that cover about PART_COLUMNS columns each.
 
-    The parts limit memory use, which would be high for the large primitives of an untrained model.
+    The division into parts limits the memory use, which would otherwise be high for the large primitives of an
+    untrained model.
     """
     step_m = voxels.columns.resolution_m
     shadow_px = (np.abs(scene.rotation[:, :2]) @ scene.size_m[:, :, None])[..., 0] / step_m + 1

@@ -32,8 +32,8 @@ def export_scenes(
 ) -> tuple[dict[Format, int], dict[str, str]]:
     """Export each scene to output/<format>/<scene_id>.<format>.
 
-    A format may be unable to represent a scene; for example, OpenDRIVE needs roads. Such a scene is listed in the table
-    `rejects` of the output, and the export continues.
+    A format may be unable to represent a scene; for example, OpenDRIVE needs roads. If a scene cannot be represented,
+    the table `rejects` of the output lists the scene, and the export continues.
 
     Args:
         selection: Scenes.

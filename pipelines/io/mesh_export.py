@@ -86,7 +86,8 @@ def compute_placements(scene: Scene) -> np.ndarray:
 def build_ground_mesh(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Build the mesh of the fused ground surface (paper, supplement B.2).
 
-    Each 2 x 2 block of occupied pixels gives two triangles. Their common edge is the diagonal (i, j + 1) - (i + 1, j).
+    Each 2 x 2 block of occupied pixels gives two triangles. The diagonal (i, j + 1) - (i + 1, j) separates the two
+    triangles.
 
     Args:
         scene: Scene.

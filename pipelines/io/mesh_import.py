@@ -13,11 +13,11 @@ Any other mesh is read in the authors' format (docs/how_to/import_scenes.md), wi
   interpretation that matches the palette better. It ignores textures.
 * Ground has one vertex per occupied pixel, with or without triangles. In the authors' grid, the vertex of pixel (i, j)
   lies at the pixel corner x = 64 - .25 i, y = -32 + .25 j (y right). In exports of this project, the vertex lies at the
-  pixel centre. On the border of two classes, a vertex may have an averaged colour. Such a vertex gets the class of the
-  nearest vertex with a class colour.
+  pixel centre. On the border of two classes, a vertex may have an averaged colour. A vertex with an averaged colour
+  gets the class of the nearest vertex with a class colour.
 * Primitives are connected pieces of one class. A mesh may hold any number of primitives. The reader first merges
   vertices that are repeated along edges. A piece with eight vertices is a box; the fit uses its edges. A piece with
-  more vertices is an ellipsoid; the fit of a quadric works for any triangulation. Boxes of vegetation become
+  more than eight vertices is an ellipsoid; the fit of a quadric works for any triangulation. Boxes of vegetation become
   vegetation_cuboid.
 
 An imported box has the same corners as the mesh. An imported ellipsoid has the same shape as the mesh. If the shape

@@ -1,7 +1,7 @@
 """Export the roads of a Scene as ASAM OpenDRIVE 1.7: reference lines, elevation, driving lanes and junctions.
 
 Each road of centerlines.py becomes an OpenDRIVE road with at least one driving lane per side. The reference line of a
-road consists of cubic curves through points of the centreline. Roads end before a node. At the node, a connecting road
+road consists of cubic curves through points of the centreline. Roads end before a node. At each node, a connecting road
 leads from each road to every other road. The inertial frame of OpenDRIVE is the scene frame. The offset in the header
 is the position of the scene in the world frame. Traffic keeps to the right.
 """

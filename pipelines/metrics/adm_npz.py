@@ -57,7 +57,7 @@ def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Open a C-ordered array; yield a stream that begins at its first number, its shape and its type.
+    """Open a C-ordered array, and yield three values: the open stream at the first number, the shape and the type.
 
     Raises:
         ValueError: The array is missing, is pickled, is in Fortran order or has the wrong size.

@@ -93,8 +93,8 @@ def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
 def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
     """Estimate the ratio of the column sums of two arrays that have one row per scene.
 
-    One use is a share of objects: the number of faulty objects divided by the number of all objects. Another use is the
-    mean of a value over the scenes in which the value is defined.
+    For example, a ratio is a share of objects: the number of faulty objects divided by the number of all objects. A
+    ratio can also be the mean of a value over the scenes in which the value is defined.
 
     Args:
         numerators: (n, m) numerators.

@@ -234,8 +234,8 @@ def match_greedily(iou: np.ndarray, thresholds: np.ndarray = THRESHOLDS) -> np.n
     """Decide for each detection and threshold whether the detection is a true positive.
 
     Each threshold is matched separately. Detections are processed in order of score. A detection is matched with the
-    unmatched true primitive of highest IoU3D, if the IoU3D reaches the threshold. If several true primitives have this
-    IoU3D, the last is matched, as in COCO.
+    unmatched true primitive of highest IoU3D, if the IoU3D reaches the threshold. If several true primitives have the
+    same highest IoU3D, the last is matched, as in COCO.
 
     Args:
         iou: (d, truths) IoU3D; the rows are in order of decreasing score.

@@ -1,9 +1,10 @@
 """Measure the visibility of seams between the known and generated parts of a scene, relative to nearby lines.
 
-A score is the rate across seams divided by the rate across nearby lines. A score of 1 means that seams are invisible.
-A line is the border between two adjacent pixel rows or pixel columns. Each seam is compared with its neighbouring
-lines. These lines are parallel to the seam, at a distance of NEAR_M to FAR_M from it, and at least NEAR_M from all
-other seams. At this distance, lines do not depend on the seam but cross similar streets.
+A score is the rate across seams divided by the rate across nearby lines. A score of 1 means that seams are invisible. A
+line is the border between two adjacent pixel rows or pixel columns. Each seam is compared with its neighbouring lines.
+The neighbouring lines are parallel to the seam. A neighbouring line is NEAR_M to FAR_M away from this seam, and at
+least NEAR_M away from all other seams. Neighbouring lines therefore do not depend on the seam, but cross similar
+streets.
 
 Each scene is summarised by a float64 record of shape (measures, 2, 2). Along the second axis, seams come first, then
 neighbouring lines. Along the last axis, the numerator comes first, then the denominator. Records can be added, and a

@@ -252,8 +252,9 @@ def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarra
     """For each ellipsoid and each pixel centre on it, return the flat pixel index, the primitive and 1 / depth (m,).
 
     A ray t d, with z = 1 in d, intersects |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d^T M^T
-    M p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. The pixels of a row with a solution form
-    the interval between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are skipped.
+    M p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. In each row, the pixels with a solution
+    form the interval between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are
+    skipped.
     """
     lens = camera.lens
     primitive = np.flatnonzero(scene.category == ELLIPSOID)

@@ -222,7 +222,7 @@ def _find_sunlit(scene: Scene, solid: Faces, sun: Camera, point: list[np.ndarray
 def _measure_open_sky(scene: Scene, solid: Faces, table_z_m: float, point: list[np.ndarray]) -> np.ndarray:
     """Return the share (H, W) of sky light.
 
-    The share decreases with the depth of a point below the mean height around the point.
+    The deeper a point lies below the mean height around the point, the smaller is its share of sky light.
     """
     grid = scene.grid
     length_m, width_m = (n * grid.resolution_m + 2 * MARGIN_M for n in (grid.rows, grid.cols))

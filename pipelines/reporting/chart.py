@@ -73,7 +73,8 @@ def choose_ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
-    """Choose powers of ten around [low, high]. If there are at most two decades, add 2 and 5 times these powers."""
+    """Choose powers of ten around [low, high]. If the powers span at most two decades, also return 2 times and 5 times
+    each power."""
     first = math.floor(math.log10(low) + 1e-9)
     last = max(first + 1, math.ceil(math.log10(high) - 1e-9))
     factors, every = (1, 2, 5) if last - first <= 2 else (1,), math.ceil((last - first) / 6)

@@ -26,7 +26,8 @@ class SceneSubset:
     * spread: evenly spaced over all scenes.
     * first: the first scenes.
     * farthest: farthest point sampling of the poses (paper, supplement, Precision and Recall Metrics).
-    * apart: poses at least apart_m apart, evenly subsampled to `limit` (paper, same section as for farthest).
+    * apart: poses with pairwise distances of at least `apart_m`, evenly subsampled to `limit` (paper, same section as
+      for farthest).
     * balanced: the same number of scenes for each pair of density labels if available, evenly spaced within a pair.
 
     Attributes:

@@ -34,8 +34,8 @@ def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple
         studio: Function that returns the studio; all requests share it.
         token: Token that each request must contain; the first request sends it as ?token=. "" means that no token is
             required.
-        hosts: Host names that requests may use. Requests with other host names are refused. Otherwise, a page of
-            another origin could reach the studio through the host name of that origin.
+        hosts: Host names that requests may use. Requests with other host names are refused. Without this check, a page
+            of another origin could reach the studio through the host name of that origin.
 
     Returns:
         FastAPI application.
