@@ -30,9 +30,9 @@ class CellDecoder(nn.Module):
     """Decode an object latent to features and existence logits of `proposals[k]` proposals per category k.
 
     Features are normalised to [0, 1]. The decoder makes SPARE proposals per slot, but at least `min_proposals_per_cell`
-    and at most MAX_PER_CELL proposals per cell and category. A minimum is needed because rare objects also occur in
-    groups. One small network decodes each cell separately, because the encoder writes each primitive into only one
-    cell.
+    and at most MAX_PER_CELL proposals per cell and category. The number of proposals has a minimum, because objects of
+    a rare category also occur in groups. One small network decodes each cell separately, because the encoder writes
+    each primitive into only one cell.
     """
 
     def __init__(self, slots: tuple[int, ...], latent_channels: int, latent_size: int, config: ObjectConfig) -> None:

@@ -1,4 +1,4 @@
-"""Tests of the imports: each package imports only lower packages (pritti, jobs, pipelines, models), without cycles."""
+"""Tests of the imports: the order of imports is pritti, jobs, pipelines, models, without cycles."""
 
 import ast
 import subprocess
