@@ -78,7 +78,7 @@ def read_help(job: Path, *words: str) -> str:
 
 
 def write_cli_page(job: Path) -> str:
-    """Return the Markdown of a job's page: its summary, its help and that of its subcommands."""
+    """Return the Markdown of a job's page: its summary, its help and the help of its subcommands."""
     text = read_help(job)
     commands = re.search(r"usage: \S+ \[-h\] \[?\{([\w,-]+)\}", text)
     parts = [f"# {job.stem}\n\n{read_summary(job)}\n\n```text\n{text}\n```"]

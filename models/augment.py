@@ -1,7 +1,8 @@
 """Augment training scenes: mirror a scene, or view it from a slightly moved vehicle.
 
 The paper does not augment scenes. The paper builds on SLEDGE, which moves the vehicle by up to 1 m and rotates it by up
-to 2.5 degrees. A moved crop includes an area outside the stored crop. This area is empty, so moves should be small.
+to 2.5 degrees. A moved crop includes an area outside the stored crop. The area outside the stored crop is empty, so
+moves should be small.
 """
 
 from __future__ import annotations

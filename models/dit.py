@@ -1,10 +1,10 @@
 """The original Diffusion Transformer (Peebles & Xie, 2023) on latent grids (paper, supplement B.3).
 
 The network consists of adaLN-Zero blocks that share one timestep embedding and one label embedding. The class
-`DiTTransformer2DModel` of the library `diffusers` has separate timestep and label embeddings in every block, so this
-class is 8 % larger. `DiTTransformer2DModel` also drops labels independently in each block, so the unconditional branch
-of classifier-free guidance is never trained. In this module, each sample has one embedding and one dropout mask for the
-whole network.
+`DiTTransformer2DModel` of the library `diffusers` has separate timestep and label embeddings in every block. This
+library class is therefore 8 % larger than the class in this module. `DiTTransformer2DModel` also drops labels
+independently in each block, so the unconditional branch of classifier-free guidance is never trained. In this module,
+each sample has one embedding and one dropout mask for the whole network.
 """
 
 from __future__ import annotations
@@ -225,8 +225,8 @@ class DiT(ConfiguredModel):
 
         Returns:
             List of tensors. For each block: (b, 6 d) shifts, scales and gates. For the output: (b, 2 d) shift and
-            scale. The last tensor (b, 2) contains two factors a and b: the noise is a times the latent plus b times the
-            network output.
+            scale. The last tensor (b, 2) contains two factors p and q per sample. The noise is the sum of p times the
+            latent and q times the network output.
         """
         condition = self.condition(timestep, label)
         return [*(layer(condition) for layer in self.list_modulations()), self.noise_shares[timestep]]

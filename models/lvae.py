@@ -55,8 +55,8 @@ class LayoutVAE(ConfiguredModel):
         objects: Options of the object branch.
         shortcut: See `LayoutVAEConfig`.
         split_latent: See `LayoutVAEConfig`.
-        branches: "both", "ground" or "objects". A model with only one branch has c latent channels; the other part of
-            its decoded layouts is empty.
+        branches: "both", "ground" or "objects". If a model has only one branch, its latent has c channels. In its
+            decoded layouts, the part of the other branch is empty.
 
     Raises:
         ValueError: An option is unknown, or the grid does not divide into latent cells.

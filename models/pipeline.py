@@ -56,7 +56,8 @@ def draw_seeds(
     """Return one seed per scene.
 
     Args:
-        generator: One generator, which draws one seed for all scenes, or one generator per scene. None: `seed` is used.
+        generator: One generator per scene, or a single generator, which draws one common seed for all scenes. None:
+            `seed` is used.
         seed: One seed for all scenes, or one per scene.
         count: Number of scenes.
 
@@ -500,8 +501,8 @@ class PrITTIPipeline:
             run: Run name; it is part of the scene ids.
             generator: One generator for all scenes, or one per scene. None: `seed` is used; otherwise, `seed` is
                 ignored.
-            callback_on_step_end: Function f(pipeline, step, timestep, {"latents": ...}), called after each step. It
-                returns a dictionary {"latents": ...} for the next step.
+            callback_on_step_end: Function f(pipeline, step, timestep, {"latents": ...}), called after each step. The
+                function returns a dictionary {"latents": ...} for the next step.
             noise_scaling: Divisor of the predicted noise; None: the default of the pipeline.
             existence_threshold: Only primitives with a higher existence probability are kept; None: the threshold of
                 the pipeline.
@@ -588,7 +589,8 @@ class PrITTIPipeline:
 
         Args:
             scenes: Scenes on the model's grid.
-            regions: Mask (rows, cols) per scene, True = regenerate (models/composition/inpaint.py).
+            regions: One mask (rows, cols) per scene; True marks the pixels to regenerate
+                (models/composition/inpaint.py).
             labels: Label of each scene.
             contents: "objects": regenerate objects on the known ground. "ground": regenerate the ground under the known
                 objects. "both": regenerate ground and objects.
@@ -605,8 +607,7 @@ class PrITTIPipeline:
             The regenerated scenes.
 
         Raises:
-            ValueError: A scene is not on the model's grid, or `contents` is not "both" although the latent is not
-                split.
+            ValueError: A scene is not on the model's grid, or the latent is not split and `contents` is not "both".
         """
         indices = range(len(scenes)) if indices is None else indices
         for scene in scenes:
@@ -660,14 +661,14 @@ class PrITTIPipeline:
                 cells.
             mode: "copy" copies the shifted latents of the neighbours, as in the paper. "reencode" transforms the
                 decoded content of the neighbours into the frame of the block and encodes it again. Object latents
-                contain absolute centres, which a copy does not change.
+                contain absolute centres. A copy does not change these centres.
             num_blocks: Number of blocks to add ahead, behind, to the left and to the right. The paper adds one block on
                 every side.
             repaint: Options of RePaint; None: the options of the paper.
             guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
             callback_on_step_end: See `generate`.
-            side: Extend the scene on this side only, by (1 - overlap) of a block: "ahead", "behind", "left" or "right".
-                If `side` is set, `num_blocks` is ignored.
+            side: "ahead", "behind", "left" or "right". If `side` is set, the scene is extended only on this side, by
+                (1 - overlap) of a block, and `num_blocks` is ignored.
 
         Returns:
             One scene that covers all blocks.

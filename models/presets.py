@@ -118,8 +118,8 @@ class DiTPreset:
         weight_decay: Weight decay of AdamW.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
-        label_dropout: Probability that a training sample gets the null label. The paper does not specify it; DiT uses
-            0.1.
+        label_dropout: Probability that a training sample gets the null label. The paper does not specify this
+            probability; DiT uses 0.1.
     """
 
     lvae: str

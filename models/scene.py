@@ -398,7 +398,7 @@ class Scene:
 def merge_scenes(scenes: list[Scene], owned: list[np.ndarray], like: Scene) -> Scene:
     """Merge scenes on the same grid. Each pixel comes from the scene that owns it.
 
-    A primitive is kept if its scene owns the pixel under its centre.
+    A primitive of a scene is kept if this scene owns the pixel under the centre of the primitive.
 
     Args:
         scenes: Scenes on `like.grid`.

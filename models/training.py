@@ -43,7 +43,8 @@ class OptimizerConfig:
         final_learning_rate: Learning rate of the last step; None: the learning rate is constant.
         warmup_steps: Number of initial steps during which the learning rate rises linearly.
         betas: beta1 and beta2 of AdamW.
-        cycle_momentum: beta1 of the first and the last step, with a cosine in between; None: beta1 is constant.
+        cycle_momentum: beta1 at the first step and at the last step. In between, beta1 follows a cosine. None: beta1 is
+            constant.
         grad_clip: Largest gradient norm; None: gradients are not clipped.
         ema_decay: Decay of the exponential moving average of the weights; None: no moving average.
         seed: Seed of all random numbers.
@@ -239,7 +240,7 @@ def make_diffusion_loss(
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
 
     Returns:
-        A function that computes the losses from posteriors and labels {mean, logvar, label}.
+        A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`).
     """
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
@@ -376,7 +377,7 @@ class Trainer:
     def update_ema(self) -> None:
         """Update the exponential moving average of the weights.
 
-        The decay is min(ema_decay, 1 - (1 + step)^-3/4), as in diffusers.
+        The decay is min(ema_decay, 1 - (1 + step)^(-3/4)), as in diffusers.
         """
         if self.ema is None or self.settings.ema_decay is None:
             return

@@ -35,6 +35,7 @@ def start_ray(training: bool = False) -> None:
 def run_packed(config: dict[str, bytes]) -> None:
     """Unpickle and call a function in a Ray Train worker.
 
-    The function is passed as bytes, so Ray Train's controller does not unpickle it and does not import the models.
+    The function is passed as bytes. Ray Train's controller therefore neither unpickles the function nor imports the
+    models.
     """
     cloudpickle.loads(config["packed"])()

@@ -19,8 +19,8 @@ def publish_scores(output: str, scores: Mapping, tags: Mapping[str, str], files:
     """Write scores to metrics.json and metrics.parquet, and log them with tags and files to MLflow.
 
     Each output directory has one MLflow run, which a repeated evaluation updates. The file metrics.parquet has one row
-    per score, and the bounds of the 95 % interval if the score has an interval. In MLflow, the bounds are separate
-    metrics, NAME.low and NAME.high.
+    per score. If the score has a 95 % interval, the row contains the bounds of the interval. In MLflow, the bounds are
+    separate metrics, NAME.low and NAME.high.
 
     Args:
         output: Directory or URI of the files.

@@ -257,7 +257,7 @@ def guard_run_name(name: str, storage_path: str, identity: dict) -> str:
         Path of the file with the id of the MLflow run.
 
     Raises:
-        ValueError: The name belongs to other options and has checkpoints.
+        ValueError: A run of this name has checkpoints and was started with other options.
     """
     directory = storage.join_uri(storage_path, name)
     guard_options(

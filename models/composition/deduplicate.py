@@ -17,7 +17,7 @@ from models.scene import CATEGORY_INDEX, VEGETATION, VEHICLES, Scene
 DUPLICATE_IOU3D = np.full(len(CATEGORY_INDEX), 0.15)
 DUPLICATE_IOU3D[list(VEGETATION)] = 0.3  # Tree crowns overlap. The value applies only at borders of known regions.
 DUPLICATE_IOU3D[list(VEHICLES)] = 0.05
-REGENERATED_IOU3D = 0.05  # A known object and its displaced copy have a higher IoU3D.
+REGENERATED_IOU3D = 0.05  # The IoU3D of a known object and its displaced copy is higher.
 
 
 def find_regenerated_objects(generated: Scene, known: Scene) -> np.ndarray:

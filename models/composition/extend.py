@@ -44,7 +44,7 @@ def expand_grid(grid: Grid, side: Side | str, pixels: int) -> Grid:
 
 
 def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterator[Grid]:
-    """Yield windows of the size of one block along one side of a grid.
+    """Yield windows along one side of a grid. Each window has the size of one block.
 
     Args:
         grid: Grid of the scene.
@@ -65,7 +65,7 @@ def tile_side(grid: Grid, side: Side | str, block: Grid, step_px: int) -> Iterat
 
 
 def tile_region(grid: Grid, region: np.ndarray, block: Grid, cell_px: int) -> list[Grid]:
-    """Return windows of the size of one block that together cover a region.
+    """Return windows that together cover a region. Each window has the size of one block.
 
     If the region fits into one block, the only window is centred on the region. Otherwise, windows overlap by half a
     block.

@@ -82,8 +82,8 @@ class InfiniteScene:
                 self.composer.level_m = find_ground_height(self.get_block((0, 0)).scene, 0.0, 0.0)
             label = self.label_of(index)
             like = self.model.new_identity("city", self.seed, 0, label)
-            # Generate one block at a time. Rounding differs between batch sizes, so the content of a block would depend
-            # on the requests if blocks were generated in batches.
+            # Generate one block at a time. Rounding differs between batch sizes. If blocks were generated in batches,
+            # the content of a block would depend on the requests.
             self.blocks |= generate_blocks(
                 self.model, self.composer, [index], known, like, {index: label}, self.seed, **self.options
             )

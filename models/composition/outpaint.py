@@ -5,8 +5,8 @@ rectangles of any size and unbounded grids. Only the order of the blocks differs
 
 Block (i, j) lies i steps ahead of block (0, 0) and j steps to its left. A step is (1 - overlap) of a block. The rank of
 a block depends only on (i, j). A cell that several blocks cover is owned by the block with the lowest rank. Blocks of
-the same rank never own the same cell. Each block is conditioned on its cells that are owned by blocks of lower rank.
-The result therefore does not depend on the time, the machine or the order of generation.
+the same rank never own the same cell. The condition of a block consists of those of its cells that blocks of lower rank
+own. The result therefore does not depend on the time, the machine or the order of generation.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class BlockGrid:
 
         Args:
             index: Index of the block.
-            of: Index of the block that covers the cells.
+            of: Index of the other block.
 
         Returns:
             Row slice and column slice of block `index`.
@@ -296,8 +296,8 @@ class BlockComposer:
             block: Content of block `other`.
 
         Returns:
-            The cropped scene. Its x and y coordinates are in the frame of block `index`, and its z coordinates are in
-            the frame of block (0, 0).
+            The cropped scene. The x and y coordinates of this scene are in the frame of block `index`, and its z
+            coordinates are in the frame of block (0, 0).
         """
         x, y = ((a - b) * self.step_m for a, b in zip(other, index, strict=True))
         return block.scene.translate(x, y, block.datum_m).crop(self.spec.grid)
@@ -313,7 +313,7 @@ class BlockComposer:
             empty: Empty Scene whose ids are copied to the result.
             mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms the decoded
                 content of the neighbours into the block's frame and encodes it again. Object latents contain absolute
-                centres, which a copy does not change.
+                centres. A copy does not change these centres.
 
         Returns:
             The known part.

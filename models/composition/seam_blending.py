@@ -5,8 +5,8 @@ original known part instead of its reconstruction. Differences between the origi
 the seam visible. The difference at the seam is therefore added to the generated side, with a weight that decreases with
 distance.
 
-The decoder may also produce a height step at the seam between known and generated latent cells. A slope at the seam is
-reduced in the same way if it exceeds both MAX_SLOPE and the slope of the known ground.
+The decoder may also produce a height step at the seam between known and generated latent cells. If the slope at the
+seam exceeds both MAX_SLOPE and the slope of the known ground, the slope at the seam is reduced in the same way.
 
 The paper pastes the generated part without blending.
 """
@@ -101,7 +101,8 @@ def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
 def extrapolate_ground(known: Scene, unknown: np.ndarray) -> Scene:
     """Fill unknown pixels with the ground of the nearest known pixel before the scene is encoded.
 
-    The receptive field of the encoder extends beyond a cell, so empty pixels would look like an edge of the ground.
+    The receptive field of the encoder extends beyond a cell, so the encoder would interpret empty pixels as an edge of
+    the ground.
 
     Args:
         known: Known part of a scene.

@@ -4,13 +4,13 @@
 `octahedral`. Each box can be described in 24 ways, which differ in the order and the signs of the axes. An ideal
 encoding has three properties: it is continuous, each box has exactly one code, and each code describes exactly one box.
 
-* quaternion and size: This encoding has none of these properties. The quaternions q and -q describe the same rotation.
-  Rotating the box by 180 degrees about one of its axes gives the same box but a different quaternion. A convention such
-  as w >= 0 makes the code discontinuous.
+* quaternion and size: This encoding has none of the three properties. The quaternions q and -q describe the same
+  rotation. Rotating the box by 180 degrees about one of its axes gives the same box but a different quaternion. A
+  convention such as w >= 0 makes the code discontinuous.
 * Cholesky factor of the scatter matrix: This encoding is continuous, and each box has one code. However, some codes
   describe several boxes. If two extents are equal, the scatter matrix does not determine the rotation in the plane of
-  these two axes. If two extents l and w are similar, an error d in S rotates the decoded box by atan(2 d / |l - w|) /
-  2.
+  these two axes. If two extents l and w are similar, an error d in S rotates the decoded box by
+  atan(2 d / |l - w|) / 2.
 * octahedral: The code consists of the scatter matrix S and the frame tensor T of the box. S is sum_j s_j v_j v_j^T, and
   T is sum_j v_j (x) v_j (x) v_j (x) v_j. S and T do not depend on the order and the signs of the axes. They are
   polynomials. Each box therefore has one code, and the encoding is smooth. T is invariant only under the 24 symmetries

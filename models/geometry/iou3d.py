@@ -1,14 +1,14 @@
 """Exact IoU3D of arbitrarily rotated boxes (vectorised over pairs), and estimated IoU3D of ellipsoids.
 
 The volume of a convex polytope follows from its edges by two applications of the divergence theorem. Let d be the
-distance of a face's plane from the origin. Let r be the distance of an edge of the face from the projection of the
-origin onto the plane of the face. Then
+distance of a face's plane from the origin. Project the origin onto the plane of the face. Let r be the distance of this
+projection from an edge of the face. The volume is then
 
     V = 1/3 sum_faces d A_face = 1/6 sum_faces d sum_edges r |edge|.
 
 The edges of A ∩ B come from three sets: edges of A inside B, edges of B inside A, and intersections of a face of A with
 a face of B. The three sets have 12, 12 and 36 candidates. Each edge is a line that is clipped by slabs. The method
-builds no polygons, so it needs no branches that depend on the pair.
+builds no polygons. All pairs therefore need the same operations, without branches.
 
 Without a correction, coplanar faces would be counted twice. B is therefore enlarged by 1e-9 of the largest extent of
 the pair. This is far above rounding errors and far below any tolerance. A face of B that coincides with a face of A
@@ -275,7 +275,10 @@ class _Clip:
         self.low, self.high = low, high
 
     def slab(self, at: np.ndarray, slope: np.ndarray, half: np.ndarray) -> None:
-        """Clip the line to |at + slope tau| <= half. If slope is 0, the line is kept or removed as a whole."""
+        """Restrict tau to the interval in which |at + slope tau| <= half.
+
+        If slope is 0, the line is kept or removed as a whole.
+        """
         inverse = 1 / np.where(np.abs(slope) < 1e-30, 1e-30, slope)
         middle, reach = at * -inverse, half * np.abs(inverse)
         self.low = np.maximum(self.low, middle - reach)

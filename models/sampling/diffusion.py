@@ -278,8 +278,8 @@ def sample(
     """Sample clean latents by ancestral sampling along `transitions`.
 
     A transition to a lower state removes noise; a transition to a higher state adds noise (RePaint). With a condition,
-    each denoising step then replaces the known part by its clean latent plus noise of the new state. In the result, the
-    known part is bit-identical to the clean latent.
+    each denoising step then replaces the known part. The new value is the clean latent of the known part, plus noise of
+    the level of the new state. In the result, the known part is bit-identical to the clean latent.
 
     The paper instead uses the noise level of the previous state (Eq. "z_known"). The known part and the generated part
     would then have different noise levels.

@@ -69,7 +69,7 @@ class LayoutVAEConfig:
             object encoder. The paper has no shortcuts.
         split_latent: If True, each decoder reads only its half of the latent channels, as in the paper. If False, both
             decoders read all channels.
-        branches: "both", or for an ablation model with only one branch: "ground" or "objects".
+        branches: "both". An ablation model with only one branch uses "ground" or "objects".
     """
 
     latent_channels: int = 32

@@ -149,8 +149,8 @@ def compute_smooth_maps(
 ) -> Float[Tensor, "batch maps rows cols"]:
     """Convert rasters to smooth maps: heights without gaps, and signed distances instead of masks.
 
-    Within a cell, a mask has a step at an edge, so it needs many linear components. The signed distance from a straight
-    edge is a plane, so it needs only three linear components.
+    Within a cell, a mask has a step at an edge, so the mask needs many linear components. The signed distance from a
+    straight edge is a plane, so it needs only three linear components.
 
     Args:
         height: Normalised heights.

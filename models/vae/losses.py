@@ -105,7 +105,7 @@ def compute_object_losses(
     """Compute the weighted existence, centre and Cholesky losses (supplement Eqs. "match", "line").
 
     For each category c, each loss is summed over the proposals and divided by max(n_c, 1), where n_c is the number of
-    primitives. The results are then summed over categories and averaged over the batch.
+    primitives of category c. The results are then summed over categories and averaged over the batch.
 
     Args:
         features: Features of the proposals.
