@@ -5,9 +5,10 @@
     jobs/evaluate_voxels.py --ground-truth DATASET --split test --reconstructed DIR    files named by scene_id
     jobs/evaluate_voxels.py --ground-truth DATASET --reconstructed DIR --compressed 'LATENTS/*.npy' --allow-missing
 
-A file holds 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 class ids. Coarse grids are upsampled by repetition
-(docs/how_to/import_scenes.md). The scores come from one confusion matrix of all voxels of all scenes. The job writes
-metrics.json, metrics.parquet and voxels.parquet (one row per scene), and logs the scores to MLflow.
+A file holds class ids on a grid of 256 x 256 x 32, or on a coarser grid of SemCity, XCube or PDD. Coarse grids are
+upsampled by repetition (docs/how_to/import_scenes.md). The scores come from one confusion matrix of all voxels of all
+scenes. The job writes metrics.json, metrics.parquet and voxels.parquet (one row per scene), and logs the scores to
+MLflow.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 """Import meshes or voxel grids of another method for evaluation.
 
     jobs/import_scenes.py DIR --name theirs                     meshes in class colours, as the paper's authors publish
-    jobs/import_scenes.py 'DIR/night-*.glb' --name night --axes y+ z+ x+
-    jobs/import_scenes.py DIR --format npz --name semcity       voxel grids, of 256 x 256 x 32 or coarser
+    jobs/import_scenes.py DIR/night-*.glb --name night --axes y+ z+ x+
+    jobs/import_scenes.py DIR --format npz --name semcity       voxel grids of 256 x 256 x 32 or coarser
 
 The job converts GLB meshes to scene tables with source=imported-<name>. The command evaluate_scenes --generated OUTPUT
 scores the scenes. The job converts voxel grids to pictures from above in OUTPUT/<name>.npz (array arr_0, uint8). The
@@ -25,8 +25,8 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    files: Annotated[str, tyro.conf.Positional]
-    """Directory to search recursively, or a quoted pattern such as 'DIR/*.glb'."""
+    files: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Files, directories to search recursively, or quoted patterns such as 'DIR/*.glb'."""
     name: str = "scenes"
     """Name of the import: scenes get source=imported-<name>."""
     format: Literal["glb", "npz"] = "glb"

@@ -23,7 +23,9 @@ def import_scenes(config: Config) -> tuple[str, dict]:
         raise ValueError(f"--name is {config.name!r}, expected a word without slashes")
     axes = config.axes or {"glb": AUTHORS_AXES, "npz": VOXEL_AXES}[config.format]
     compute_scene_from_axes(axes)
-    base, files = find_files(make_absolute(config.files), f".{config.format}")
+    if not config.files:
+        raise ValueError("no file is given; pass files, directories or patterns")
+    base, files = find_files([make_absolute(path) for path in config.files], f".{config.format}")
     output = resolve_path(config.output, "imported", config.name)
     request = ImportRequest(base, files, config.format, axes, output, config.name)
     start_ray()

@@ -4,8 +4,9 @@ A file holds one scene as an array of integer class ids. The array is named `vox
 The ids are those of the authors (docs/how_to/import_scenes.md; palette.py): 0 empty, 1 ground, 2 terrain, 3 sidewalk, 4
 parking, 5 road, 6 vegetation_cuboid, 7 vegetation_ellipsoid, 8 vehicle_big, 9 vehicle_small, 10 two_wheelers, 11 human,
 12 construction_big, 13 construction_small, 14 pole, 15 traffic_control, 16 object. This project adds the id 17 for
-crossing. An array has 256 x 256 x 32, 128 x 128 x 16 or 64 x 64 x 8 voxels, which cover the crop of 64 x 64 m. Coarse
-voxels are upsampled by repetition (nearest neighbour), as in the paper's evaluation of baselines.
+crossing. An array has one of the shapes of SHAPES and covers the crop of 64 x 64 m: 256 x 256 x 32 voxels, the coarser
+grids of SemCity and XCube (128 x 128 x 16 and 64 x 64 x 8), or the other two grids of PDD (256 x 256 x 16 and 32 x 32 x
+4). Coarse voxels are upsampled by repetition (nearest neighbour), as in the paper's evaluation of baselines.
 
 In this project's axis order, row 0 is farthest ahead and rows continue backwards. Column 0 is leftmost and columns
 continue to the right. Levels continue upwards.
@@ -28,7 +29,7 @@ from pipelines.schema.palette import CLASS_COLORS, EMPTY
 VOXEL_AXES: Axes = ("x-", "y-", "z+")
 ARRAY = "voxels"
 FULL = VoxelGrid().shape
-SHAPES = tuple(tuple(n // factor for n in FULL) for factor in (1, 2, 4))
+SHAPES = (FULL, (256, 256, 16), (128, 128, 16), (64, 64, 8), (32, 32, 4))
 MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size in bytes of the largest array: 64-bit numbers and a header.
 
 
@@ -144,6 +145,6 @@ def draw_voxels(voxels: np.ndarray) -> np.ndarray:
         (rows, cols, 3) uint8 sRGB, white for empty columns.
     """
     filled = voxels != EMPTY
-    # In an empty column, the result is the highest level, which is EMPTY.
+    # In an empty column, `top` is the highest level, and the class id there is EMPTY.
     top = voxels.shape[2] - 1 - filled[:, :, ::-1].argmax(axis=2)
     return CLASS_COLORS[np.take_along_axis(voxels, top[:, :, None], axis=2)[:, :, 0]]

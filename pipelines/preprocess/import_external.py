@@ -8,7 +8,8 @@ a row of `rejects`.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from typing import Literal
@@ -102,34 +103,53 @@ def make_scene_id(file: str) -> str:
     return file.rsplit(".", 1)[0].replace("/", "-")
 
 
-def find_files(pattern: str, suffix: str) -> tuple[str, tuple[str, ...]]:
-    """Find the files of a directory or a glob pattern.
+def find_files(patterns: str | Sequence[str], suffix: str) -> tuple[str, tuple[str, ...]]:
+    """Find files by any number of paths and glob patterns.
+
+    A shell that expands a pattern gives the same result as the quoted pattern.
 
     Args:
-        pattern: Path or URI of a directory, or a pattern such as DIR/*.glb.
+        patterns: One or more paths or URIs of files or directories, or patterns such as DIR/*.glb. A directory is
+            searched recursively.
         suffix: File name extension, such as .glb.
 
     Returns:
-        Directory, and sorted file names relative to this directory.
+        The deepest directory that contains everything that was found by each pattern, and the sorted file names
+        relative to this directory.
 
     Raises:
-        ValueError: No file matches, or two files give the same scene id.
+        ValueError: A pattern matches no file, or two files give the same scene id.
     """
-    fixed = pattern
-    while any(sign in fixed for sign in "*?[") or (suffix and fixed.endswith(suffix)):
-        fixed = fixed.rsplit("/", 1)[0]
-    files = [f[len(fixed.rstrip("/")) + 1 :] for f in storage.list_files(fixed, suffix)]
-    if fixed != pattern:
-        files = [file for file in files if fnmatch(storage.join_uri(fixed, file), pattern)]
-    if not files:
+    patterns = [patterns] if isinstance(patterns, str) else list(patterns)
+    found = [_match_pattern(pattern, suffix) for pattern in patterns]
+    base = found[0][0]
+    while not all(f"{one}/".startswith(f"{base}/") for one, _ in found):
+        if "/" not in base.rstrip("/"):
+            raise ValueError(f"{patterns[0]} and the other files have no directory in common; import them separately")
+        base = base.rsplit("/", 1)[0]
+    # A file can be named by several patterns.
+    files = sorted({uri[len(base) + 1 :] for _, uris in found for uri in uris})
+    names = Counter(make_scene_id(file) for file in files)
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise ValueError(f"{base}: two files give the same scene id {twice[0]!r}; rename one")
+    return base, tuple(files)
+
+
+def _match_pattern(pattern: str, suffix: str) -> tuple[str, list[str]]:
+    """Return the directory of a pattern without wildcards, and the URIs of the matching files."""
+    has_wildcard = any(sign in pattern for sign in "*?[")
+    if suffix and pattern.endswith(suffix) and not has_wildcard:
+        directory, uris = pattern.rsplit("/", 1)[0], [pattern] if storage.exists(pattern) else []
+    else:
+        directory = pattern.rstrip("/")
+        while any(sign in directory for sign in "*?["):
+            directory = directory.rsplit("/", 1)[0]
+        uris = [uri for uri in storage.list_files(directory, suffix) if not has_wildcard or fnmatch(uri, pattern)]
+    if not uris:
         raise ValueError(
-            f"{pattern} matches no {suffix} file; pass a directory or a quoted pattern such as 'DIR/*{suffix}'"
+            f"{pattern} matches no {suffix} file; pass files, directories or patterns such as 'DIR/*{suffix}'"
         )
-    names = [make_scene_id(file) for file in files]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{pattern}: two files give the same scene id {twice!r}; rename one")
-    return fixed, tuple(files)
+    return directory, uris
 
 
 # --------------------------------------------------------------------------------------------------------- shards
@@ -158,8 +178,8 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
     return names, contents
 
 
-# The writer writes the rejects before the shard and deletes them after the shard. A shard without rejects is therefore
-# complete, even if the writer was killed.
+# The writer writes new rejects before the shard, and deletes outdated rejects after the shard. If a shard has no
+# rejects, it is therefore complete, even if the writer was killed.
 
 
 def write_tables(row: dict, request: ImportRequest) -> dict:

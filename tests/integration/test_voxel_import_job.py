@@ -13,6 +13,7 @@ from pipelines.geometry.voxels import VoxelGrid, voxelize
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.voxel_import import FULL, draw_voxels, write_voxels
 from pipelines.metrics.reconstruction import compute_voxel_confusion
+from pipelines.preprocess.import_external import find_files
 from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.tables import Shard, find_shards, read_scenes
 
@@ -36,7 +37,7 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
         path.write_bytes(export_glb(scene))
     good = (meshes / "night/4.glb").read_bytes()
     (meshes / "night/4.glb").write_bytes(good[:1000])
-    config = Config(str(meshes), name="theirs", output=str(output))
+    config = Config((str(meshes),), name="theirs", output=str(output))
     found, made = import_scenes(config)
     assert found == str(output) and made["rejects"] == 1
     order = ["day-1", "day-3", "day-5", "night-0", "night-2"]
@@ -64,6 +65,31 @@ def test_import_meshes_writes_tables_of_same_scenes(cluster, tmp_path, town_scen
         import_scenes(config)
 
 
+def test_import_scenes_reads_all_files_of_the_authors(cluster, real_data, tmp_path):
+    """A shell expands DIR/*.glb into many arguments; the files are Open3D's, with `data:` URIs."""
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
+
+    files = sorted((real_data / "glb").glob("*.glb"))
+    output, made = import_scenes(Config(tuple(map(str, files)), output=str(tmp_path)))
+    assert len(files) == 4 and made["scenes"] == [file.stem for file in files] and made["rejects"] == 0
+    same = import_scenes(Config((str(real_data / "glb" / "*.glb"),), output=str(tmp_path)))  # the quoted pattern
+    assert same == (output, made)
+
+
+def test_find_files_combines_arguments(tmp_path):
+    for name in ("a/1.glb", "a/2.glb", "b/c/3.glb", "b/4.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    a, b = str(tmp_path / "a"), str(tmp_path / "b")
+    assert (
+        find_files((f"{a}/1.glb", f"{a}/2.glb"), ".glb") == find_files(f"{a}/*.glb", ".glb") == (a, ("1.glb", "2.glb"))
+    )
+    assert find_files((f"{b}/", f"{a}/1.glb", f"{a}/1.glb"), ".glb") == (str(tmp_path), ("a/1.glb", "b/c/3.glb"))
+    with pytest.raises(ValueError, match=r"5\.glb matches no \.glb file"):
+        find_files((f"{a}/1.glb", f"{a}/5.glb"), ".glb")
+
+
 def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     from jobs.evaluate_scenes import Config as EvaluateConfig
     from jobs.implementation.evaluate_scenes import evaluate
@@ -73,7 +99,7 @@ def test_evaluate_scores_imported_scenes(smoke, tmp_path):
     scenes = list(read_scenes(str(smoke / "datasets/smoke"), split="test"))
     for scene in scenes:
         (tmp_path / f"{scene.scene_id}.glb").write_bytes(export_glb(scene))
-    output, _ = import_scenes(Config(str(tmp_path / "*.glb"), output=str(tmp_path / "out")))
+    output, _ = import_scenes(Config((str(tmp_path / "*.glb"),), output=str(tmp_path / "out")))
     real = str(smoke / "datasets/smoke")
     scores = evaluate(
         EvaluateConfig(real, "test", output, balance_labels=False, output=str(tmp_path / "scores"), num_actors=1)
@@ -91,7 +117,7 @@ def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
     for k, scene in enumerate(town_scenes[:3]):
         write_voxels(str(tmp_path / "in" / f"scene{k}.npz"), scene)
     save_npz(tmp_path / "in" / "scene1b.npz", np.zeros((4, 4, 4), np.uint8))
-    config = Config(str(tmp_path / "in"), name="peer", format="npz", output=str(tmp_path / "out"))
+    config = Config((str(tmp_path / "in"),), name="peer", format="npz", output=str(tmp_path / "out"))
     target, made = import_scenes(config)
     assert made["scenes"] == ["scene0", "scene1", "scene2"] and made["rejects"] == 1
     want = np.stack([draw_voxels(voxelize(scene, VoxelGrid())) for scene in town_scenes[:3]])
@@ -115,16 +141,16 @@ def test_import_rejects_input_without_scenes(cluster, tmp_path):
 
     (tmp_path / "a.glb").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"none of the 1 files could be read; error of the first file: .*a\.glb"):
-        import_scenes(Config(str(tmp_path), output=str(tmp_path / "out")))
+        import_scenes(Config((str(tmp_path),), output=str(tmp_path / "out")))
     with pytest.raises(ValueError, match=r"matches no \.npz file"):
-        import_scenes(Config(str(tmp_path), format="npz"))
+        import_scenes(Config((str(tmp_path),), format="npz"))
     with pytest.raises(ValueError, match=r"--name is 'a/b'"):
-        import_scenes(Config(str(tmp_path), name="a/b"))
+        import_scenes(Config((str(tmp_path),), name="a/b"))
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub/b.glb").write_bytes(b"x")
     (tmp_path / "sub-b.glb").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"two files give the same scene id 'sub-b'"):
-        import_scenes(Config(str(tmp_path)))
+        import_scenes(Config((str(tmp_path),)))
 
 
 # ---------------------------------------------------------------------------------------------- jobs/evaluate_voxels

@@ -3,6 +3,7 @@
 docs/how_to/import_scenes.md describes both formats.
 """
 
+import base64
 import json
 from dataclasses import replace
 
@@ -304,6 +305,43 @@ def test_scene_from_glb_takes_ids_from_file(tmp_path, town_scenes):
     assert import_glb(tmp_path / "scene-7.glb", "other").scene_id == "other"
 
 
+# --------------------------------------------------------------------------------------- files of the paper's authors
+
+
+def count_unit_meshes(path) -> dict[str, int]:
+    """Count the primitives per colour from the numbers of vertices and triangles, as trimesh reads them.
+
+    The authors place copies of two unit meshes: a box of 8 vertices and 12 triangles, and a sphere of 63 vertices and
+    80 triangles. The number of boxes b and the number of spheres e of a colour follow from 8 b + 63 e and 12 b + 80 e.
+    """
+    mesh = trimesh.load(path, process=False, force="mesh")
+    color = np.asarray(mesh.visual.vertex_colors)[:, :3]
+    found = {}
+    for name in CATEGORIES:
+        painted = (color == parse_rgb(COLOR_HEX[name])).all(axis=1)
+        sums = painted.sum(), painted[mesh.faces].all(axis=1).sum()
+        boxes, spheres = np.linalg.solve([[8, 63], [12, 80]], sums)
+        found[name] = round(spheres if name == "vegetation_ellipsoid" else boxes)
+        assert np.allclose([boxes, spheres], np.round([boxes, spheres]))
+    return found
+
+
+@pytest.mark.parametrize("name", ["generated_low_0", "high_121", "low_12", "medium_240"])
+def test_files_of_the_authors_give_the_count_of_their_unit_meshes(real_data, name):
+    path = real_data / "glb" / f"{name}.glb"
+    scene = import_glb(path)
+    assert dict(zip(CATEGORIES, scene.counts().tolist(), strict=True)) == count_unit_meshes(path)
+    assert scene.occupied.any(axis=0).mean() > 0.5 and scene.scene_id == name
+
+
+def test_own_export_with_data_uri_equals_binary_chunk(town_scenes):
+    glb = export_glb(town_scenes[0])
+    size = int.from_bytes(glb[12:16], "little")
+    text = base64.b64encode(glb[20 + size + 8 :]).decode()
+    uri = f"data:application/octet-stream;base64,{text}"
+    assert_same_scene(import_glb(edit_glb(glb[: 20 + size], lambda t: t["buffers"][0].update(uri=uri))), town_scenes[0])
+
+
 # ------------------------------------------------------------------------------------------------------- faults
 
 
@@ -336,11 +374,21 @@ FAULTS = {
     "text": (lambda: b"{}", "not a binary glTF"),
     "truncated": (lambda: export_glb(random_scene(6, n=2))[:-100], "expected a whole file"),
     "uri": (lambda: export_with_json(lambda t: t["buffers"][0].update(uri="http://x/y.bin")), "buffers lie outside"),
+    "base64": (
+        lambda: export_with_json(lambda t: t["buffers"][0].update(uri="data:application/octet-stream;base64,AA?A")),
+        "buffer 0 is not valid base64",
+    ),
+    "plain": (lambda: export_with_json(lambda t: t["buffers"][0].update(uri="data:,AAAA")), "not valid base64"),
+    "short": (
+        lambda: export_with_json(lambda t: t["buffers"][0].update(uri="data:application/octet-stream;base64,AAAA")),
+        "buffer 0 has 3 of",
+    ),
+    "buffer": (lambda: export_with_json(lambda t: t["buffers"].append({"byteLength": 4})), "buffer 1 has neither"),
     "image": (lambda: export_with_json(lambda t: t.update(images=[{"uri": "../x.png"}])), "images lie outside"),
     "draco": (lambda: export_with_json(lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"])), "draco"),
     "cycle": (lambda: export_with_json(lambda t: t["nodes"][0].update(children=[0])), "two parents"),
-    "beyond": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**7)), "beyond the file's"),
-    "stride": (lambda: export_with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond the file's"),
+    "beyond": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**7)), "beyond its buffer"),
+    "stride": (lambda: export_with_json(lambda t: t["bufferViews"][0].update(byteStride=0)), "beyond its buffer"),
     "many": (lambda: export_with_json(lambda t: t["accessors"][0].update(count=10**12)), "more than"),
     "missing": (lambda: export_with_json(lambda t: t.pop("accessors")), "not well-formed"),
     "number": (lambda: export_with_json(lambda t: t.update(nodes=7)), "not well-formed"),
