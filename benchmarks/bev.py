@@ -1,11 +1,14 @@
-"""Compare two renderers of 256 x 256 pictures from above: one draws all primitives together, one draws them in turn.
+"""Compare two renderers of 256 x 256 pictures from above.
+
+The renderer of this project draws all primitives together. The plain renderer draws one primitive after the other.
 
     python benchmarks/bev.py                      # dense towns
     python benchmarks/bev.py --dataset DIRECTORY  # scenes selected evenly from a dataset
 
 The plain renderer is vectorised over the pixels inside the bounds of one primitive. It has no tolerance at edges. Times
-are CPU seconds of one thread, without the time to read scenes. Set MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1, as
-jobs/support/cli.py does for the workers of jobs. With these values, a process keeps freed memory.
+are CPU seconds of one thread, without the time to read scenes. Before you run the benchmark, set the environment
+variables MALLOC_MMAP_MAX_=0 and MALLOC_TRIM_THRESHOLD_=-1. jobs/support/cli.py sets the same variables for the workers
+of jobs. With these values, a process keeps freed memory.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from pipelines.schema.scene_subset import SceneSubset
 
 ROUNDS = 7
 SCENES = 32
-PICTURES, CORES = 50_000, 2  # for an estimate of the time of a large evaluation
+PICTURES, CORES = 50_000, 2  # size of an evaluation whose time is estimated
 
 
 def render_plainly(scene: Scene, supersample: int) -> np.ndarray:

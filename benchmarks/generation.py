@@ -3,9 +3,9 @@
     python benchmarks/generation.py                      # 1,000 samples per side with both, 10,000 with ours
     python benchmarks/generation.py --samples 61913      # ours only, on Ray: memory and time
 
-There are two kinds of features. The first kind has a falling spectrum like Inception features: a few dozen of 2,048
-dimensions have most of the variance. The second kind is isotropic noise. It is the worst case, because all distances
-are similar. Times are wall-clock seconds on all cores.
+There are two kinds of features. The first kind resembles Inception features: a few dozen of the 2,048 dimensions have
+most of the variance. The second kind is isotropic noise. It is the worst case, because all distances are similar. Times
+are wall-clock seconds on all cores.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ ROUNDS = 3
 def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
     """Return features (count, 2048) in float32.
 
-    With `falling`, no feature is negative, and mean squares along a random basis are proportional to 1 / rank^2.
+    If `falling` is true, no feature is negative. The mean square along axis k of a random basis is then proportional to
+    1 / k^2.
     """
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((count, DIMENSIONS), dtype=np.float32)
@@ -43,7 +44,8 @@ def make_features(count: int, seed: int, falling: bool) -> np.ndarray:
 def compute_adm_precision_recall(real: np.ndarray, generated: np.ndarray, k: int = 3) -> tuple[float, float]:
     """Compute precision and recall as ADM's evaluator does.
 
-    Distances are |x|^2 - 2 x.y + |y|^2 in float16. The function sorts whole rows to find the radius.
+    The squared distance of x and y is computed in float16 as |x|^2 - 2 x.y + |y|^2. The function sorts whole rows to
+    find the radius.
     """
     sides = [torch.from_numpy(side).half() for side in (real, generated)]
 

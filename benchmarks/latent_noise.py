@@ -44,7 +44,11 @@ class Config:
 
 
 def decode_with_noise(lvae: LayoutVAE, scenes: list[Scene], noise: float, seed: int) -> list[Scene]:
-    """Decode posterior means after adding noise of the given number of standard deviations; keep ids and labels."""
+    """Add noise to the posterior means of scenes, and decode the result.
+
+    The argument `noise` is the noise level, in standard deviations. The decoded scenes have the ids and labels of the
+    given scenes.
+    """
     generator = torch.Generator().manual_seed(seed)
     made = []
     for scene in scenes:

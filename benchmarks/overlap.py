@@ -1,10 +1,14 @@
-"""Compare two sources of the known latents of a block: copies (`copy`, the paper) and re-encoded scenes (`reencode`).
+"""Compare two ways to obtain the known part of a block's latent.
+
+The way `copy` copies this part from the latent of the neighbouring block, as in the paper. The way `reencode` encodes
+the known scene again.
 
     python benchmarks/overlap.py --lvae DIRECTORY
 
 The two blocks of a pair are cut from the same town, 32 m apart along the street. The known half of the second latent
-comes from the first block. The other half comes from the true scene. The second latent is decoded, and its known half
-is compared with the true scene. The upper bound is "own latent": the latent of the whole second block.
+comes from the first block. The other half comes from the true scene. The benchmark decodes the second latent and
+compares the known half of the result with the true scene. The case "own latent" decodes the latent of the whole second
+block. Its result is an upper bound.
 """
 
 from __future__ import annotations

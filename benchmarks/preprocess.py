@@ -37,7 +37,7 @@ from pipelines.training.data_loader import LayoutReader
 
 pa.set_cpu_count(1)
 pa.set_io_thread_count(1)
-BATCH = 32  # scenes that one timing of the rasteriser contains; a timing of ray casting contains one scene
+BATCH = 32  # number of scenes in one timing of the rasteriser; a timing of ray casting uses one scene
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,9 @@ def measure_agreement(drive: Drive, indices: np.ndarray, grid: Grid) -> tuple[fl
     """Compare occupied pixels and heights of rasters with ray casting.
 
     Returns:
-        Share of pixels, over all ground classes, where both methods agree on the occupancy. The other two values use
-        only pixels that both methods mark as occupied: share of pixels with a height error below 1 cm, and largest
-        height error in metres.
+        Three values. The first value is the share of pixels, over all ground classes, for which both methods agree on
+        the occupancy. The other two values use only pixels that are occupied in both methods. They are the share of
+        pixels with a height error below 1 cm and the largest height error in metres.
     """
     same, within, worst = [], [], 0.0
     for index in indices:

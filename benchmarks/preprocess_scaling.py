@@ -4,7 +4,7 @@
     python benchmarks/preprocess_scaling.py --nodes 16      # many-node part with 16 simulated nodes of one CPU
 
 The simulated cluster runs on one machine. The results are the CPU time and the network traffic of the driver per scene.
-There is only one driver, so both numbers must be small and independent of the number of nodes.
+One driver serves all nodes. Both numbers must therefore be small, and they must not grow with the number of nodes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from pipelines.preprocess.sharding import ShardTask, plan_kitti360
 from pipelines.preprocess.sources import kitti360
 from pipelines.schema.tables import find_shards
 
-FULL_POSES, FULL_LOGS = 80_000, 1_000  # poses of KITTI-360; logs of Argoverse 2, two per shard
+# number of poses of KITTI-360; number of logs of Argoverse 2, with two logs per shard
+FULL_POSES, FULL_LOGS = 80_000, 1_000
 
 
 @dataclass(frozen=True)

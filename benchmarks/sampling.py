@@ -4,7 +4,8 @@
     python benchmarks/sampling.py --model DIRECTORY     # a trained pipeline
 
 Times are CPU seconds of one thread. Target: all work after sampling takes at most a tenth of the time for sampling with
-50 steps. There are two memory figures: the peak of the process, and the memory of Python, torch and the weights.
+50 steps. The benchmark reports two memory figures. The first is the peak of the whole process. The second is the memory
+for Python, torch and the weights alone.
 """
 
 from __future__ import annotations

@@ -55,13 +55,13 @@ def voxelize_plainly(scene: Scene, voxels: VoxelGrid) -> np.ndarray:
 
 
 def tilt_primitives(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene after tilting every primitive by a few degrees; decoded primitives are also tilted."""
+    """Tilt every primitive of a scene by a few degrees, because decoded primitives are also tilted."""
     axis = rng.normal(size=(len(scene), 3))
     return replace(scene, rotation=(Rotation.from_rotvec(0.05 * axis).as_matrix() @ scene.rotation).astype(np.float32))
 
 
 def merge_scenes(scenes: list[Scene]) -> Scene:
-    """Return one scene with PAPER_OBJECTS primitives, which come from several scenes."""
+    """Merge the primitives of several scenes into one scene, and keep the first PAPER_OBJECTS primitives."""
     joined = {
         name: np.concatenate([getattr(s, name) for s in scenes])
         for name in ("category", "center_m", "rotation", "size_m", "existence", "heading_rad", "instance_id", "label")

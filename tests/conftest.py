@@ -309,7 +309,7 @@ def controlnet_weights(tmp_path_factory) -> tuple[str, str]:
     controlnet = ControlNetModel(in_channels=4, conditioning_embedding_out_channels=(16, 32), **common)
     embedding = controlnet.controlnet_cond_embedding.conv_out
     for block in (*controlnet.controlnet_down_blocks, controlnet.controlnet_mid_block, embedding):
-        torch.nn.init.normal_(block.weight, std=0.5)  # the initial weights are zero, so the image would have no effect
+        torch.nn.init.normal_(block.weight, std=0.5)  # with the initial weights of zero, the image would have no effect
     vae = AutoencoderKL(
         block_out_channels=(32, 64),
         down_block_types=("DownEncoderBlock2D",) * 2,

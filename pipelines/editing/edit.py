@@ -103,7 +103,7 @@ class Select:
 
 
 def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
-    """Return a mask (n,) of the rows of a primitives table that satisfy an SQL condition."""
+    """Return a mask (n,): whether each row of a primitives table satisfies an SQL condition."""
     table = table.append_column("row", pa.array(np.arange(len(table))))
     with duckdb.connect(config={"enable_external_access": False}) as connection:
         try:
@@ -134,7 +134,7 @@ class Edit(ABC):
         """Check the edit without a scene.
 
         Raises:
-            ValueError: The edit is invalid for every scene, or it changes nothing.
+            ValueError: The edit is invalid regardless of the scene, or the edit has no effect.
         """
         self.select.check()
 
@@ -147,7 +147,8 @@ class Edit(ABC):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene with m primitives, and the index (m,) that each of them has in `scene`.
+            The edited scene with m primitives, and an array (m,). For each primitive of the edited scene, the array
+            holds the index of this primitive in `scene`.
 
         Raises:
             ValueError: A primitive of the result has an invalid position or size.
@@ -176,7 +177,7 @@ class ObjectEdit(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the indices 0 .. n - 1.
+            The edited scene, and the indices 0 .. n - 1, because no primitive changes its index.
         """
         part = require_valid_objects(self.transform(scene.select(chosen)))
         place = np.arange(len(scene))
@@ -216,7 +217,7 @@ class Remove(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The scene without these primitives, and the previous index of each remaining primitive.
+            The scene without the selected primitives, and the index in `scene` of each remaining primitive.
         """
         return scene.select(~chosen), np.flatnonzero(~chosen)
 
@@ -245,7 +246,8 @@ class Duplicate(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The edited scene, and the index in `scene` of each primitive. A copy has the index of its original.
+            The edited scene, and the index that each of its primitives has in `scene`. A copy has the index of its
+            original.
         """
         copies = require_valid_objects(Translate(by_m=self.by_m).transform(scene.select(chosen)))
         copies = replace(copies, instance_id=np.full(len(copies), -1, np.int64))
@@ -468,7 +470,7 @@ class Repair(Edit):
             chosen: (n,) bool; the selected primitives.
 
         Returns:
-            The repaired scene, and the previous index of each remaining primitive.
+            The repaired scene, and the index in `scene` of each remaining primitive.
 
         Raises:
             ValueError: A primitive of the result has an invalid position or size.
@@ -506,7 +508,7 @@ class ObjectChange(NamedTuple):
     Attributes:
         primitive: Index of the primitive in the scene before the edit.
         change: One of removed, copied and changed.
-        moved_m: Displacement of the centre (m); for a copy, the distance from its original.
+        moved_m: Displacement of the centre (m). If the primitive is a copy, the distance from its original (m).
         turned_rad: Largest rotation angle of an axis (rad). Opposite directions of an axis are equivalent.
         resized: Largest relative change of length, width or height.
     """
@@ -524,7 +526,7 @@ def compare_objects(before: Scene, after: Scene, origin: np.ndarray) -> ObjectCh
     Args:
         before: Scene before the edit.
         after: Scene after the edit, with m primitives.
-        origin: (m,) index in `before` of each primitive of `after`.
+        origin: (m,) indices. For each primitive of `after`, its index in `before`.
 
     Returns:
         One entry per removed, copied or changed primitive.

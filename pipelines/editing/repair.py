@@ -119,8 +119,8 @@ class _Separation:
         """For each pair of boxes, find up to CANDIDATES placements (k, 2) in which the two boxes do not overlap.
 
         The shortest displacement comes first. If two boxes overlap at both ends of a straight path, they overlap along
-        the whole path, because their common volume is log-concave (Brunn-Minkowski). A direction is therefore skipped
-        if its longest displacement does not separate the boxes.
+        the whole path. The reason is that their common volume is log-concave (Brunn-Minkowski). If the longest
+        displacement in a direction does not separate the boxes, the direction is therefore skipped.
         """
         start = self.now.take(pairs)  # (p, 2, ...)
         share = self.select_primitives[pairs] * start.size_m.prod(axis=2)[:, ::-1]
@@ -139,7 +139,7 @@ class _Separation:
         within &= share.any(axis=1)[:, None, None]
 
         def parted(where: np.ndarray) -> np.ndarray:
-            """Return a mask (p, directions, steps): the displacements in `where` that separate the two boxes."""
+            """Return a mask (p, directions, steps): whether a displacement is in `where` and separates the boxes."""
             pair, *_ = np.nonzero(where)
             a, b = (Boxes(center_m[where][:, k], start.rotation[pair, k], size_m[pair, k]) for k in (0, 1))
             found = where.copy()
@@ -159,7 +159,8 @@ class _Separation:
     def hit(self, pair: np.ndarray, ways: Boxes) -> np.ndarray:
         """For each placement (k, 2) of a pair, return whether one of the two boxes would overlap a third box.
 
-        An overlap counts only if its IoU3D exceeds both the limit and the present IoU3D of the two boxes.
+        An overlap counts only if its IoU3D exceeds two values: the limit, and the IoU3D of the same two boxes before
+        the displacement.
         """
         others = self.solid.copy()
         others[pair] = False

@@ -35,7 +35,8 @@ from pipelines.runtime.ray_tasks import map_dataset
 
 TEST_COUNT = 2000
 TRAIN_KEY, TEST_KEY, NOISE_KEY = 0, 1, 2
-SHARE_EDGES = np.linspace(0.4, 1.0, 7)  # Edges of bins of width / length; "any" boxes also have a score per bin.
+# Edges of the bins of width / length. Boxes of the distribution "any" also get one score per bin.
+SHARE_EDGES = np.linspace(0.4, 1.0, 7)
 
 
 def compute_mean_iou3d(truth: CenteredBoxes, other: CenteredBoxes) -> np.ndarray:
@@ -56,8 +57,8 @@ class Trial:
         encoding: Encoding of a box.
         count: Number of training boxes.
         seed: Seed of boxes and weights.
-        numbers: Numbers that the autoencoder regresses. all: all numbers; moving: only the numbers that vary between
-            boxes.
+        numbers: Numbers that the autoencoder regresses. If "all", all numbers. If "moving", only the numbers that vary
+            between boxes.
     """
 
     kind: str
@@ -76,7 +77,7 @@ def list_trials(kind: str, counts: Sequence[int], seeds: int, numbers: str = "al
     """List the trials of each encoding and training size, by seed and then by decreasing training size.
 
     Raises:
-        ValueError: A training size is less than 2, or the training sizes or the seeds are empty.
+        ValueError: A training size is less than 2, there is no training size, or there is no seed.
     """
     if not counts or min(counts) < 2 or seeds < 1:
         raise ValueError(
@@ -159,7 +160,10 @@ def reconstruct_boxes(
 
 
 def average_by_size(scores: Iterable[dict]) -> list[dict]:
-    """Return the mean IoU3D and its variation over seeds, for each combination of boxes, numbers, encoding and size."""
+    """Return the mean IoU3D and its variation over seeds.
+
+    The result has one row for each combination of boxes, numbers, encoding and training size.
+    """
 
     def key(row: dict) -> tuple:
         return (
@@ -198,14 +202,14 @@ def average_by_size(scores: Iterable[dict]) -> list[dict]:
 
 NOISES = (0.001, 0.003, 0.01, 0.03)  # Noise relative to the range of each entry.
 SHARES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
-LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # Mean IoU of a square with itself at a random yaw: 0.7935.
+LOST_YAW_IOU3D = np.sqrt(8) / np.pi * np.arcsinh(1)  # Mean IoU of a square and its copy with a random yaw: 0.7935.
 
 
 def compute_square_iou(turn_rad: np.ndarray | float) -> np.ndarray:
-    """Return the IoU of a square and its rotated copy, 1 / (sin + cos), for rotations in [0, pi/2].
+    """Return the IoU of a square and its copy that is rotated by t in [0, pi/2]: 1 / (sin t + cos t).
 
-    The formula also gives the IoU3D of an upright box with a square footprint and its rotated copy. The mean over all
-    rotations is LOST_YAW_IOU3D.
+    If an upright box has a square footprint, the same formula gives the IoU3D of the box and its rotated copy. The mean
+    over all rotations is LOST_YAW_IOU3D.
     """
     return 1 / (np.sin(turn_rad) + np.cos(turn_rad))
 
@@ -222,8 +226,8 @@ def compute_yaw_loss(row: dict, count: int) -> dict:
     The input row holds encoding, width_share and noise. The output row contains the input row and the scores. The noise
     is Gaussian. The standard deviation of the noise is `noise` times the range of the entry over boxes of the
     distribution "any". Constant entries therefore get no noise. `iou3d_lost_with_yaw` is the loss that the yaw error
-    alone causes: the IoU3D of a box with the true axes minus the IoU3D of the decoded box. The extents along the true
-    axes are computed from the decoded scatter matrix.
+    alone causes. This loss is a difference: the IoU3D of a box with the true axes minus the IoU3D of the decoded box.
+    The extents along the true axes are computed from the decoded scatter matrix.
     """
     torch.set_num_threads(1)
     encoding, scale = ENCODINGS[row["encoding"]], find_ranges(row["encoding"])
@@ -445,7 +449,7 @@ def draw_size_chart(rows: Sequence[dict], kind: str, numbers: str = "all") -> Ch
 
 
 def _draw_whisker(x: float, row: dict) -> Iterator[tuple[float, float]]:
-    """Yield the points of a whisker: mean, maximum, minimum, and the mean again, from which the line continues."""
+    """Yield the points of a whisker: mean, maximum, minimum, mean. The chart line continues from the last point."""
     yield from ((x, row[f"iou3d_{way}"]) for way in ("mean", "max", "min", "mean"))
 
 
@@ -462,7 +466,10 @@ def draw_share_chart(rows: Sequence[dict], kind: str, count: int) -> Chart:
 
 
 def draw_yaw_chart(rows: Sequence[dict]) -> Chart:
-    """Draw the IoU3D loss from yaw errors: Cholesky at each noise, the other encodings only at the largest noise."""
+    """Draw the IoU3D loss from yaw errors.
+
+    The chart shows the encoding Cholesky at each noise level, and the other encodings only at the largest noise level.
+    """
     noises = sorted({row["noise"] for row in rows})
     shown = [("cholesky", noise) for noise in reversed(noises)] + [
         (e, noises[-1]) for e in ENCODINGS if e != "cholesky"

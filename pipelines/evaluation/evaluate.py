@@ -42,7 +42,7 @@ from pipelines.metrics.neighbours import (
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
-MEMORISED_QUANTILE = 0.01  # Quantile of the distance of a real scene to the nearest other real scene.
+MEMORISED_QUANTILE = 0.01  # Quantile of the distances from real scenes to their nearest other real scene.
 
 
 def compare_datasets(
@@ -124,8 +124,8 @@ def compute_feature_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[
 def compute_neighbourhood_scores(real: np.ndarray, generated: np.ndarray, k: Sequence[int]) -> dict[str, Estimate]:
     """Compute precision, recall, density and coverage for each k, with names such as precision_k3.
 
-    For the intervals, only the samples that are tested for membership in a ball are resampled. The balls are kept,
-    because a sample that is drawn twice would be its own neighbour.
+    For the intervals, only the samples that are tested for membership in a ball are resampled. The balls are kept. If a
+    resample defined the balls, a sample that is drawn twice would be its own neighbour.
 
     Raises:
         ValueError: There are too few samples for the largest k.
@@ -183,8 +183,9 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
         `generated`: statistics of the distance from each generated sample to the nearest real sample. `real`:
         statistics of the distance from each real sample to the nearest other real sample. `memorised`: share of
         generated samples with a distance below the 1 % quantile of the distances of real samples. `copies`: share of
-        generated samples at distance 0. `nearest` (m, 3): indices of the nearest real samples of each generated sample,
-        in order of distance. `distance` (m, 3): distances from each generated sample to these nearest real samples.
+        generated samples at distance 0. `nearest` (m, 3): for each generated sample, the indices of the three nearest
+        real samples; the nearest comes first. `distance` (m, 3): distances from each generated sample to these nearest
+        real samples.
     """
     sides = prepare_features(real, generated, (NEIGHBOURS,))
     squared, index = find_nearest(sides[1], sides[0], range(len(generated)), NEIGHBOURS)
@@ -239,7 +240,10 @@ def compute_scene_means(values: np.ndarray) -> list[Estimate | None]:
 
 
 def compute_pair_ratios(records: np.ndarray) -> list[Estimate | None]:
-    """Estimate the rate of each measure from records (n, 2 * measures): alternating numerators and denominators."""
+    """Estimate the rate of each measure from records (n, 2 * measures).
+
+    In a record, the numerator of each measure is followed by the denominator.
+    """
     return estimate_ratios(records[:, ::2], records[:, 1::2])
 
 

@@ -122,14 +122,14 @@ class SceneRecord:
 
     Attributes:
         ground: Per-class sums of ground errors, at the resolution of the true scene.
-        raster: Per-class sums of ground errors, at the resolution of the model; the true scene is resampled.
+        raster: Per-class sums of ground errors at the resolution of the model, to which the true scene is resampled.
         matches: Matched detections.
         pairs: Per-category sums over pairs of matched primitives.
         confusion: (classes, classes) number of voxels; rows are true classes, and columns are predicted classes.
         outside: Numbers of ground pixels and of objects outside the voxel grid.
         memory: Size of the scene in each representation of MEMORY (bytes).
-        labels: (measures, 2) label fidelity: whether the reconstruction and the true scene have the same label; zeros
-            if unknown.
+        labels: (measures, 2) label fidelity: whether the reconstruction and the true scene have the same label. If this
+            is unknown, the values are 0.
     """
 
     ground: GroundSums
@@ -245,7 +245,7 @@ class Reconstruction:
     Attributes:
         scores: Nested dictionary of the scores of the dataset.
         scenes: One row of scores per scene, in order of decreasing voxel mIoU.
-        places: Location of each scene (a chunk with one row), in the order of `scenes`.
+        places: Location of each scene, as a chunk with one row. The order is the same as in `scenes`.
     """
 
     scores: dict

@@ -36,7 +36,7 @@ class ReferenceSet:
 def list_references(
     xy_m: np.ndarray, world: np.ndarray, sizes: Sequence[int], distances_m: Sequence[float], least: int, most: int
 ) -> Iterator[ReferenceSet]:
-    """Yield reference sets of `least` to `most` scenes, which are selected by their poses (n, 2).
+    """Select reference sets of `least` to `most` scenes by the poses (n, 2) of the scenes, and yield the sets.
 
     Values of `sizes` that exceed n are skipped.
     """

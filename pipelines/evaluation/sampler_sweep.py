@@ -10,7 +10,8 @@ from pipelines.metrics.intervals import Estimate
 from pipelines.reporting.chart import Chart
 from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, render_report_html
 
-# Scores of `compare_datasets`: keys, display name, and which values are better ("one": values close to 1).
+# Scores of `compare_datasets`. Each score has its keys, its display name and the better values: "low", "high" or "one"
+# (close to 1).
 MEASURES = {
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),

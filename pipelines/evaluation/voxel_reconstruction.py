@@ -31,7 +31,7 @@ SCENE_SCORES = pa.schema(
         ("voxel_iou", pa.float64()),  # Null if both sides are empty.
         ("voxel_miou", pa.float64()),
         ("rebuilt_bytes", pa.int64()),  # Size of the reconstruction file.
-        ("stored_bytes", pa.int64()),  # Size of the representation that the method stores; null if it is not given.
+        ("stored_bytes", pa.int64()),  # Size of the file that the method stores; null if no such file is given.
     ]
 )
 
@@ -53,7 +53,7 @@ class VoxelPair:
         name: Scene id.
         truth: Location of the true voxels.
         rebuilt: URI of the reconstruction.
-        stored: URI of the representation that the method stores; "" if it is not given.
+        stored: URI of the representation that the method stores. If no such file is given, "".
     """
 
     name: str
@@ -94,7 +94,7 @@ def pair_files(
     Args:
         truth: True voxels by scene id.
         rebuilt: Files of the reconstructions by scene id.
-        stored: By scene id, the file of the representation that the method stores. None: there are no such files.
+        stored: For each scene id, the file of the representation that the method stores. None: there are no such files.
         partial: Whether scenes may be missing from some sides.
 
     Returns:

@@ -136,8 +136,8 @@ def compute_drift_scores(sums: Sequence[Mapping[str, float]]) -> dict[str, float
         sums: Results of `compute_drift`.
 
     Returns:
-        Ground IoU, height RMSE (m), share of objects that are found, and the mean IoU3D of these objects. A ratio 0 / 0
-        is None.
+        Ground IoU, height RMSE (m), share of known objects that have a match, and mean IoU3D of the matched objects. A
+        ratio 0 / 0 is None.
     """
     total = {name: sum(row[name] for row in sums) for name in sums[0]}
 

@@ -41,7 +41,7 @@ from pipelines.schema.tables import Shard
 
 RANKS = {"outward": rank_outward, "colours": rank_four_colors}
 ARRAYS = ("category", "center_m", "rotation", "size_m", "existence", "height_m", "occupied")
-HARDLY_KNOWN = 0.1  # Minimum fraction of known pixels with ground; below it, the job prints a warning.
+HARDLY_KNOWN = 0.1  # If the fraction of known pixels with ground is smaller, the job prints a warning.
 MAX_RETRIES = 3  # Number of retries for a block whose process died.
 
 
@@ -56,7 +56,7 @@ class OutpaintRequest(Request):
         mode: Outpainting mode of `generate_blocks`.
         repaint: RePaint options.
         guidance_scale: Scale of classifier-free guidance.
-        num_blocks: Number of blocks to generate ahead, behind, to the left and to the right.
+        num_blocks: Four numbers of blocks to generate: ahead, behind, to the left, to the right.
         order: Order in which blocks are generated (a key of RANKS).
         batch_size: Maximum number of blocks per batch.
     """
@@ -83,7 +83,7 @@ class OutpaintRequest(Request):
         return f"{self.source}-{self.seed}-{number:07d}"
 
     def blocks_directory(self, number: int) -> str:
-        """Return the directory of the blocks of a scene; it is deleted after stitching.
+        """Return the directory of the blocks of a scene. After the blocks are stitched, the directory is deleted.
 
         Args:
             number: Number of the scene in the run.
@@ -162,7 +162,8 @@ def make_block_path(directory: str, index: BlockIndex) -> str:
 
 
 def write_block(block: SceneBlock, path: str) -> None:
-    """Write a block at full precision; the tables round values. A resumed run then gives exactly the same scene.
+    """Write a block at full precision, because the tables round values. A resumed run then gives exactly the same
+    scene.
 
     Args:
         block: Block.

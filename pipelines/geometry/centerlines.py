@@ -1,8 +1,8 @@
 """Extract the road network of a Scene from its road mask: centrelines with heights and widths, which meet at nodes.
 
 The mask is cleaned and thinned to a skeleton of one pixel width. The skeleton is cut at its forks. Spurs, which are
-artefacts of an uneven outline, are removed. Forks that are closer together than the road width become one node. The
-mask is padded with its edge values beyond the scene's border. A road therefore crosses the border in a straight line.
+artefacts of an uneven outline, are removed. Forks that are closer together than the road width become one node. Beyond
+the scene's border, the mask repeats the values at the border. A road therefore crosses the border in a straight line.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ class Road:
     Attributes:
         xyz_m: Points on the ground (m).
         width_m: Width of the whole road at each point (m).
-        start: Number of the node at the first point; -1 if the road ends there at the scene's border or in a dead end.
-        end: Number of the node at the last point; -1 under the same conditions as for `start`.
+        start: Number of the node at the first point. If the first point lies at the scene's border or is a dead end,
+            -1.
+        end: Number of the node at the last point. If the last point lies at the scene's border or is a dead end, -1.
         number: Number of the road in the network.
     """
 
@@ -151,8 +152,8 @@ def _keep_large_parts(mask: np.ndarray, area_m2: float, border: bool = False) ->
 def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
     """Convert a skeleton to a graph.
 
-    Forks and ends become nodes with the attribute `place` (2,): row and column. The lines between nodes become edges
-    with the attribute `path` (k, 2), which leads from u to v with u < v.
+    Forks and ends become nodes with the attribute `place` (2,): row and column. A line between two nodes u < v becomes
+    an edge. The attribute `path` (k, 2) of the edge leads from u to v.
     """
     neighbours = ndimage.convolve(skeleton.astype(int), AROUND, mode="constant") - 1
     forks, count = label_parts(skeleton & (neighbours > 2), AROUND)
@@ -166,7 +167,7 @@ def _trace_graph(skeleton: np.ndarray) -> nx.MultiGraph:
         ends = []
         for end in (0, -1):
             fork = int(touching[tuple(path[end])])
-            # For a single pixel between two forks, find the second fork among its neighbours.
+            # If a line is a single pixel between two forks, find the second fork among the neighbours of this pixel.
             if len(path) == 1 and end == -1 and fork:
                 around = forks[path[0][0] - 1 : path[0][0] + 2, path[0][1] - 1 : path[0][1] + 2]
                 fork = int(min(set(around[around > 0].tolist()) - {ends[0]}, default=0))
@@ -342,8 +343,8 @@ def plan_drive(network: RoadNetwork, start_m: tuple[float, float] = (0.0, 0.0), 
             half.
 
     Returns:
-        (k, 3) points in the scene frame (m), as closely spaced as the points of the roads; (0, 3) if there are no
-        roads.
+        (k, 3) points in the scene frame (m). Their spacing is that of the points of the roads. If there are no roads,
+        the shape is (0, 3).
     """
     starts = [r for road in network.roads for r in (road, road.reverse()) if r.start == -1]
     starts = starts or [r for road in network.roads for r in (road, road.reverse())]

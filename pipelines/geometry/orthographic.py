@@ -145,9 +145,9 @@ def find_ellipsoids_over(scene: Scene, camera: Camera, depth_m: np.ndarray) -> n
 
 
 class _Chords(NamedTuple):
-    """Chords: m intersections of ellipsoids with rows of pixel centres, as seen from a camera.
+    """Chords in an image. A chord is the part of a row of pixel centres that lies inside an ellipsoid.
 
-    Chords are ordered by ellipsoid.
+    There are m chords, ordered by ellipsoid.
     """
 
     primitive: np.ndarray  # (m,) index of the primitive in the scene.
@@ -159,9 +159,9 @@ class _Chords(NamedTuple):
 def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, _Chords]:
     """Return the flat pixel index (k,) and chord index (k,) of each pixel centre inside an ellipsoid, and the chords.
 
-    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| = 1. L is
-    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The third
-    entry of s is the positive square root of 1 minus the squares of the other two entries.
+    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. The surface of an ellipsoid is the set of points center + L
+    s with |s| = 1. L is lower triangular. Therefore x determines the first entry of s, and y then determines the second
+    entry. The third entry of s is the positive square root of 1 minus the squares of the other two entries.
     """
     view = camera.view
     primitive = np.flatnonzero(scene.category == ELLIPSOID)
@@ -189,7 +189,7 @@ def _compute_chords(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarra
 
 
 def _compute_depth_m(pixel: np.ndarray, chord: np.ndarray, chords: _Chords, view: Grid) -> np.ndarray:
-    """Return the depth (k,) of ellipsoids at pixels on their chords; pixels are flat indices."""
+    """Return the depth (k,) of an ellipsoid at each pixel of a chord. The argument `pixel` holds flat pixel indices."""
     y, shift, l11, rest, middle, l21, l22 = chords.terms
     col = pixel - chords.row_start.take(chord)
     s1 = (view.y_m().take(col) - y.take(chord) - shift.take(chord)) / l11.take(chord)

@@ -14,14 +14,15 @@ from models.scene import Grid
 
 # A pixel centre within this distance of an edge counts as inside. This prevents gaps between adjacent triangles.
 EDGE_PX = 1e-7
-# If the slope of a triangle (m per pixel) exceeds STEEP, the heights of its hits are clamped to its height range.
+# If the slope of a triangle (m per pixel) exceeds STEEP, the heights of its hits are clamped to the height range of the
+# triangle.
 STEEP = 1e3
 
 
 def concatenate_ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Concatenate the integer ranges first[i] .. first[i] + count[i] - 1.
 
-    If x holds one value per range, `np.repeat(x, count)` assigns each integer the value of its range.
+    If x holds one value per range, `np.repeat(x, count)` gives, for each integer of the result, the value of its range.
 
     Args:
         first: (n,) first integer of each range.
@@ -90,7 +91,7 @@ def find_hits(triangles_m: np.ndarray, grid: Grid, owner: np.ndarray) -> tuple[n
 def _find_column_intervals(
     row: np.ndarray, spans: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest column coordinate of a triangle in each of its pixel rows (s,).
+    """Return, for each pixel row of a triangle, the lowest and the highest column coordinate (s,) in this row.
 
     The argument `spans` (t,) contains the number of rows per triangle. The arguments `u` and `v` (3, t) are row and
     column coordinates of the corners, in pixels. Pixel centres have integer coordinates.
@@ -154,7 +155,7 @@ def cast_rays_down(
 def rasterize_heights(triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int) -> np.ndarray:
     """Return only the heights from `cast_rays_down`.
 
-    This function uses half of the memory of `cast_rays_down` and takes less time.
+    Compared with `cast_rays_down`, this function needs half of the memory and less time.
 
     Args:
         triangles_m: (t, 3, 3) corners (x, y, z) in the frame of the grid (m).

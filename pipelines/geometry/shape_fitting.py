@@ -16,7 +16,7 @@ def fit_boxes_to_edges(edges_m: np.ndarray, center_m: np.ndarray) -> tuple[np.nd
     """Fit boxes to edge vectors.
 
     The longest edge determines the first axis of the box. A short edge is unsuitable, because rounding errors change
-    its direction more. The error would displace the corners of a long box.
+    the direction of a short edge more. With a wrong direction, the corners of a long box would be displaced.
 
     Args:
         edges_m: (n, 3, 3); columns are the edge vectors of a box (m).

@@ -55,7 +55,7 @@ assert sorted(PRECEDENCE) == sorted(CATEGORIES) and EMPTY == 0
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A voxel grid: one column of voxels per pixel of a horizontal grid, with levels of the same height.
+    """A voxel grid with one column of voxels per pixel of a horizontal grid. All levels have the same height.
 
     The default is the paper's 256 x 256 x 32 voxels, with an edge length of 0.25 m. The paper does not define the
     range in z.
@@ -182,7 +182,7 @@ class _Runs(NamedTuple):
 
     column: np.ndarray  # (m,) flat index of the column.
     primitive: np.ndarray  # (m,) index of the primitive in the scene.
-    low_m: np.ndarray  # (m,) z of the lower end; rounding errors can place it above high_m.
+    low_m: np.ndarray  # (m,) z of the lower end. Because of rounding errors, the value may exceed high_m.
     high_m: np.ndarray  # (m,) z of the upper end.
 
 
@@ -205,8 +205,8 @@ def _list_pixels(
 ) -> tuple[np.ndarray, np.ndarray]:
     """List the pixels along an axis whose centres lie in the intervals [middle + low, middle + high].
 
-    The result holds the number of each pixel and the index of its interval. Pixel numbers decrease along the axis. The
-    centre of a pixel lies at first_m - (pixel + .5) step_m.
+    For each pixel, the result holds the pixel number and the index of the interval. Pixel numbers decrease along the
+    axis. The centre of a pixel lies at first_m - (pixel + .5) step_m.
     """
     at = (first_m - middle_m) / step_m - 0.5
     first = np.ceil(at - (high_m + EDGE_M) / step_m).clip(0, count).astype(np.int64)
@@ -230,8 +230,8 @@ def _compute_box_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     col, span = _list_pixels(center_m[box, 1], low_m, high_m, grid.left_m, grid.resolution_m, grid.cols)
     dy = grid.y_m()[col] - center_m[box, 1].take(span)
 
-    # Slab j covers the range center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j| in z. If R_2j is 0, the slab adds no
-    # limit to the vertical projection of the box.
+    # In z, slab j covers the range center - (R_0j dx + R_1j dy) / R_2j ± half_j / |R_2j|. If R_2j is 0, the slab adds
+    # no limit to the vertical projection of the box.
     leans = np.abs(rotation[:, 2]) > LEVEL_AXIS
     inverse = np.where(leans, 1.0, 0.0) / np.where(leans, rotation[:, 2], 1.0)
     reach_m = np.where(leans, half_m * np.abs(inverse), np.inf)
@@ -270,9 +270,9 @@ def _list_shadow_pixels(edges_m: np.ndarray, box: np.ndarray, dx_m: np.ndarray) 
 def _compute_ellipsoid_runs(scene: Scene, voxels: VoxelGrid) -> _Runs:
     """Compute the runs of all ellipsoids.
 
-    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set center + L s with |s| <= 1. L is
-    lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The third
-    entry of s lies between the two roots of a quadratic.
+    Let L be the Cholesky factor of R diag(size / 2)^2 R^T. An ellipsoid is the set of points center + L s with |s| <=
+    1. L is lower triangular. Therefore x determines the first entry of s, and y then determines the second entry. The
+    third entry of s lies between the two roots of a quadratic.
     """
     grid, chosen = voxels.columns, np.flatnonzero((scene.category == ELLIPSOID) & (scene.size_m > 0).all(axis=1))
     center_m = scene.center_m[chosen].astype(np.float64)
@@ -304,8 +304,8 @@ class OutsideCounts:
 
     Attributes:
         ground: (2,) int64: number of columns with ground, and number of columns with ground outside the grid.
-        objects: (11, 3) int64 numbers of primitives per category: all primitives, those at least partly outside, and
-            those wholly outside.
+        objects: (11, 3) int64. For each category: number of all primitives, number of primitives at least partly
+            outside the grid, and number of primitives wholly outside the grid.
     """
 
     ground: np.ndarray

@@ -1,8 +1,8 @@
 """Convert a Scene to meshes: layout reconstruction (paper, supplement B.2), GLB files and PLY files.
 
 The ground is one fused surface. Each occupied pixel becomes a vertex at the pixel centre, with the colour of the
-pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles; all blocks have the same diagonal. A primitive
-is a unit cuboid or a unit ellipsoid (diameter 1), transformed by T = [R diag(l, w, h) | t].
+pixel's class. Each 2 x 2 block of occupied pixels becomes two triangles. The diagonal has the same direction in all
+blocks. A primitive is a unit cuboid or a unit ellipsoid (diameter 1), transformed by T = [R diag(l, w, h) | t].
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CATEGORY_IDS, GROUND_CLASS_ID
 
 AUTHORS_AXES: Axes = ("x+", "y-", "z-")
-# Changes below UNMOVED are rounding errors, not edits. Changes of a size are relative; changes of a yaw are in rad.
+# Changes below UNMOVED are rounding errors, not edits. For a size, the change is relative. For a yaw, the change is in
+# rad.
 UNMOVED = 1e-4
 MAX_PIXELS = 2**24  # Maximum number of pixels of an imported grid.
 
@@ -121,8 +122,8 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
     center_m = scene_from_unit[:, :3, 3]
     rotation, size_m = fit_boxes_to_edges(scene_from_unit[:, :3, :3], center_m)
-    # Keep the stored sizes where the fitted sizes agree with them. Otherwise, rounding can swap length and width of a
-    # square.
+    # If the fitted sizes agree with the stored sizes, keep the stored sizes. Otherwise, rounding can swap length and
+    # width of a square.
     size_said_m = size_said_m.reshape(-1, 3)
     size_m = np.where(np.isclose(size_m, size_said_m, rtol=UNMOVED, atol=0), size_said_m, size_m)
     rotation, size_m = canonicalize_boxes(rotation, size_m)

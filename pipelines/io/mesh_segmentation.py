@@ -197,7 +197,8 @@ def rasterize_ground(
     vertices of one class, the highest vertex is used.
 
     Args:
-        vertices_m: (v, 3) vertices in the scene frame (m), all at corners or all at centres.
+        vertices_m: (v, 3) vertices in the scene frame (m). Either all vertices lie at pixel corners, or all vertices
+            lie at pixel centres.
         class_id: (v,) class id of each vertex.
         classes: G ground classes of the raster.
         grid: Raster grid.
@@ -206,7 +207,7 @@ def rasterize_ground(
         height_m (G, H, W) float32 and occupied (G, H, W) bool.
 
     Raises:
-        ValueError: The vertices lie neither at corners nor at centres, or they lie outside the grid.
+        ValueError: The vertices lie neither at pixel corners nor at pixel centres, or a vertex lies outside the grid.
     """
     at_px = (np.array([grid.front_m, grid.left_m]) - vertices_m[:, :2]) / grid.resolution_m
     from_corner, from_center = (np.abs(at - np.round(at)).max(initial=0) for at in (at_px, at_px - 0.5))

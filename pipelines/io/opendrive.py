@@ -200,7 +200,8 @@ def _make_road_body(
 ) -> None:
     """Write the plan view, elevation and lanes of a road.
 
-    For a connecting road, `links` holds two signs: those of the lane numbers in the previous road and in the next road.
+    For a connecting road, `links` holds two signs: the sign of the lane numbers in the previous road, and the sign of
+    the lane numbers in the next road.
     """
     ET.SubElement(ET.SubElement(road, "type", s="0", type="town"), "speed", max="50", unit="km/h")
     plan, profile = ET.SubElement(road, "planView"), ET.Element("elevationProfile")

@@ -182,9 +182,10 @@ def compute_frechet_distance(a: Gaussian, b: Gaussian, between: Transport | None
 def compute_influence_maps(b: Moments, between: Transport) -> tuple[np.ndarray, np.ndarray]:
     """Return a matrix W (d, r) for each of the two sets. Sample influences are computed from this matrix.
 
-    The derivative of the squared distance with respect to the covariance of a set is I - W W^T. Let
-    M = F^T B F = U s^2 U^T. For the set with covariance A, W W^T is (B F U) s^-3 (B F U)^T. For the set with covariance
-    B, W W^T is (F U) s^-1 (F U)^T. The latter equals A^1/2 (A^1/2 B A^1/2)^-1/2 A^1/2.
+    The derivative of the squared distance with respect to the covariance of a set is I - W W^T. Let U s^2 U^T be the
+    eigendecomposition of M = F^T B F. For the set with covariance A, the matrix W W^T equals (B F U) s^-3 (B F U)^T.
+    For the set with covariance B, the matrix W W^T equals (F U) s^-1 (F U)^T. The latter equals A^1/2 (A^1/2 B
+    A^1/2)^-1/2 A^1/2.
 
     Args:
         b: Moments with covariance B.

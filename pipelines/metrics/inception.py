@@ -27,9 +27,9 @@ KNOWN_FILE = "weights-inception-2015-12-05-6726825d.pth of torch-fidelity's rele
 # The file of pytorch-fid has the same sha256.
 KNOWN_SHA256 = "6726825d0af5f729cebd5821db510b11b1cfad8faad88a03f1befd49fb9129b2"
 
-# A branch is a chain of convolutions (output channels, kernel height, kernel width). A chain that ends in SPLIT has two
-# parallel convolutions at its end, 1x3 and 3x1. If a chain has only one step, the step has the same name as the branch.
-# The steps of longer chains are called name_1, name_2 and so on.
+# A branch is a chain of convolutions (output channels, kernel height, kernel width). If a chain ends in SPLIT, its last
+# step has two parallel convolutions: 1x3 and 3x1. If a chain has only one step, the step has the same name as the
+# branch. The steps of longer chains are called name_1, name_2 and so on.
 SPLIT = "split"
 Chain = tuple[tuple[int, int, int] | str, ...]
 

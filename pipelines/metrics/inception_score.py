@@ -13,8 +13,8 @@ SPLIT_SAMPLES = 5000  # Samples per split, as in ADM's evaluator.
 def compute_inception_score(logits: np.ndarray) -> Estimate:
     """Compute the exponential of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
 
-    The mean divergence is the entropy of the mean distribution minus the mean entropy. The score of a resample is
-    therefore computed from products of its weights with p and with the entropies.
+    The mean divergence is the entropy of the mean distribution minus the mean entropy. Let w be the weights of a
+    resample. The score of the resample therefore needs only two products: w with p, and w with the entropies.
 
     Args:
         logits: (n, classes) logits pool3 @ W **without bias**, as in ADM.

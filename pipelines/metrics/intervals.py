@@ -93,7 +93,7 @@ def estimate_mean(values: np.ndarray, key: int = 0) -> Estimate:
 def estimate_ratios(numerators: np.ndarray, denominators: np.ndarray, key: int = 0) -> list[Estimate | None]:
     """Estimate the ratio of the column sums of two arrays that have one row per scene.
 
-    For example, a ratio is a share of objects: the number of faulty objects divided by the number of all objects. A
+    For example, a ratio can be a share of objects: the number of faulty objects divided by the number of all objects. A
     ratio can also be the mean of a value over the scenes in which the value is defined.
 
     Args:
@@ -118,7 +118,7 @@ def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> E
 
     Args:
         value: Score of the original sample.
-        influences: (n,) influences of the samples, one array for each side.
+        influences: One array per side: (n,) influence of each sample on the score.
 
     Returns:
         Score with its 95 % interval.

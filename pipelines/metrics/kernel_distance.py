@@ -64,7 +64,7 @@ def sum_pairs(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
         gram: (n, n) kernel matrix.
 
     Returns:
-        (b,) means; NaN if a draw holds only one distinct sample.
+        (b,) means. If a draw holds only one distinct sample, the mean is NaN.
     """
     own = np.square(weights)
     total = ((weights @ gram) * weights).sum(axis=1) - own @ np.diag(gram)

@@ -19,11 +19,14 @@ from torch import Tensor
 from pipelines.metrics.frechet import check_features
 
 BLOCK_ROWS = 1024  # Rows per block of the distance matrix; a block takes 4 kB per column.
-SPARE_NEIGHBOURS = 8  # Number of candidates beyond k; their upper bounds limit the k-th distance.
-PAIRS_PER_BLOCK = 128  # Pairs per block of exact distances; a block (2 MB at 2048-d) fits into a cache.
+# Number of candidates in addition to k. The k-th smallest upper bound of the candidates limits the k-th distance.
+SPARE_NEIGHBOURS = 8
+# Number of pairs per block of exact distances. At 2,048 dimensions, a block has 2 MB and fits into a cache.
+PAIRS_PER_BLOCK = 128
 BASIS_SAMPLES = 512  # Number of samples from which the principal axes are computed.
-KEPT_VARIANCE = 0.997  # Share of the variance along the principal axes; more axes need fewer exact distances.
-MOST_LEFT_OVER = 0.02  # Maximum share of the variance in the residual; above it, whole features are used.
+# Share of the variance along the principal axes. With more axes, fewer exact distances are necessary.
+KEPT_VARIANCE = 0.997
+MOST_LEFT_OVER = 0.02  # If the residual holds a larger share of the variance, the whole features are used.
 FLOAT32_ROUNDING = 2.0**-24
 
 
@@ -37,7 +40,7 @@ class NeighbourhoodScores:
 
     Attributes:
         k: Neighbourhood size.
-        in_real: (m,) int64, number of balls of real samples that contain each generated sample.
+        in_real: (m,) int64. For each generated sample, the number of balls of real samples that contain this sample.
         in_generated: (n,) bool, whether each real sample lies in the ball of a generated sample.
         covered: (n,) bool, whether the ball of each real sample contains a generated sample.
     """
@@ -243,9 +246,9 @@ def compute_principal_axes(real: np.ndarray, generated: np.ndarray) -> Principal
 def project_to_axes(features: np.ndarray, basis: PrincipalBasis) -> FeatureSet:
     """Compute the short vectors of features for the filter.
 
-    Let Q be the axes, x = Q^T c + r and y = Q^T c' + r'. Then |x - y|^2 is the sum of |c - c'|^2 and |r - r'|^2. The
-    length |r - r'| lies between the difference and the sum of |r| and |r'|. Let v = (c, |r|). The bound |v - v'|^2 is
-    the dot product of (-2 v, |v|^2, 1) and (v', 1, |v'|^2).
+    Let the rows of Q be the axes. Let r and r' be the residuals of two features x = Q^T c + r and y = Q^T c' + r'. Then
+    |x - y|^2 is the sum of |c - c'|^2 and |r - r'|^2. The length |r - r'| lies between the difference and the sum of
+    |r| and |r'|. Let v = (c, |r|). The bound |v - v'|^2 is the dot product of (-2 v, |v|^2, 1) and (v', 1, |v'|^2).
 
     Args:
         features: (n, d) features.
@@ -342,8 +345,9 @@ def find_within(
         rows: Real samples to consider.
 
     Returns:
-        Three arrays: in_real (len(k), m), and in_generated and covered, each (len(k), len(rows)). The array in_real
-        counts the balls of the samples in `rows` that contain each generated sample; add the counts of all parts.
+        Three arrays: in_real (len(k), m), and in_generated and covered, each (len(k), len(rows)). For each generated
+        sample, in_real is the number of balls that contain this sample; only the balls of the samples in `rows` count.
+        To get the number for all real samples, add the arrays of all ranges of rows.
     """
     in_real = np.zeros(generated_radii.shape, np.int64)
     in_generated, covered = (np.zeros((len(real_radii), len(rows)), bool) for _ in range(2))

@@ -293,7 +293,7 @@ def compute_detection_scores(
         matches: Matches of all scenes.
         max_detections: Number of highest-scoring detections that are kept per scene and category (Omni3D: 100). None:
             all detections are kept.
-        min_score: Detections are ignored unless their score exceeds this value.
+        min_score: Detections with this score or a lower score are ignored.
 
     Returns:
         Scores of the dataset.

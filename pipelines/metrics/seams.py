@@ -28,7 +28,7 @@ MEASURES = (
     "doubled_objects",  # Share of objects at the line that overlap an object of their category on the other side.
 )
 NEAR_M, FAR_M = 4.0, 16.0
-END_M = 0.25  # An object ends at a line if its end is at most this far from the line (m).
+END_M = 0.25  # An object ends at a line if the distance between its end and the line is at most END_M (m).
 DOUBLE_IOU3D = 0.05
 
 
@@ -98,7 +98,7 @@ def measure_line(ground_class: np.ndarray, height_m: np.ndarray, line: int) -> n
         line: Index of the row after the line.
 
     Returns:
-        (2, 2) numerator and denominator of class changes and of height differences.
+        (2, 2) array with the axes (class changes, height differences), (numerator, denominator).
     """
     before, after = ground_class[line - 1], ground_class[line]
     either, both = (before >= 0) | (after >= 0), (before >= 0) & (after >= 0)
@@ -119,7 +119,7 @@ def measure_objects(
         doubles: (p, 2) index pairs of objects that overlap and have the same category.
 
     Returns:
-        (l, 2, 2) numerator and denominator of cut objects and of doubled objects.
+        (l, 2, 2) array with the axes lines, (cut objects, doubled objects), (numerator, denominator).
     """
     at = at_m[:, None]
     ends = (np.abs(low_m - at) <= END_M) | (np.abs(high_m - at) <= END_M)
@@ -144,7 +144,7 @@ def compute_footprint_ranges(scene: Scene) -> np.ndarray:
         scene: Scene with n primitives.
 
     Returns:
-        (n, 2, 2) minimum and maximum of x and of y (m, scene frame).
+        (n, 2, 2) array with the axes primitives, (x, y), (minimum, maximum) (m, scene frame).
     """
     reach = 0.5 * (np.abs(scene.rotation) * scene.size_m[:, None, :]).sum(axis=2)[:, :2]
     return np.stack([scene.center_m[:, :2] - reach, scene.center_m[:, :2] + reach], axis=2)

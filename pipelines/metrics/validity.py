@@ -68,7 +68,8 @@ def find_faults(
         tolerance_m: Maximum distance of an object from the surface (m).
 
     Returns:
-        For each measure, two (n,) bool arrays: implausible primitives, and primitives to which the measure applies.
+        For each measure, two (n,) bool arrays: whether a primitive is implausible, and whether the measure applies to
+        it.
     """
     category = scene.category
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])

@@ -183,7 +183,7 @@ class StreetRenderer:
 
 
 def _list_pixels(lens: Lens) -> Grid:
-    """Return the image as a Grid (rasterize.py), with x = -v - 1/2 and y = -u - 1/2."""
+    """Return the image as a Grid (rasterize.py). At pixel coordinates (u, v), x = -v - 1/2 and y = -u - 1/2."""
     return Grid(0.0, 0.0, 1.0, lens.height, lens.width)
 
 
@@ -228,7 +228,7 @@ def _cut(index: np.ndarray, corners: np.ndarray, behind: np.ndarray) -> tuple[np
     for count in (1, 2):
         some = np.flatnonzero(behind == count)
         near = corners[some, :, 2] < NEAR_M
-        # The first corner is the corner that lies alone on its side of the plane.
+        # Two corners lie on one side of the plane. The first corner is the corner on the other side.
         odd = np.argmax(near if count == 1 else ~near, axis=1)
         turned = corners[some[:, None], (odd[:, None] + np.arange(3)) % 3]
         first, second, third = np.moveaxis(turned, 1, 0)
@@ -251,10 +251,10 @@ def _find_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _intersect_ellipsoids(scene: Scene, camera: StreetCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each ellipsoid and each pixel centre on it, return the flat pixel index, the primitive and 1 / depth (m,).
 
-    A ray t d, with z = 1 in d, intersects |M (t d - p)| = 1 where A t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d^T M^T
-    M p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T K d >= 0. In each row, the pixels with a solution
-    form the interval between the roots of a quadratic. Ellipsoids that are not entirely in front of the camera are
-    skipped.
+    A ray is the set of points t d, where the z of d is 1. The ray intersects the ellipsoid |M (t d - p)| = 1 where A
+    t^2 - 2 B t + C = 0. Here, A = |M d|^2, B = d^T M^T M p and C = |M p|^2 - 1. A solution exists where B^2 - A C = d^T
+    K d >= 0. In each row, the pixels with a solution form the interval between the roots of a quadratic. Ellipsoids
+    that are not entirely in front of the camera are skipped.
     """
     lens = camera.lens
     primitive = np.flatnonzero(scene.category == ELLIPSOID)

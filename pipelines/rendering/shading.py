@@ -34,9 +34,11 @@ SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = -62.0, 52.0
 SUN = np.array([0.68, 0.65, 0.60], np.float32)  # Linear RGB of sunlight on a horizontal surface.
 SKY = 1 - SUN
 SHADOW_PX, SHADOW_BIAS_PX = 900, 1.2
-# Height map: number of pixels along the longer side, standard deviation of the blur, and margin around the grid.
+# Height map: number of pixels along the longer side, standard deviation of the blur (m), and margin around the grid
+# (m).
 SKY_PX, NEARBY_M, MARGIN_M = 640, 1.6, 12.0
-# Share of light that is removed on a line between two primitives, and on a line between two faces of one primitive.
+# Shares of light that are removed: OUTLINE on a line between two primitives, CREASE on a line between two faces of one
+# primitive.
 OUTLINE, CREASE = 0.5, 0.25
 
 SCENERY = 0  # Part number of ground, plate and table. Their borders have no lines.
@@ -164,7 +166,7 @@ def _make_plate(grid: Grid, sheet_m: np.ndarray, table_z_m: float) -> Faces:
 
 
 def _compute_table_depth(camera: Camera, table_z_m: float) -> np.ndarray:
-    """Return the depth (H, 1) of the table in each image row, computed from z = up * x + near * depth."""
+    """Return the depth (H, 1) of the table in each image row: the solution of z = up * x + near * depth."""
     up, _, near = camera.camera_from_scene[:, 2]
     return ((table_z_m - up * camera.view.x_m()) / near)[:, None]
 

@@ -36,7 +36,8 @@ class View:
 
     Attributes:
         kind: `bev` is a view from above; `3d` is an oblique view.
-        size_px: For `bev`, length of the longer side (px). For `3d`, width (px); the aspect ratio is 4 : 3.
+        size_px: If `kind` is `bev`, the length of the longer side (px). If `kind` is `3d`, the width (px) of a picture
+            with the aspect ratio 4 : 3.
     """
 
     kind: Literal["bev", "3d"]

@@ -16,7 +16,7 @@ from pipelines.reporting.chart import choose_log_ticks, choose_ticks, format_num
 from pipelines.schema.palette import COLOR_HEX
 
 MAX_BINS = 25
-LEAST_SPAN = 10  # Minimum range of counts on the axis of a histogram; it limits the width of the bars.
+LEAST_SPAN = 10  # Minimum range of counts on the axis of a histogram. This minimum limits the width of the bars.
 PAGE_PX = 1140  # Width of a drawing that fills the page.
 
 

@@ -21,7 +21,7 @@ def count_gpus_per_actor() -> int:
 
 
 def make_numbered_rows(numbers: Sequence[int]) -> ray.data.Dataset:
-    """Make rows {"id": number}; each row is a block of its own and becomes one task."""
+    """Make one row {"id": number} per number. Each row is a separate block and becomes one task."""
     return ray.data.from_items([{"id": number} for number in numbers], override_num_blocks=len(numbers))
 
 
@@ -30,8 +30,8 @@ def map_dataset(dataset: ray.data.Dataset, function: Callable[..., Any], **optio
 
     Args:
         dataset: Input rows.
-        function: Function of a row and further arguments (`fn_args`, `fn_kwargs`), or an actor class whose instances
-            are such functions.
+        function: Function whose arguments are a row and further arguments (`fn_args`, `fn_kwargs`). Alternatively, an
+            actor class whose instances can be called with these arguments.
         options: Options of `Dataset.map`. Ray's type annotations allow only functions with one argument, the row.
 
     Returns:

@@ -35,7 +35,10 @@ def exists(uri: str) -> bool:
 
 
 def fingerprint_file(uri: str) -> list[str | int]:
-    """Return the path, size (bytes) and modification time of a file; they change if the file is rewritten."""
+    """Return the path, size (bytes) and modification time of a file.
+
+    If the file is rewritten, this fingerprint changes.
+    """
     fs, path = resolve_uri(uri)
     info = fs.get_file_info(path)
     return [path, info.size, str(info.mtime)]

@@ -14,8 +14,8 @@ MAX_SEGMENTS = 100
 TEST_M = 15.0
 MARGIN_M = 5.0
 REMOVAL_M = 5.0
-# The paper defines the split only for its 73.7 km of drives. Shorter drives are cut into fewer segments of at least
-# 50 m: 25 m for test poses with margins, and 25 m for training poses.
+# The paper defines the split only for its 73.7 km of drives. Shorter drives are cut into fewer segments. Each segment
+# has at least 50 m: 25 m for test poses with margins, and 25 m for training poses.
 MIN_SEGMENT_M = 50.0
 
 # Argoverse 2 is split by log; its test logs have no annotations.

@@ -156,7 +156,10 @@ class Studio:
         self.sampling, self.num_waiting, self.lock = threading.Lock(), 0, threading.Lock()
 
     def open_session(self, visitor: str) -> Session:
-        """Return the session of a visitor; above MAX_SESSIONS, delete the least recently used idle session."""
+        """Return the session of a visitor.
+
+        If there are more than MAX_SESSIONS sessions, the least recently used idle session is deleted.
+        """
         with self.lock:
             session = self.sessions.pop(visitor, None) or Session()
             self.sessions[visitor] = session
@@ -173,7 +176,11 @@ class Studio:
         return LABELS[self.pipeline.dit.config.label]
 
     def choose_label(self, request: SamplingRequest, scene: Scene | None) -> str:
-        """Return the requested label; if it is missing, the label of the scene or the first label of the model."""
+        """Return the requested label.
+
+        If the request has no label, return the label of the scene. If the scene has no label either, return the first
+        label of the model.
+        """
         kind = self.pipeline.dit.config.label
         if request.label:
             require_labels(kind, [request.label])

@@ -29,7 +29,7 @@ RUN_PAGES = [
 
 
 def run_words(words: list[str]) -> None:
-    """Run one command of a shell block: run a job in this process, and run a target of make as a dry run."""
+    """Run one command of a shell block. A job runs in this process. A target of make runs as a dry run."""
     from jobs.support.cli import run
 
     if words[0] == "export":

@@ -112,13 +112,13 @@ def test_encoding_is_bi_lipschitz_only_if_octahedral():
         for name, e in ENCODINGS.items()
     }
     assert ratio["octahedral"].min() > 0.05 and ratio["octahedral"].max() < 50
-    assert ratio["cholesky"].min() < 1e-6  # The rotation of a cube does not change its code.
+    assert ratio["cholesky"].min() < 1e-6  # A rotated cube has the same code.
     assert ratio["quaternion"].max() > 1000  # Length and width are swapped, or yaw jumps between -pi/2 and pi/2.
 
 
 @pytest.mark.parametrize("name", ["cholesky", "octahedral"])
 def test_encoding_is_continuous_where_length_equals_width(name):
-    """If a box changes in smaller steps until its length equals its width, its encoding changes in smaller steps too.
+    """If a box changes in smaller steps, its encoding also changes in smaller steps, even where length equals width.
 
     The path turns the box by 180 degrees, tilts it and returns to the same box.
     """

@@ -322,7 +322,8 @@ def test_learning_rate_is_one_cycle_without_warm_up():
 
 
 def test_pseudoinverse_guidance_halves_error():
-    """For data on the line z_1 = z_0 and the exact denoiser, generated values must equal known values."""
+    """All data lie on the line z_1 = z_0, and the denoiser is exact. The generated values must therefore equal the
+    known values."""
     schedule, covariance = SamplingSchedule(Diffusion(), 50), torch.ones(2, 2, dtype=torch.float64)
 
     def denoise(latent, timestep, label):

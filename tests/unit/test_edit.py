@@ -231,7 +231,7 @@ def make_two_cars(gap_m: float, sizes_m=((4, 2, 1.5), (4, 2, 1.5)), **fields) ->
 
 
 def test_repair_separates_overlap_by_shortest_move():
-    scene = make_two_cars(-0.4)  # the IoU3D is 0.0495, and it would be 0.4 / 7.6 = 0.0526 without the lateral offset
+    scene = make_two_cars(-0.4)  # the IoU3D is 0.0495; without the lateral offset, the IoU3D is 0.4 / 7.6 = 0.0526
     scene = replace(scene, center_m=scene.center_m * np.array([1, 0, 1], np.float32))
     mended, (done,) = replay_edits(scene, [edit.Repair(ALL)])
     assert compute_overlap(scene) > 0.05 > compute_overlap(mended) and len(mended) == 2

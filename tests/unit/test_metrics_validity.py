@@ -27,8 +27,8 @@ def make_town_scene(primitives=(), road=None, heights_m=1.0, **labels) -> Scene:
     The last row has no ground. All primitives are cubes of 2 m, except houses, which are cubes of 4 m.
 
     Args:
-        primitives: Category, x, y, and height of the bottom above the surface for each primitive (m).
-        road: Mask of the road; it replaces all ground (None: road and sidewalk as above).
+        primitives: For each primitive: category, x, y, and height of its bottom above the surface (m).
+        road: Mask of the road. If it is given, the scene has no other ground. None: road and sidewalk as above.
         heights_m: Height of the surface below the ground slabs.
         labels: Density labels of the scene.
     """

@@ -1,4 +1,4 @@
-"""Tests of the run guard: after a run has written scenes, its name is bound to its options."""
+"""Tests of the run guard: after a run has written scenes, its name can be reused only with the same options."""
 
 import json
 

@@ -43,7 +43,7 @@ def compute_rays(camera: StreetCamera) -> np.ndarray:
 def test_street_view_equals_ray_casting(seed):
     """The reference for boxes and ground is embree. The reference for ellipsoids is the exact quadric."""
     scene = random_scene(seed, 60, tilt_rad=0.4)
-    # As in the renderer, rays hit only outer faces, so a camera inside a box sees through the faces of the box.
+    # As in the renderer, a ray hits a face only from outside. A camera inside a box therefore sees through its faces.
     camera = StreetCamera.at([1.0, 2.0, 3.0], 0.2, -0.1, SMALL)
     view, way = StreetRenderer(scene).view(camera), compute_rays(camera)
     soup = triangulate_scene(scene)

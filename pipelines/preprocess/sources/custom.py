@@ -462,7 +462,7 @@ def _is_text(value: object) -> bool:
 def _is_whole(value: object) -> bool:
     """Return whether a value is an integer of at least 0.
 
-    Floats such as 3.0 count, because pandas columns with nulls contain them.
+    Floats such as 3.0 count as integers, because pandas stores the integers of a column with nulls as floats.
     """
     return (type(value) is int or type(value) is float) and 0 <= value <= MAX_WHOLE and value == value // 1
 

@@ -441,8 +441,9 @@ def compute_box_geometry(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute centre, rotation and size of a box or ellipsoid mesh under an affine transform.
 
-    For a mirrored transform, the y axis of the box is flipped. The x axis is kept, because it may be the heading. For a
-    sheared transform, the result is the nearest rotation (polar factor of the unit axes) and the lengths of the axes.
+    For a mirrored transform, the y axis of the box is flipped. The x axis is kept, because it may be the heading. If
+    the transform is sheared, the rotation is the nearest rotation (polar factor of the unit axes), and the sizes are
+    the lengths of the axes.
 
     Args:
         world_from_local: (4, 4) transform.

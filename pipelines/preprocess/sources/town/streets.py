@@ -68,7 +68,7 @@ class CityBlock:
         u1: Upper bound along u (m).
         v0: Lower bound along v (m).
         v1: Upper bound along v (m).
-        streets: For the south, east, north and west side, whether the side faces a street.
+        streets: Four values, for the sides south, east, north and west: whether the side faces a street.
         corners: Kerb radii at the corners SW, SE, NE and NW (m); 0 at a corner without a kerb.
         kind: Name of the district.
     """
