@@ -30,8 +30,9 @@ class Config:
     """Dataset directory (default: $PRITTI_HOME/datasets/<the preset's source>)."""
     latents: str = ""
     """Directory with latents.json (default: the dataset directory)."""
-    label_kind: Literal["vegetation", "vehicle", "joint", "none"] = "vegetation"
-    """Kind of label that the model is conditioned on."""
+    label_kind: Literal["vegetation", "vehicle", "joint", "none"] | None = None
+    """Kind of label that the model is conditioned on (default: as in the paper, vegetation density, or vehicle density
+    if the dataset has no vegetation, such as Argoverse 2)."""
     name: str = ""
     """Name of the run; a run name is bound to its options (default: dit-<preset>)."""
     output: str = ""

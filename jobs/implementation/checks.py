@@ -20,8 +20,11 @@ from jobs.support.model_directories import find_pipeline_directory, require_mode
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
+from models.scene import CATEGORIES, VEGETATION, VEHICLES
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
+
+DENSITY_GROUPS = {"vegetation": VEGETATION, "vehicle": VEHICLES}  # Categories that each density label counts.
 
 
 def find_training_dataset(config: LVAEConfig | DiTConfig, source: str) -> str:
@@ -47,8 +50,33 @@ def check_train_dit(config: DiTConfig) -> None:
     row = find_preset(DIT_PRESETS, config.preset)
     require_positive(config, "gradient_accumulation_steps")
     if not needs_smoke_inputs(config):
-        root = Dataset.open(find_training_dataset(config, LVAE_PRESETS[row.lvae].source)).root
-        require_latents(make_absolute(config.latents) if config.latents else root, root)
+        dataset = Dataset.open(find_training_dataset(config, LVAE_PRESETS[row.lvae].source))
+        resolve_label_kind(config, dataset)
+        require_latents(make_absolute(config.latents) if config.latents else dataset.root, dataset.root)
+
+
+def resolve_label_kind(config: DiTConfig, dataset: Dataset) -> str:
+    """Return --label-kind, or the default for a dataset.
+
+    The paper conditions on vegetation density for KITTI-360 and on vehicle density for Argoverse 2, which has no
+    vegetation.
+
+    Raises:
+        ValueError: The dataset has no object of a category that the label counts. All scenes would get one label.
+    """
+    lacks = {
+        name
+        for name, group in DENSITY_GROUPS.items()
+        if not {CATEGORIES[k] for k in group} & set(dataset.spec.categories)
+    }
+    kind = config.label_kind or ("vehicle" if "vegetation" in lacks else "vegetation")
+    if missing := lacks & (set(DENSITY_GROUPS) if kind == "joint" else {kind}):
+        known = [name for name in (*DENSITY_GROUPS, "none") if name not in lacks]
+        raise ValueError(
+            f"--label-kind {kind}: {dataset.root} has no objects of the group {' or '.join(sorted(missing))}, so all"
+            f" scenes would have the same label; use --label-kind {' or '.join(known)}"
+        )
+    return kind
 
 
 def require_latents(latents_root: str, dataset_root: str) -> None:

@@ -7,11 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+import pyarrow as pa
 import torch
 from torch import Tensor
 
 from jobs.encode_latents import Config as EncodeConfig
-from jobs.implementation.checks import find_training_dataset, needs_smoke_inputs, require_latents
+from jobs.implementation.checks import (
+    find_training_dataset,
+    needs_smoke_inputs,
+    require_latents,
+    resolve_label_kind,
+)
 from jobs.implementation.encode_latents import encode
 from jobs.implementation.smoke_inputs import make_smoke_dataset
 from jobs.implementation.train_lvae import train as train_lvae
@@ -34,8 +41,8 @@ from models.training import ExecutionConfig, OptimizerConfig, TimestepSampling, 
 from pipelines.generation.sample import load_pipeline
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
-from pipelines.schema.tables import find_shards
-from pipelines.training.data_loader import LatentReader, Stream
+from pipelines.schema.tables import Shard, find_shards
+from pipelines.training.data_loader import LatentReader, Stream, label_indices
 from pipelines.training.latents import digest_weights, load_lvae
 
 
@@ -51,14 +58,15 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
         make_smoke_dataset(root)
         make_smoke_latents(root)
     dataset = Dataset.open(root)
+    label_kind = resolve_label_kind(config, dataset)
     latents_root = make_absolute(config.latents) if config.latents else root
     require_latents(latents_root, root)
     latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
-    architecture = make_dit_architecture(config, row, latents, load_encoder(latents, latents_root))
+    architecture = make_dit_architecture(row, latents, load_encoder(latents, latents_root), label_kind)
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
     architecture |= start.normalisation if start else {}
     settings = make_optimizer_config(config, row)
-    identity = make_run_identity(config, row, settings, latents, root, start)
+    identity = make_run_identity(config, row, settings, latents, root, start) | {"label": label_kind}
     name = config.name or f"dit-{config.preset}"
     record = trainer.guard_run_name(name, home_path("runs"), identity)
     tracker = Tracker.start("pritti-dit", name, identity | {"architecture": row.architecture()}, record)
@@ -66,20 +74,39 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     timestep_sampling = parse_timestep_sampling(config)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
+    warn_about_missing_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         storage_path=home_path("runs"),
         build=partial(build, architecture, settings, execution, row.label_dropout, start, timestep_sampling),
         stream=Stream(tuple(shards), tuple(counts), row.batch_size, config.seed),
-        reader=LatentReader(latents_root, config.label_kind),
+        reader=LatentReader(latents_root, label_kind),
         settings=settings,
         identity=identity,
         tracker=tracker,
         checkpoint_every=config.checkpoint_every or max(4, settings.steps // 20),
         log_every=max(1, min(50, settings.steps // 50)),
-        validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], config.label_kind),
+        validate=SamplingCheck(root, dataset.source, latents_root, latents["lvae"], label_kind),
     )
     return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
+
+
+def warn_about_missing_labels(shards: list[Shard], kind: str) -> None:
+    """Print the labels that no training scene has; the model cannot learn them.
+
+    Raises:
+        ValueError: All scenes have the same label although this kind has several.
+    """
+    tables = [shard.read("scenes", ["vegetation_density", "vehicle_density"]) for shard in shards]
+    counts = np.bincount(label_indices(pa.concat_tables(tables), kind), minlength=len(LABELS[kind]))
+    missing = [name for name, count in zip(LABELS[kind], counts, strict=True) if count == 0]
+    if len(counts) > 1 and len(missing) == len(counts) - 1:
+        raise ValueError(
+            f"--label-kind {kind}: all {counts.sum()} training scenes have the label"
+            f" {LABELS[kind][counts.argmax()]!r}; use another kind, or none"
+        )
+    if missing:
+        print(f"note: no training scene has the label {', '.join(missing)}; do not sample with it")
 
 
 def parse_timestep_sampling(config: Config) -> TimestepSampling:
@@ -141,14 +168,14 @@ def make_optimizer_config(config: Config, row: DiTPreset) -> OptimizerConfig:
     )
 
 
-def make_dit_architecture(config: Config, row: DiTPreset, latents: dict, lvae: LayoutVAE) -> dict:
+def make_dit_architecture(row: DiTPreset, latents: dict, lvae: LayoutVAE, label_kind: str) -> dict:
     """Return the keyword arguments of DiT from the preset, the latents and the labels."""
     channels, size, _ = latents["shape"]
     return row.architecture() | {
         "channels": channels,
         "size": size,
-        "label": config.label_kind,
-        "num_labels": len(LABELS[config.label_kind]),
+        "label": label_kind,
+        "num_labels": len(LABELS[label_kind]),
         "layout": dict(lvae.config.layout),
         "shift": latents["channel_mean"] if row.normalise_latents else None,
         "scale": latents["channel_std"] if row.normalise_latents else None,
@@ -164,7 +191,6 @@ def make_run_identity(
         stage="dit",
         preset=config.preset,
         batch_size=row.batch_size,
-        label=config.label_kind,
         prediction=RECORDED_PREDICTIONS[row.model.prediction],
         normalise_latents=row.normalise_latents,
         lvae=latents["lvae_digest"],

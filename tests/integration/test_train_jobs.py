@@ -8,10 +8,12 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pytest
 from helpers import run_command
 from safetensors.torch import load_file
 
+from pipelines.schema.dataset import Dataset
 from pipelines.schema.tables import find_shards
 
 
@@ -30,6 +32,30 @@ def test_train_dit_creates_inputs_of_smoke_preset(home):
     assert latents["complete"] and latents["scenes"] == {"train": 32, "test": 16}
     assert (home / "models/pritti-smoke/model_index.json").exists()
     assert not list(home.rglob("*.pkl")) and not list(home.rglob("*.pt"))
+
+
+def test_train_dit_conditions_on_a_label_that_the_data_have(home):
+    from jobs.implementation.checks import resolve_label_kind
+    from jobs.implementation.train_dit import warn_about_missing_labels
+    from jobs.train_dit import Config
+
+    town = Dataset.open(str(home / "datasets/smoke"))
+    kept = [k for k, name in enumerate(town.spec.categories) if not name.startswith("vegetation")]
+    fields = {name: tuple(getattr(town.spec, name)[k] for k in kept) for name in ("categories", "slots")}
+    without_plants = replace(town, spec=replace(town.spec, **fields))
+    assert resolve_label_kind(Config(), town) == "vegetation"
+    assert resolve_label_kind(Config(), without_plants) == "vehicle"  # the paper's condition for Argoverse 2
+    assert resolve_label_kind(Config(label_kind="none"), without_plants) == "none"
+    for kind in ("vegetation", "joint"):
+        with pytest.raises(ValueError, match=rf"--label-kind {kind}: .*no objects of the group vegetation.*vehicle or"):
+            resolve_label_kind(Config(label_kind=kind), without_plants)
+
+    class Uniform:
+        def read(self, table, columns):
+            return pa.table({column: ["medium"] * 3 for column in columns})
+
+    with pytest.raises(ValueError, match="all 3 training scenes have the label 'medium'"):
+        warn_about_missing_labels([Uniform()], "vegetation")
 
 
 def test_encode_latents_match_lvae_and_scene_order(home):
