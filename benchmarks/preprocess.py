@@ -209,8 +209,9 @@ def main(config: Config) -> None:
         )
         same, within, worst = measure_agreement(drive, some, grid)
         print(
-            f"rays      agreement {100 * same:.4f} % of pixel and class decisions, "
-            f"{100 * within:.4f} % of common pixels within 1 cm (worst {1000 * worst:.2f} mm)"
+            f"rays      occupied or not: equal for {100 * same:.4f} % of pixels and classes; heights:  "
+            f"{100 * within:.4f} % of the pixels filled by both "
+            f"differ by less than 1 cm (largest difference {1000 * worst:.2f} mm)"
         )
 
         masks, worst = measure_storage_error(drive, poses[:64], grid, f"{out}/0")

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "diffusion_pytorch_model.safetensors"
@@ -97,6 +97,25 @@ def read_config(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{path}: expected a JSON object, got a {type(content).__name__}")
     return {name: value for name, value in content.items() if not name.startswith("_")}
+
+
+def apply_in_float32(module: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Apply a module in float32, also inside `torch.autocast`.
+
+    bfloat16 has 8 bits of precision: a centre at x = 60 m would be rounded to a multiple of 25 cm. The layers that read
+    coordinates and heights, or that output them, therefore compute in float32. The layers between them do not.
+
+    Args:
+        module: Layer or function whose parameters are float32 if autocast is enabled.
+        x: Input, any floating-point type.
+
+    Returns:
+        Output of the module. Without autocast, the module is applied as it is.
+    """
+    if not torch.is_autocast_enabled(x.device.type):
+        return module(x)
+    with torch.autocast(x.device.type, enabled=False):
+        return module(x.float())
 
 
 class ConfiguredModel(nn.Module):

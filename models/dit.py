@@ -18,8 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, Real
 from torch import Tensor, nn
 
-from models.base import ConfiguredModel, register_to_config
-from models.sampling.diffusion import Denoiser, Diffusion
+from models.base import ConfiguredModel, apply_in_float32, register_to_config
+from models.sampling.diffusion import PAPER_SCHEDULE, Denoiser, Diffusion
 
 FREQUENCIES = 256
 Prediction = Literal["epsilon", "v_prediction"]
@@ -121,6 +121,7 @@ class DiT(ConfiguredModel):
         layout: LayoutSpec of the training scenes as a dictionary, or None.
         shift: One value per channel, subtracted from VAE latents before diffusion. The paper uses no shift.
         scale: One divisor per channel, applied to VAE latents after the shift. The paper uses no scale.
+        schedule: Noise schedule of the training. Samplers must use the same schedule.
         prediction: Output of the network. "epsilon" is the noise, as in the paper. "v_prediction" is sqrt(alpha_bar)
             noise - sqrt(1 - alpha_bar) z_0 (Salimans & Ho, 2022), which `forward` converts to the noise. With
             "v_prediction", a small network does not need to pass the noise of its input through all layers.
@@ -147,6 +148,7 @@ class DiT(ConfiguredModel):
         shift: Sequence[float] | None = None,
         scale: Sequence[float] | None = None,
         prediction: Prediction | str = "epsilon",
+        schedule: Diffusion = PAPER_SCHEDULE,
     ) -> None:
         super().__init__()
         if prediction not in get_args(Prediction):
@@ -160,14 +162,14 @@ class DiT(ConfiguredModel):
         self.modulation = nn.Linear(width, 2 * width)
         self.patch_out = nn.Linear(width, patch * patch * channels)
         self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
-        alpha_bar = torch.from_numpy(Diffusion().alpha_bar)
+        alpha_bar = torch.from_numpy(schedule.alpha_bar)
         shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
         self.register_buffer("noise_shares", shares, persistent=False)  # Weights of the latent and of v in the noise.
         self.init_weights()
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Convert prediction names in a config written by a version before 0.2.
+        """Convert prediction names in a config written by a version before 0.2, and the noise schedule to a Diffusion.
 
         Args:
             config: Entries of a stored config.
@@ -177,7 +179,9 @@ class DiT(ConfiguredModel):
         """
         renamed = {"noise": "epsilon", "velocity": "v_prediction"}
         prediction = config.get("prediction", "epsilon")
-        return config | {"prediction": renamed.get(prediction, prediction)}
+        schedule = config.get("schedule", PAPER_SCHEDULE)
+        schedule = schedule if isinstance(schedule, Diffusion) else Diffusion(**schedule)
+        return config | {"prediction": renamed.get(prediction, prediction), "schedule": schedule}
 
     def init_weights(self) -> None:
         """Initialise the weights as in DiT: zeros for the output and every residual branch, Xavier elsewhere."""
@@ -199,6 +203,11 @@ class DiT(ConfiguredModel):
         return [*(cast(DiTBlock, block).modulation for block in self.blocks), self.modulation]
 
     @property
+    def diffusion(self) -> Diffusion:
+        """Noise schedule of the training."""
+        return Diffusion(**self.config.schedule)
+
+    @property
     def null_label(self) -> int:
         """Index of the null label."""
         return self.config.num_labels
@@ -214,7 +223,7 @@ class DiT(ConfiguredModel):
             One vector per sample.
         """
         frequencies = embed_timesteps(timestep).to(self.patch_out.weight.dtype)
-        return F.silu(self.timestep_mlp(frequencies) + self.label_embedding(label))
+        return F.silu(apply_in_float32(self.timestep_mlp, frequencies) + self.label_embedding(label))
 
     def modulations(self, timestep: Int[Tensor, " batch"], label: Int[Tensor, " batch"]) -> list[Tensor]:
         """Compute the modulations of all layers.
@@ -303,12 +312,13 @@ class DiT(ConfiguredModel):
             Predicted noise.
         """
         patch, tokens = self.config.patch, self.config.size // self.config.patch
-        x = self.patch_in(latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
+        x = apply_in_float32(self.patch_in, latent).flatten(2).transpose(1, 2) + self.positions  # (b, n, d)
         *of_blocks, of_output, shares = modulations
         for block, modulation in zip(self.blocks, of_blocks, strict=True):
             x = block(x, modulation)
         shift, scale = of_output.chunk(2, dim=1)
-        x = self.patch_out(modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale))  # (b, n, p p c).
+        x = modulate(F.layer_norm(x, x.shape[-1:], eps=1e-6), shift, scale)
+        x = apply_in_float32(self.patch_out, x)  # (b, n, p p c).
         x = x.unflatten(1, (tokens, tokens)).unflatten(3, (patch, patch, -1))  # (b, i, j, p, q, c).
         x = x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
         if self.config.prediction == "epsilon":

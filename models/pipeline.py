@@ -108,7 +108,8 @@ class PrITTIPipeline:
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
 
     Raises:
-        ValueError: The LayoutSpec of the DiT differs from that of `lvae`.
+        ValueError: The LayoutSpec of the DiT differs from that of `lvae`, or the noise schedule of the scheduler from
+            that of the DiT.
     """
 
     def __init__(
@@ -120,7 +121,7 @@ class PrITTIPipeline:
         existence_threshold: float = EXISTENCE_THRESHOLD,
     ) -> None:
         self.lvae, self.dit = lvae.eval().requires_grad_(False), dit.eval().requires_grad_(False)
-        self.scheduler_config, self._scheduler = SchedulerConfig.ddpm(), None
+        self.scheduler = SchedulerConfig.ddpm(dit.diffusion)
         if scheduler is not None:
             self.scheduler = scheduler
         self.config = Config(noise_scaling=noise_scaling, existence_threshold=existence_threshold)
@@ -190,13 +191,17 @@ class PrITTIPipeline:
 
         Args:
             scheduler: A SchedulerConfig or a scheduler of diffusers.
+
+        Raises:
+            ValueError: The noise schedule differs from that of the DiT.
         """
-        if isinstance(scheduler, SchedulerConfig):
-            self.scheduler_config, self._scheduler = scheduler, None
-            return
-        plain = json.loads(scheduler.to_json_string())
-        config = {name: value for name, value in plain.items() if not name.startswith("_")}
-        self.scheduler_config, self._scheduler = SchedulerConfig(type(scheduler).__name__, config), scheduler
+        config, built = scheduler, None
+        if not isinstance(scheduler, SchedulerConfig):
+            plain = json.loads(scheduler.to_json_string())
+            options = {name: value for name, value in plain.items() if not name.startswith("_")}
+            config, built = SchedulerConfig(type(scheduler).__name__, options), scheduler
+        config.require_schedule(self.dit.diffusion)
+        self.scheduler_config, self._scheduler = config, built
 
     def use_sampler(self, name: str) -> None:
         """Select a sampler by name.
@@ -221,9 +226,13 @@ class PrITTIPipeline:
 
         Args:
             **components: New components by name.
+
+        Raises:
+            ValueError: The noise schedules of the DiT and of the scheduler differ.
         """
         for name, component in components.items():
             setattr(self, name, component)
+        self.scheduler_config.require_schedule(self.dit.diffusion)
 
     def register_to_config(self, **changes: Any) -> None:
         """Replace `noise_scaling` or `existence_threshold`.
@@ -282,9 +291,8 @@ class PrITTIPipeline:
 
     @property
     def diffusion(self) -> Diffusion:
-        """Noise schedule of the scheduler."""
-        config = self.scheduler_config.config
-        return Diffusion(config["num_train_timesteps"], config["beta_start"], config["beta_end"])
+        """Noise schedule, which the DiT defines."""
+        return self.dit.diffusion
 
     def _moments(self) -> tuple[Tensor, Tensor]:
         """Return the shift and the scale of the latents, each of shape (c, 1, 1)."""

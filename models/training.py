@@ -27,7 +27,7 @@ from models.batch import LayoutBatch
 from models.dit import DiT
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
-from models.sampling.diffusion import Diffusion, make_keyed_generator
+from models.sampling.diffusion import make_keyed_generator
 from models.vae.losses import compute_lvae_loss
 from models.vae.matching import NonFiniteCostError
 
@@ -193,8 +193,9 @@ def make_layout_loss(
         noise = sample_noise(generators, latent_shape, device)
         corruption = sample_corruption(generators, latent_shape, latent_noise, device) if latent_noise else None
         output, posterior = model(batch, noise, corruption)
-        output, posterior = output.float(), posterior.float()
-        parts = compute_lvae_loss(output, posterior, batch, spec, kl_weight).items()
+        with torch.autocast(device.type, enabled=False):  # Losses and matching costs are computed in float32.
+            output, posterior = output.float(), posterior.float()
+            parts = compute_lvae_loss(output, posterior, batch, spec, kl_weight).items()
         return parts | {"latent_std": posterior.mean.std(), "latent_sigma": (0.5 * posterior.logvar).exp().mean()}
 
     return loss
@@ -226,7 +227,7 @@ def sample_timesteps(uniform: Float[Tensor, " b"], density: TimestepSampling, nu
 
 
 def make_diffusion_loss(
-    dit: DiT, diffusion: Diffusion, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
+    dit: DiT, label_dropout: float, timestep_sampling: TimestepSampling = "uniform"
 ) -> LossFunction:
     """Return the loss function of stage 2 (training of the DiT): mean squared error of the noise (Eq. "LDM").
 
@@ -234,14 +235,14 @@ def make_diffusion_loss(
     posteriors. Labels are dropped once per sample.
 
     Args:
-        dit: Model.
-        diffusion: Noise schedule.
+        dit: Model, which defines the noise schedule.
         label_dropout: Probability that a training sample gets the null label.
         timestep_sampling: Density of the timesteps (`sample_timesteps`).
 
     Returns:
         A function that computes the losses from a batch of posteriors (`mean`, `logvar`) and labels (`label`).
     """
+    diffusion = dit.diffusion
     shape = (dit.config.channels, dit.config.size, dit.config.size)
     shift = torch.tensor(dit.config.shift or [0.0] * shape[0])[:, None, None]
     scale = torch.tensor(dit.config.scale or [1.0] * shape[0])[:, None, None]
@@ -511,7 +512,7 @@ def make_dit_trainer(
     """
     execution = execution or ExecutionConfig()
     model = model.to(device)
-    loss = make_diffusion_loss(model, Diffusion(), label_dropout, timestep_sampling)
+    loss = make_diffusion_loss(model, label_dropout, timestep_sampling)
     return Trainer(model, loss, settings, device, wrap(_compile_model(model, execution)), execution)
 
 

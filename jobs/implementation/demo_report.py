@@ -126,7 +126,7 @@ def make_introduction_sections(
 
 
 def make_scene_sections(config: Config, real: list[Scene], generated: list[Scene]) -> list[Section]:
-    """Return pictures of released, real, generated and outpainted scenes."""
+    """Return pictures of real, generated and outpainted scenes, and of scenes from the released weights."""
     released = []
     if config.num_released_scenes:
         released = [

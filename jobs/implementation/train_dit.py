@@ -64,7 +64,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     latents = storage.read_json(storage.join_uri(latents_root, "latents.json"))
     architecture = make_dit_architecture(row, latents, load_encoder(latents, latents_root), label_kind)
     start = load_start(config.start_from, latents["lvae_digest"], architecture) if config.start_from else None
-    architecture |= start.normalisation if start else {}
+    architecture |= start.inherited if start else {}
     settings = make_optimizer_config(config, row)
     identity = make_run_identity(config, row, settings, latents, root, start) | {"label": label_kind}
     name = config.name or f"dit-{config.preset}"
@@ -216,7 +216,7 @@ class Start:
     """Trained weights from which a run starts."""
 
     digest: str
-    normalisation: dict  # Shift and scale of the latents for these weights.
+    inherited: dict  # Shift and scale of the latents, and noise schedule, for these weights.
     sampling: dict  # Noise scaling and existence threshold of the pipeline.
     state: dict[str, Tensor]
 
@@ -241,9 +241,9 @@ def load_start(model: str, lvae_digest: str, architecture: dict) -> Start:
                 f"--start-from {model}: its {key} is {built[key]}, but that of this run is {architecture[key]}; "
                 "use equal values"
             )
-    normalisation = {"shift": built["shift"], "scale": built["scale"]}
+    inherited = {"shift": built["shift"], "scale": built["scale"], "schedule": pipeline.dit.diffusion}
     sampling = {key: pipeline.config[key] for key in ("noise_scaling", "existence_threshold")}
-    return Start(digest_weights(pipeline.dit), normalisation, sampling, pipeline.dit.state_dict())
+    return Start(digest_weights(pipeline.dit), inherited, sampling, pipeline.dit.state_dict())
 
 
 def build(

@@ -86,6 +86,9 @@ class Diffusion:
         return alpha_bar.sqrt().to(clean.dtype) * clean + (1 - alpha_bar).sqrt().to(clean.dtype) * noise
 
 
+PAPER_SCHEDULE = Diffusion()
+
+
 class SamplingSchedule:
     """Timesteps of a sampling run, and the transitions between its states.
 

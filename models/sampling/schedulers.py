@@ -8,13 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, cast
 
-# Noise schedule of the paper, as options of the class `DDPMScheduler` of the library `diffusers`.
+from models.sampling.diffusion import PAPER_SCHEDULE, Diffusion
+
+# Options of the class `DDPMScheduler` of the library `diffusers` without those of the noise schedule.
 DDPM_CONFIG = {
-    "num_train_timesteps": 1000,
-    "beta_start": 0.0015,
-    "beta_end": 0.015,
-    "beta_schedule": "linear",
-    "trained_betas": None,
     "variance_type": "fixed_small",
     "clip_sample": False,
     "clip_sample_range": 1.0,
@@ -39,6 +36,24 @@ SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
+def list_schedule_options(diffusion: Diffusion) -> dict[str, Any]:
+    """Return a noise schedule as options of a diffusers scheduler.
+
+    Args:
+        diffusion: Noise schedule.
+
+    Returns:
+        Options by name.
+    """
+    return {
+        "num_train_timesteps": diffusion.num_timesteps,
+        "beta_start": diffusion.beta_start,
+        "beta_end": diffusion.beta_end,
+        "beta_schedule": "linear",
+        "trained_betas": None,
+    }
+
+
 @dataclass(frozen=True)
 class SchedulerConfig:
     """Class name and options of a diffusers scheduler.
@@ -52,9 +67,31 @@ class SchedulerConfig:
     config: dict[str, Any]
 
     @classmethod
-    def ddpm(cls) -> SchedulerConfig:
-        """Return the paper's noise schedule and sampler."""
-        return cls("DDPMScheduler", dict(DDPM_CONFIG))
+    def ddpm(cls, diffusion: Diffusion | None = None) -> SchedulerConfig:
+        """Return the paper's sampler, DDPM.
+
+        Args:
+            diffusion: Noise schedule; None: that of the paper.
+
+        Returns:
+            The config.
+        """
+        return cls("DDPMScheduler", DDPM_CONFIG | list_schedule_options(diffusion or PAPER_SCHEDULE))
+
+    def require_schedule(self, diffusion: Diffusion) -> None:
+        """Raise an error if the scheduler has another noise schedule.
+
+        Args:
+            diffusion: Noise schedule with which a model was trained.
+
+        Raises:
+            ValueError: An option differs.
+        """
+        for name, value in list_schedule_options(diffusion).items():
+            if self.config.get(name) != value:
+                raise ValueError(
+                    f"{self.class_name}: {name} is {self.config.get(name)}, but the DiT was trained with {value}"
+                )
 
     def with_sampler(self, name: str) -> SchedulerConfig:
         """Return a config with the same noise schedule but another sampler.

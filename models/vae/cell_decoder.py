@@ -12,11 +12,13 @@ paper, cells with high existence probabilities would be matched to primitives of
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.base import apply_in_float32
 from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
@@ -68,9 +70,9 @@ class CellDecoder(nn.Module):
             Normalised features and existence logits; proposals are ordered by category.
         """
         cells = latent.flatten(2).transpose(1, 2)
-        out = self.head(self.net(cells)).unflatten(2, (-1, 1 + FEATURES))  # (b, cells, k, 10)
+        out = apply_in_float32(self.head, self.net(cells)).unflatten(2, (-1, 1 + FEATURES))  # (b, cells, k, 10)
         values = out[..., 1:].sigmoid()
-        center_xy = (self.middle + (values[..., :2] - 0.5) * self.reach).clamp(0, 1)
+        center_xy = (cast(Tensor, self.middle) + (values[..., :2] - 0.5) * self.reach).clamp(0, 1)
         features = torch.cat([center_xy, values[..., 2:]], dim=-1)  # (b, cells, k, 9)
         # The order (b, k, cells) sorts proposals by category, because k is sorted by category.
         return features.transpose(1, 2).flatten(1, 2), out[..., 0].transpose(1, 2).flatten(1)

@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from models.base import apply_in_float32
+
 EPSILON = 1e-6  # Epsilon of every group normalisation.
 
 
@@ -203,10 +205,10 @@ class ConvolutionalEncoder(nn.Module):
         Returns:
             (batch, out_channels, h, w) features.
         """
-        x = self.conv_in(maps)
+        x = apply_in_float32(self.conv_in, maps)
         for block in self.down_blocks:
             x = block(x)
-        return self.conv_out(F.silu(self.conv_norm_out(self.mid_block(x))))
+        return apply_in_float32(self.conv_out, F.silu(self.conv_norm_out(self.mid_block(x))))
 
 
 class ConvolutionalDecoder(nn.Module):
@@ -237,7 +239,7 @@ class ConvolutionalDecoder(nn.Module):
         Returns:
             (batch, out_channels, H, W) maps.
         """
-        x = self.mid_block(self.conv_in(latent))
+        x = self.mid_block(apply_in_float32(self.conv_in, latent))
         for block in self.up_blocks:
             x = block(x)
-        return self.conv_out(F.silu(self.conv_norm_out(x)))
+        return apply_in_float32(self.conv_out, F.silu(self.conv_norm_out(x)))

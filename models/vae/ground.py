@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models.base import apply_in_float32
 from models.vae.config import GroundConfig
 from models.vae.convolutional import ConvolutionalDecoder, ConvolutionalEncoder
 
@@ -53,7 +54,7 @@ class GroundEncoder(nn.Module):
         mean, logvar = moments.chunk(2, dim=1)
         height, occupied = maps.chunk(2, dim=1)
         smooth = compute_smooth_maps(height, occupied, self.shortcut.stride[0])
-        return torch.cat([mean + self.shortcut(smooth), logvar], dim=1)
+        return torch.cat([mean + apply_in_float32(self.shortcut, smooth), logvar], dim=1)
 
 
 class GroundDecoder(nn.Module):
@@ -82,7 +83,7 @@ class GroundDecoder(nn.Module):
             Normalised heights and occupancy logits, concatenated along the channel axis.
         """
         maps = self.shuffle(self.net(latent))
-        return maps if self.shortcut is None else maps + self.shortcut(latent)
+        return maps if self.shortcut is None else maps + apply_in_float32(self.shortcut, latent)
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from models.base import apply_in_float32
 from models.layout import FEATURES
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
@@ -197,18 +198,20 @@ class ObjectEncoder(nn.Module):
         batch = len(features)
         moments, rows, cols = self.grid.shape
         category = self.category(category)  # (b, n, 10)
-        x = self.project_in(torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1))  # (b, n, d)
+        x = torch.cat([features, category, real[..., None].to(features.dtype)], dim=-1)  # (b, n, 20)
+        x = apply_in_float32(self.project_in, x)  # (b, n, d)
         # Attention needs at least one visible token, also in a scene without primitives. The first slot is therefore
         # visible, but if it is padding, it is not written to the latent grid.
         visible = real.clone()
         visible[:, 0] |= ~real.any(dim=1)
         for layer in self.layers:
             x = layer(x, visible)
-        x = self.project_out(x)  # (b, n, moments)
+        x = apply_in_float32(self.project_out, x)  # (b, n, moments)
         row, col = find_grid_cells(features[..., :3], rows, cols)
         if self.shortcut is not None:
             mean, logvar = x.chunk(2, dim=-1)
-            x = torch.cat([mean + self.shortcut(self.encode_in_cell(features, row, col, category)), logvar], dim=-1)
+            added = apply_in_float32(self.shortcut, self.encode_in_cell(features, row, col, category))
+            x = torch.cat([mean + added, logvar], dim=-1)
         x = x * real[..., None]
         cell = row * cols + col  # (b, n)
         total = x.new_zeros(batch, rows * cols, moments).scatter_add_(1, cell[..., None].expand(-1, -1, moments), x)
@@ -311,14 +314,14 @@ class ObjectDecoder(nn.Module):
         Returns:
             Normalised features and existence logits of all slots.
         """
-        memory = self.project_in(latent.flatten(2).transpose(1, 2))  # (b, hw, d)
-        memory_key = memory + self.positions
+        memory = apply_in_float32(self.project_in, latent.flatten(2).transpose(1, 2))  # (b, hw, d)
+        memory_key = memory + cast(Tensor, self.positions)
         x = torch.zeros_like(self.queries).expand(len(latent), -1, -1)  # (b, n, d): DETR starts from zeros
         for layer in self.layers:
             x = layer(x, self.queries, memory, memory_key)
         groups = list(zip(self._list_heads(), x.split(self.proposals, dim=1), strict=True))
-        features = torch.cat([head.features(group) for head, group in groups], dim=1).sigmoid()
-        existence = torch.cat([head.existence(group) for head, group in groups], dim=1).squeeze(-1)
+        features = torch.cat([apply_in_float32(head.features, group) for head, group in groups], dim=1).sigmoid()
+        existence = torch.cat([apply_in_float32(head.existence, group) for head, group in groups], dim=1).squeeze(-1)
         return features, existence
 
     def _list_heads(self) -> list[OutputHeads]:

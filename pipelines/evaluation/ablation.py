@@ -291,7 +291,8 @@ DECODERS = {
     "DETR, no shortcuts": Variant({"objects": {"decoder": "detr"}, "shortcut": False}, {"learning_rate": 5e-4}),
 }
 # Variants with only the ground branch. The preset `town` has the options `pixel_unshuffle=8` and `channels=(32,)`.
-# The linear start (option `shortcut`) comes from a principal component analysis of the data (models/vae/ground.py).
+# With the option `shortcut`, the initial weights are a linear map from a principal component analysis of the data
+# (models/vae/ground.py).
 GROUND = {
     name: Variant({"branches": "ground"} | changes)
     for name, changes in {

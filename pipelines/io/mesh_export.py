@@ -189,7 +189,8 @@ def export_glb(scene: Scene) -> bytes:
     world.graph.update("scene", "world", matrix=GLTF_FROM_SCENE)
     vertices, triangles, class_id = build_ground_mesh(scene)
     if len(vertices):
-        # trimesh omits meshes without triangles. A triangle without area therefore keeps isolated pixels in the file.
+        # trimesh omits meshes without triangles. Each isolated pixel would otherwise be lost, so it is written as a
+        # triangle without area.
         triangles = triangles if len(triangles) else np.zeros((1, 3), int)
         world.geometry["ground"] = _paint_mesh(vertices, triangles, class_id)
         extras = {"classes": {name: f"#{COLOR_HEX[name]}" for name in scene.ground_classes}}

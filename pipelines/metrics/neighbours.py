@@ -35,8 +35,8 @@ class NeighbourhoodScores:
     """Precision, recall, density and coverage for one neighbourhood size.
 
     The ball of a sample is centred at the sample. The radius of the ball is the distance to the k-th nearest other
-    sample of the same side. Precision and recall follow Kynkaanniemi et al. 2019 and the supplement of the paper.
-    Density and coverage follow Naeem et al. 2020.
+    sample of the same set (real or generated). Precision and recall follow Kynkaanniemi et al. 2019 and the supplement
+    of the paper. Density and coverage follow Naeem et al. 2020.
 
     Attributes:
         k: Neighbourhood size.

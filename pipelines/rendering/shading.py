@@ -110,7 +110,7 @@ def _cast_surfaces(scene: Scene, camera: Camera, faces: Faces, table_z_m: float)
     seen = find_facing_sides(turned)
     (depth,), (hit,) = cast_rays_down(turned[seen], camera.view)
     depth = np.where(hit < 0, _compute_table_depth(camera, table_z_m), depth)
-    # Index -1 (no hit) selects the last entry, which is the table.
+    # Index -1 (no hit) selects the last entry, the colour of the table under the scene.
     color_id = np.append(faces.color_id[seen], np.uint8(TABLE)).take(hit, mode="wrap")
     part = np.append(faces.part[seen], SCENERY).astype(np.int32).take(hit, mode="wrap")
     normal = np.vstack([_compute_normals(faces.corners_m[seen]), [[0, 0, 1]]]).astype(np.float32)

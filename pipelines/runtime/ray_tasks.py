@@ -75,7 +75,7 @@ def map_actors(
     If there are no numbers, no actor starts.
 
     Args:
-        numbers: Numbers of the units of work.
+        numbers: Index of each unit of work.
         actor: Actor class. Its instances are called with a row and return a row.
         arguments: Arguments of the constructor.
         num_actors: Maximum number of actors.

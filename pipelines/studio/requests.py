@@ -21,6 +21,9 @@ class OpenRequest(StudioRequest):
     scene_id: str = Field(max_length=200)
 
 
+GUIDED = RePaintConfig.guided()  # The defaults of --guided; only the number of steps is smaller in the studio.
+
+
 class SamplingRequest(StudioRequest):
     # An empty string selects the label of the scene. If the scene has no label, an empty string selects the model's
     # first label.
@@ -35,9 +38,9 @@ class GenerateRequest(SamplingRequest):
 
 class RepaintRequest(SamplingRequest):
     jump_length: int = Field(1, ge=1, le=100)
-    resamplings: int = Field(1, ge=1, le=20)
-    pseudoinverse_guidance: float = Field(1.0, ge=0, le=10)
-    eta: float = Field(0.0, ge=0, le=1)
+    resamplings: int = Field(GUIDED.resamplings, ge=1, le=20)
+    pseudoinverse_guidance: float = Field(GUIDED.pseudoinverse_guidance, ge=0, le=10)
+    eta: float = Field(GUIDED.eta, ge=0, le=1)
 
     def repaint(self) -> RePaintConfig:
         return RePaintConfig(self.steps, self.jump_length, self.resamplings, self.pseudoinverse_guidance, self.eta)

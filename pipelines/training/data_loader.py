@@ -2,8 +2,8 @@
 
 The order of the samples depends only on the seed. The order is fixed before the first sample is read. Each epoch visits
 the shards in random order and shuffles the rows within windows of a few shards. Each worker uses its rank and the step
-to compute the rows that it needs. A resumed run therefore continues with the next batch. Two workers together read the
-same samples as a single worker.
+to compute the rows that it needs. A resumed run therefore continues with the next batch. The samples of two workers,
+taken together, are the samples that a single worker would read.
 
 The loader does not use Ray Data, whose executor runs in the training process. While finished blocks wait, the executor
 polls without pauses and holds the global interpreter lock of Python. With Ray Data, training steps on two cores take up

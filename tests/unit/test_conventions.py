@@ -12,7 +12,9 @@ MODULES = sorted((ROOT / "tests").rglob("test_*.py"))
 
 def test_modules_lie_in_known_folders_with_unique_names():
     assert {path.parent.relative_to(ROOT / "tests").as_posix() for path in MODULES} == set(FOLDERS)
-    assert max(Counter(path.name for path in MODULES).values()) == 1  # pytest imports modules without their folder
+    assert (
+        max(Counter(path.name for path in MODULES).values()) == 1
+    )  # pytest imports a test module by its file name, without the name of its folder
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

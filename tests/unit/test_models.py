@@ -1,6 +1,7 @@
 """Tests of the networks: sizes, masks, equivariance, losses and training."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -318,27 +319,44 @@ def test_losses_equal_their_equations():
     assert np.isclose(float(compute_kl_loss(posterior)), float(want), rtol=1e-5)
 
 
-@pytest.mark.parametrize("decoder, steps, ground", [("detr", 200, 0.9), ("cells", 60, 0.7)])
-def test_lvae_overfits_one_batch(decoder, steps, ground):
+@pytest.mark.parametrize("decoder, steps, rate, clip", [("detr", 400, 3e-3, 0.1), ("cells", 250, 1e-2, np.inf)])
+def test_lvae_overfits_one_batch(decoder, steps, rate, clip):
+    """Both decoders find all 40 primitives of two scenes within 1 m, and no others. DETR's paper also clips at 0.1."""
     spec = small_spec()
     lvae = make_small_lvae(
         decoder=decoder, width=64, hidden=128, head_hidden=64, latent_channels=8, channels=(16, 32, 32), norm_groups=8
     )
     batch = make_layout_batch([random_scene(i, n=20) for i in range(2)], spec)
-    optimiser = torch.optim.AdamW(lvae.parameters(), 3e-3)
+    lvae.init_from_data(batch)
+    optimiser = torch.optim.AdamW(lvae.parameters(), rate)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: min((step + 1) / 50, 1 - step / steps))
     generator = torch.Generator().manual_seed(0)
-    losses = []
     for _ in range(steps):
         noise = torch.randn(2, *lvae.latent_shape, generator=generator)
         output, posterior = lvae(batch, noise)
-        loss = compute_lvae_loss(output, posterior, batch, spec)
         optimiser.zero_grad()
-        loss.total.backward()
+        compute_lvae_loss(output, posterior, batch, spec).total.backward()
+        torch.nn.utils.clip_grad_norm_(lvae.parameters(), clip)
         optimiser.step()
-        losses.append(loss.total.item())
-    assert losses[-1] < 0.25 * losses[0]
+        schedule.step()
     right = (output.occupancy_logit > 0) == (batch.occupied > 0.5)
-    assert right.float().mean() > ground
+    assert right.float().mean() > 0.9
+    extent_m = torch.tensor(spec.center_bounds_m.high) - torch.tensor(spec.center_bounds_m.low)
+    truths = zip(batch.features.split(spec.slots, 1), batch.real.split(spec.slots, 1), strict=True)
+    proposals = zip(
+        output.features.split(output.proposals, 1), output.existence_logit.split(output.proposals, 1), strict=True
+    )
+    errors_m, counts = [], []
+    for (truth, real), (features, logit) in zip(truths, proposals, strict=True):
+        for k in range(2):
+            found_m = features[k][logit[k].sigmoid() > 0.3][:, :3] * extent_m
+            true_m = truth[k][real[k]][:, :3] * extent_m
+            counts.append((len(found_m), len(true_m)))
+            errors_m += (
+                torch.cdist(true_m, found_m).min(dim=1).values.tolist() if len(found_m) else [99.0] * len(true_m)
+            )
+    assert len(errors_m) == 40 and max(errors_m) < 1
+    assert all(number == true for number, true in counts)
 
 
 @pytest.mark.parametrize(
@@ -361,6 +379,51 @@ def test_lvae_step_is_equal_in_halves_and_bf16(execution):
     plain, other = losses.values()
     assert np.isclose(other[0], plain[0], rtol=1e-2 if execution.precision == "bf16" else 1e-5)
     assert plain[-1] < 0.9 * plain[0] and np.isclose(other[-1], plain[-1], rtol=0.1)
+
+
+@pytest.mark.parametrize(("decoder", "shortcut"), [("detr", False), ("cells", True)])
+def test_bf16_leaves_coordinates_and_heights_in_float32(decoder, shortcut):
+    """Layers that read or output features compute in float32: a bf16 number near 60 m is a multiple of 25 cm."""
+    lvae, outer = (
+        make_small_lvae(decoder=decoder, shortcut=shortcut),
+        r"conv_in|conv_out|project_in|project_out|shortcut",
+    )
+    outer = re.compile(rf"(^|\.)({outer}|head|features|existence)$")
+    layers = {name: layer for name, layer in lvae.named_modules() if outer.search(name)}
+    seen = {}
+    for name, layer in layers.items():
+        layer.register_forward_hook(lambda _, inputs, output, name=name: seen.update({name: (inputs[0], output)}))
+    layouts = [encode_layout(random_scene(i, n=20), lvae.spec) for i in range(2)]
+    arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
+    batch, noise = LayoutBatch.from_compact(arrays), torch.randn(2, *lvae.latent_shape)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        output, posterior = lvae(batch, noise)
+    assert len(layers) >= 8 and set(seen) == set(layers)
+    for name, (given, got) in seen.items():
+        assert got.dtype == torch.float32, name
+        with torch.no_grad():
+            assert torch.equal(got, layers[name](given.float())), name
+    assert {output.features.dtype, output.height.dtype, posterior.mean.dtype} == {torch.float32}
+    read = seen["object_encoder.project_in"][0][..., :3]  # the centres, in the order of `drop_padding`
+    assert torch.equal(read, lvae.object_encoder.drop_padding(batch.features, batch.real)[0][..., :3])
+
+
+def test_bf16_computes_losses_and_matching_in_float32(monkeypatch):
+    seen = []
+
+    def record(truth, features, p):
+        seen.append((torch.is_autocast_enabled("cpu"), truth.dtype, features.dtype))
+        return cdist(truth, features, p)
+
+    cdist = torch.cdist
+    monkeypatch.setattr(torch, "cdist", record)
+    layouts = [encode_layout(random_scene(i, n=20), small_spec()) for i in range(2)]
+    arrays = {name: torch.from_numpy(np.stack([part[name] for part in layouts])) for name in layouts[0]}
+    settings = OptimizerConfig(steps=20, learning_rate=3e-3, weight_decay=0.0)
+    way = ExecutionConfig(precision="bf16")
+    trainer = make_lvae_trainer(make_small_lvae(), settings, 1e-6, torch.device("cpu"), lambda model: model, way)
+    trainer.step(arrays, range(2))
+    assert seen and set(seen) == {(False, torch.float32, torch.float32)}
 
 
 def test_latent_noise_is_per_sample_with_stated_scale():

@@ -34,6 +34,7 @@ from models.sampling.diffusion import (
 from models.sampling.repaint import RePaintConfig
 from models.sampling.schedulers import SAMPLERS, SchedulerConfig
 from models.scene import Grid
+from models.training import make_diffusion_loss
 
 SPEC = small_spec()
 
@@ -347,3 +348,43 @@ def test_composite_does_not_repeat_object_across_border():
     for contents in ("both", "objects"):
         assert np.array_equal(composite_scenes(scene, again, region, contents).center_m, scene.center_m)
         assert len(composite_scenes(scene, far, region, contents)) == 2
+
+
+def test_one_noise_schedule_for_training_sampling_and_scheduler(tmp_path):
+    """The DiT defines the schedule; a pipeline refuses a scheduler with another one."""
+    other = Diffusion(1000, 0.0001, 0.02)
+    torch.manual_seed(0)
+    dit = DiT(channels=8, size=8, width=32, depth=1, heads=2, prediction="v_prediction", schedule=other)
+    lvae = LayoutVAE(layout=small_spec().to_dict(), **LVAE_PRESETS["smoke"].architecture())
+    pipeline = PrITTIPipeline(lvae, dit)
+    assert pipeline.diffusion == other and pipeline.scheduler.config.beta_end == 0.02
+    assert torch.allclose(dit.noise_shares[:, 1].square().double(), torch.from_numpy(other.alpha_bar), atol=1e-6)
+    pipeline.save_pretrained(tmp_path)
+    assert PrITTIPipeline.from_pretrained(tmp_path).diffusion == other
+    with pytest.raises(ValueError, match=r"beta_start is 0\.0015, but the DiT was trained with 0\.0001"):
+        pipeline.scheduler = SchedulerConfig.ddpm()
+    with pytest.raises(ValueError, match=r"beta_start is 0\.00085"):
+        pipeline.scheduler = DPMSolverMultistepScheduler(beta_start=0.00085, beta_schedule="scaled_linear")
+    pipeline.use_sampler("dpm++")
+    assert pipeline.scheduler.config.beta_end == 0.02
+
+    seen = []  # training adds the noise of the same schedule
+    loss = make_diffusion_loss(dit, 0.0)
+    mean = torch.full((1, 8, 8, 8), 3.0)
+    arrays = {"mean": mean, "logvar": torch.full_like(mean, -60.0), "label": torch.zeros(1, dtype=torch.long)}
+
+    def model(noisy, timestep, label):
+        seen.append((noisy.mean().item(), timestep.item()))
+        return noisy
+
+    for seed in range(5):
+        loss(model, arrays, [torch.Generator().manual_seed(seed)])
+    for value, timestep in seen:
+        assert abs(value - 3 * other.alpha_bar[timestep] ** 0.5) < 0.2
+
+
+def test_studio_uses_eta_of_guided_options():
+    from pipelines.studio.requests import RepaintRequest
+
+    guided = RePaintConfig.guided(20)
+    assert RepaintRequest().repaint() == replace(guided, jump_length=1)

@@ -139,7 +139,7 @@ def list_blocks(
 ) -> list[CityBlock]:
     """Return the blocks between the streets, and a ring of blocks of depth outskirts_m around the town.
 
-    kind_at(u, v) returns the district of a board point.
+    kind_at(u, v) returns the kind of district at the point (u, v) of the town's plan.
     """
     u, v, hu, hv = streets.u_m, streets.v_m, streets.half_u_m, streets.half_v_m
     blocks = []
