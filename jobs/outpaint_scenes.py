@@ -43,9 +43,9 @@ class Config(RePaintOptions):
     order: Literal["outward", "colours"] = "outward"
     """Order of blocks: outward from the scene (the paper), or four groups of independent blocks (needs --overlap <
     0.5)."""
-    neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """How to get the known latents of a block: encode the neighbours again in the frame of the block, or copy and shift
-    their latents (the paper)."""
+    neighbour_latents: Literal["reencode", "copy", "paper"] = "reencode"
+    """How a block uses its neighbours: reencode encodes them again in the frame of the block, copy copies and shifts
+    their latents. paper does the same as copy, but without blending the ground and without removing duplicates."""
     batch_size: int = 4
     """Number of blocks of a scene per batch; the batch size changes the result only by rounding."""
 

@@ -28,9 +28,8 @@ class Config(GenerationOptions):
     """Settings of five numbers each: steps, jump length, resamplings, weight of pseudoinverse guidance, eta."""
     overlap: float = 0.5
     """Overlap of neighbouring blocks, as a share of the block size."""
-    neighbour_latents: Literal["reencode", "copy"] = "reencode"
-    """How to get the known latents of a block: encode the neighbours again in the frame of the block, or copy and shift
-    their latents (the paper)."""
+    neighbour_latents: tuple[Literal["reencode", "copy", "paper"], ...] = ("reencode",)
+    """How a block uses its neighbours (see outpaint_scenes.py); every setting is measured in each of these ways."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     batch_size: int = 4

@@ -170,6 +170,11 @@ class LayoutVAE(ConfiguredModel):
         return {"ground_encoder.shortcut": 0.05, "ground_decoder.shortcut": 0.05, "ground_": 0.25}
 
     @property
+    def proposes_duplicates(self) -> bool:
+        """True if two proposals may decode the same object: two cells of the cell decoder."""
+        return self.config.objects["decoder"] == "cells"
+
+    @property
     def spec(self) -> LayoutSpec:
         """Layout of the scenes."""
         return LayoutSpec.from_dict(self.config.layout)

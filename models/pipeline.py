@@ -316,18 +316,23 @@ class PrITTIPipeline:
 
     @torch.no_grad()
     def decode(
-        self, latents: Float[Tensor, "b c h w"], identities: Sequence[Scene], existence_threshold: float | None = None
+        self,
+        latents: Float[Tensor, "b c h w"],
+        identities: Sequence[Scene],
+        existence_threshold: float | None = None,
+        deduplicate: bool = True,
     ) -> list[Scene]:
         """Decode latents to scenes.
 
-        Latents are decoded one at a time. Each scene is therefore bit-identical for any batch size. A cell decoder may
-        propose the same object in two cells; the proposal with the higher existence probability is kept.
+        Latents are decoded one at a time. Each scene is therefore bit-identical for any batch size.
 
         Args:
             latents: Latents.
             identities: Scenes whose ids and labels are copied to the results.
             existence_threshold: Only primitives with a higher existence probability are kept; None: the threshold of
                 the pipeline.
+            deduplicate: A cell decoder may propose the same object in two cells. If True, only the proposal with the
+                higher existence probability is kept.
 
         Returns:
             One scene per latent.
@@ -342,7 +347,7 @@ class PrITTIPipeline:
             decode_layout(layout, self.spec, identity, threshold)
             for layout, identity in zip(layouts, identities, strict=True)
         ]
-        if self.lvae.config.objects["decoder"] != "cells":
+        if not (deduplicate and self.lvae.proposes_duplicates):
             return scenes
         return [scene.select(~find_lower_confidence_duplicates(scene)) for scene in scenes]
 
@@ -667,9 +672,10 @@ class PrITTIPipeline:
             index: Index of the scene within the run.
             overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent
                 cells.
-            mode: "copy" copies the shifted latents of the neighbours, as in the paper. "reencode" transforms the
-                decoded content of the neighbours into the frame of the block and encodes it again. Object latents
-                contain absolute centres. A copy does not change these centres.
+            mode: "copy" copies the shifted latents of the neighbours. "reencode" transforms the decoded content of the
+                neighbours into the frame of the block and encodes it again. Object latents contain absolute centres,
+                which a copy does not change. "paper" is the outpainting of the paper: a copy, without blending of the
+                ground and without removal of duplicates.
             num_blocks: Number of blocks to add ahead, behind, to the left and to the right. The paper adds one block on
                 every side.
             repaint: Options of RePaint; None: the options of the paper.

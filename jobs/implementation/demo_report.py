@@ -24,7 +24,8 @@ MEANINGS = {
     "ground_iou": "IoU of the ground classes over all pixels; 1 is perfect (paper, on KITTI-360: 0.9996)",
     "height_rmse_m": "root mean squared error of the ground height in metres, over pixels with ground",
     "height_mse_normalised": "mean squared error of heights scaled to [0, 1] by the data's range (paper: 0.0075)",
-    "ap3d": "average precision of boxes over ten IoU thresholds, 0.05 to 0.50, without ellipsoids (paper: 0.621)",
+    "ap3d": "average precision of boxes over ten IoU thresholds, 0.05 to 0.50, without ellipsoids, above existence 0.3 "
+    "(paper: 0.621)",
     "ap3d_50": "average precision at IoU 0.50 (paper: 0.470)",
 }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import pyarrow as pa
 from rich.progress import Progress
 
@@ -32,8 +34,8 @@ def sweep_seams(config: Config) -> list[dict]:
     """Outpaint and measure every setting, write all files, and return a row per setting."""
     require_positive(config, "num_actors", "batch_size")
     model = find_pipeline_directory(config.model)
-    if not config.settings:
-        raise ValueError("--settings is empty: expected five numbers per setting")
+    if not (config.settings and config.neighbour_latents):
+        raise ValueError("--settings or --neighbour-latents is empty: expected five numbers per setting, and a way")
 
     for setting in config.settings:
         RePaintConfig(*setting).transitions()  # raise an error for an invalid setting before hours of outpainting
@@ -44,8 +46,8 @@ def sweep_seams(config: Config) -> list[dict]:
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:
-        for setting in config.settings:
-            name = "-".join(f"{value:g}" for value in setting)
+        for mode, setting in product(config.neighbour_latents, config.settings):
+            name = "-".join(f"{value:g}" for value in setting) + ("" if mode == "reencode" else f"-{mode}")
             request = OutpaintRequest(
                 model=model,
                 output=output,
@@ -53,7 +55,7 @@ def sweep_seams(config: Config) -> list[dict]:
                 label=config.label or None,
                 seed=config.seed,
                 overlap=config.overlap,
-                mode=config.neighbour_latents,
+                mode=mode,
                 repaint=RePaintConfig(*setting),
                 guidance_scale=config.guidance_scale,
                 batch_size=config.batch_size,
@@ -63,14 +65,12 @@ def sweep_seams(config: Config) -> list[dict]:
             measured = measure_seams(SceneSubset(output, request.source), SeamLines(), config.num_actors)
             objects = count_objects_per_ha(read_scenes(output, request.source))
             seams = int(measured.seams.sum())
-            rows.append(make_seam_row(request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
+            rows.append(make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
             pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
     storage.write_json(rows, storage.join_uri(output, "sweep.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
-    how = [
-        f"{count} scenes of {selection.root}, overlap {config.overlap:g}, {config.neighbour_latents}. Model: {model}."
-    ]
+    how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}. Model: {model}."]
     html = render_seam_sweep_html(rows, pictures, how)
     storage.write_text(html, storage.join_uri(output, "sweep.html"))
     return rows

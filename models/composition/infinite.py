@@ -31,7 +31,7 @@ class InfiniteScene:
         label: One label for all blocks, or a function that returns the label for a block index.
         seed: Seed of the scene.
         overlap: Fraction of a block that overlaps its neighbour; it must be below 0.5.
-        mode: "copy" or "reencode"; see `PrITTIPipeline.outpaint`.
+        mode: "reencode", "copy" or "paper"; see `PrITTIPipeline.outpaint`.
         repaint: Options of RePaint; None: the options of the paper.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
 

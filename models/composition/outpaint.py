@@ -30,6 +30,9 @@ from models.scene import Grid, Scene, concatenate_primitives, merge_scenes
 from models.tensors import make_empty_scene
 
 BlockIndex = tuple[int, int]  # (i, j): i steps ahead of block (0, 0), j steps to the left.
+# How a block uses its neighbours. "reencode" and "copy" differ in the known latents (`BlockComposer.condition_block`);
+# both blend the ground and remove duplicates. "paper" copies the latents and does neither.
+MODES = ("reencode", "copy", "paper")
 EncodeScenes = Callable[[Sequence[Scene]], Tensor]  # Maps scenes on the model's grid to latents (b, c, h, w).
 
 
@@ -311,9 +314,9 @@ class BlockComposer:
             index: Index of the block.
             blocks: Generated blocks; they must include all predecessors of the block.
             empty: Empty Scene whose ids are copied to the result.
-            mode: "copy" copies the latents of the neighbours, as in the paper. "reencode" transforms the decoded
-                content of the neighbours into the block's frame and encodes it again. Object latents contain absolute
-                centres. A copy does not change these centres.
+            mode: "copy" and "paper" copy the latents of the neighbours, as in the paper. "reencode" transforms the
+                decoded content of the neighbours into the block's frame and encodes it again. Object latents contain
+                absolute centres. A copy does not change these centres.
 
         Returns:
             The known part.
@@ -330,7 +333,7 @@ class BlockComposer:
         datum_m = find_ground_height(known, 0.0, 0.0) - self.level_m if parts and mode == "reencode" else 0.0
         known = known.translate(0, 0, -datum_m)
         latent = self.encode([extrapolate_ground(known, grid.upsample_cells(owned))])[0]
-        if mode == "copy":
+        if mode != "reencode":
             latent = torch.zeros_like(latent)
             for other, block, cells in parts:
                 there, here = self.block_grid.overlap_cells(other, index), self.block_grid.overlap_cells(index, other)
@@ -338,18 +341,21 @@ class BlockComposer:
                 latent[:, *here] = torch.where(shared, block.latent[:, *there].to(latent), latent[:, *here])
         return BlockCondition(known, latent, mask.to(latent).expand_as(latent), datum_m)
 
-    def finish_block(self, condition: BlockCondition, latent: Tensor, generated: Scene) -> SceneBlock:
-        """Blend a decoded block into its known part and remove copies of known objects.
+    def finish_block(
+        self, condition: BlockCondition, latent: Tensor, generated: Scene, blend: bool = True
+    ) -> SceneBlock:
+        """Reduce a decoded block to the cells that it owns.
 
         Args:
             condition: Known part of the block.
             latent: (c, h, w) latent of the whole block.
             generated: Decoded block.
+            blend: See `extract_new_part`.
 
         Returns:
             The block, which contains only the cells that it owns.
         """
-        own = extract_new_part(generated, condition.known, condition.new_pixels)
+        own = extract_new_part(generated, condition.known, condition.new_pixels, blend)
         seen = np.any(condition.known.occupied, axis=0)[~condition.new_pixels]
         return SceneBlock(own, latent, condition.datum_m, 1.0 if condition.is_empty else float(seen.mean()))
 
@@ -415,7 +421,7 @@ def generate_blocks(
         label: One label for all blocks, or a mapping from block index to label.
         seed: Seed of the noise.
         scene_index: Index of the scene. The noise depends on the seed, this index and the block index.
-        mode: "copy" or "reencode"; see `BlockComposer.condition_block`.
+        mode: One of MODES.
         repaint: Options of RePaint; None: the options of the paper.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.
         callback_on_step_end: See `PrITTIPipeline.generate`.
@@ -427,8 +433,8 @@ def generate_blocks(
         KeyError: A block has no label, or a predecessor is missing.
         ValueError: `mode` is unknown.
     """
-    if mode not in ("copy", "reencode"):
-        raise ValueError(f"outpainting mode is {mode!r}, expected 'copy' or 'reencode'")
+    if mode not in MODES:
+        raise ValueError(f"outpainting mode is {mode!r}, expected one of: {', '.join(MODES)}")
     empty = make_empty_scene(like.scene_id, like.source, like.sequence, like.frame, model.spec)
     conditions = [composer.condition_block(index, blocks, empty, mode) for index in indices]
     stacked = InpaintCondition(torch.stack([c.latent for c in conditions]), torch.stack([c.mask for c in conditions]))
@@ -445,9 +451,13 @@ def generate_blocks(
         callback_on_step_end,
         OUTPAINT,
     )
-    scenes = model.decode(latents, [empty] * len(indices))
+    as_paper = mode == "paper"
+    scenes = model.decode(latents, [empty] * len(indices), deduplicate=not as_paper)
     parts = zip(indices, conditions, latents, scenes, strict=True)
-    return {index: composer.finish_block(condition, latent, scene) for index, condition, latent, scene in parts}
+    return {
+        index: composer.finish_block(condition, latent, scene, blend=not as_paper)
+        for index, condition, latent, scene in parts
+    }
 
 
 def outpaint_scene(
@@ -472,7 +482,7 @@ def outpaint_scene(
         seed: Seed of the noise.
         scene_index: Index of the scene. The noise depends on the seed and this index.
         overlap: Fraction of a block that overlaps its neighbour; it must correspond to a whole number of latent cells.
-        mode: "copy" or "reencode"; see `BlockComposer.condition_block`.
+        mode: One of MODES.
         num_blocks: Number of blocks to add ahead, behind, to the left and to the right.
         repaint: Options of RePaint; None: the options of the paper.
         guidance_scale: Scale of classifier-free guidance; 1 switches guidance off.

@@ -83,17 +83,21 @@ def blend_ground(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
     return replace(blended, center_m=center_m)
 
 
-def extract_new_part(generated: Scene, known: Scene, new: np.ndarray) -> Scene:
-    """Return the generated part of a scene, blended into the known ground and without copies of known objects.
+def extract_new_part(generated: Scene, known: Scene, new: np.ndarray, blend: bool = True) -> Scene:
+    """Return the generated part of a scene.
 
     Args:
         generated: Decoded scene on the grid of `known`.
         known: Known part.
         new: (rows, cols) bool mask of the generated pixels.
+        blend: If True, blend the ground into the known ground, and remove copies of known objects. If False, leave the
+            decoded content as it is, as in the paper.
 
     Returns:
         The scene, which contains only the content of `new`.
     """
+    if not blend:
+        return merge_scenes([generated], [new], generated)
     fresh = generated.select(~find_regenerated_objects(generated, known))
     return merge_scenes([blend_ground(fresh, known, new)], [new], generated)
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 import ray.data
 import torch
 
+from models.composition.deduplicate import find_lower_confidence_duplicates
 from models.layout import LayoutSpec
 from models.scene import CATEGORIES, Scene
 from models.tensors import EXISTENCE_THRESHOLD, DecodedLayout, decode_layout, make_layout_batch, resample_scene_ground
@@ -176,14 +177,22 @@ def make_scene_record(
     spec: LayoutSpec,
     voxels: VoxelGrid,
     dataset: Dataset | None = None,
+    deduplicate: bool = False,
 ) -> SceneRecord:
     """Compare a scene with its reconstruction. The ground is compared at the resolutions of the scene and of the model.
 
     The scores cover all true primitives, including primitives without a slot. AP3D ranks all proposals. Pairs and
-    voxels are computed from the decoded scene, which contains only proposals above the existence threshold.
+    voxels are computed from the decoded scene, which contains only proposals above the existence threshold. If
+    `deduplicate` is True, duplicates among these are removed for all scores, as in generation.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
-    rebuilt = decode_layout(layout, spec, truth)
+    proposals = decode_layout(layout, spec, truth, threshold=-1.0)
+    if deduplicate:
+        likely = np.flatnonzero(proposals.existence > EXISTENCE_THRESHOLD)
+        kept = np.ones(len(proposals), bool)
+        kept[likely[find_lower_confidence_duplicates(proposals.select(likely))]] = False
+        proposals = proposals.select(kept)
+    rebuilt = proposals.select(proposals.existence > EXISTENCE_THRESHOLD)
     everywhere = replace(rebuilt, height_m=decoded_m, occupied=np.ones_like(rebuilt.occupied))
     true_height_m, true_occupied = resample_scene_ground(truth, spec.ground_classes, truth.grid)
     _, occupied = resample_scene_ground(rebuilt, spec.ground_classes, truth.grid)
@@ -193,7 +202,7 @@ def make_scene_record(
     return SceneRecord(
         ground=sum_ground(true_occupied, true_height_m, occupied, height_m),
         raster=sum_ground(coarse_occupied, coarse_height_m, rebuilt.occupied, decoded_m),
-        matches=match_scene(truth, decode_layout(layout, spec, truth, threshold=-1.0)),
+        matches=match_scene(truth, proposals),
         pairs=sum_pairs(truth, rebuilt),
         confusion=compute_voxel_confusion(true_voxels, voxelize(rebuilt, voxels)),
         outside=count_outside(truth, voxels),
@@ -203,12 +212,12 @@ def make_scene_record(
 
 
 def score_chunk(
-    row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None
+    row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None, deduplicate: bool
 ) -> list[dict]:
     """Compute one record per scene from an output row of a Reconstructor."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
-        | make_scene_record(scene, layout, latent, spec, voxels, dataset).to_row()
+        | make_scene_record(scene, layout, latent, spec, voxels, dataset, deduplicate).to_row()
         for number, scene, layout, latent in unstack_layouts(row, chunks)
     ]
 
@@ -276,12 +285,13 @@ def evaluate_reconstruction(
     Returns:
         Scores of the dataset and of each scene.
     """
-    spec, chunks = load_lvae(lvae).spec, split_chunks(selection, batch_size)
+    model, chunks = load_lvae(lvae), split_chunks(selection, batch_size)
+    spec, deduplicate = model.spec, model.proposes_duplicates
     voxels = make_voxel_grid(spec, voxel_range_m)
     graph = flat_map_dataset(
         reconstruct_chunks(chunks, lvae, num_actors),
         score_chunk,
-        fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset},
+        fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset, "deduplicate": deduplicate},
         num_cpus=READER_CPUS,
     )
     rows = []
@@ -344,8 +354,10 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
         "class_height_mae_m": ground.class_height_mae_m,
         "class_height_rmse_m": ground.class_height_rmse_m,
         "class_height_mse_normalised": ground.class_height_mse,
-        "ap3d": detection["ranked"].ap3d,
-        "ap3d_50": detection["ranked"].ap3d_50,
+        "ap3d": detection["threshold"].ap3d,
+        "ap3d_50": detection["threshold"].ap3d_50,
+        "ap3d_ranked": detection["ranked"].ap3d,
+        "ap3d_50_ranked": detection["ranked"].ap3d_50,
         "detection": {
             name: {
                 "ap3d": found.ap3d,

@@ -24,10 +24,11 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 
 
 def make_seam_row(
-    repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
+    mode: str, repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
 ) -> dict:
     """Make the row of one setting: options, cost per block, and ratios with intervals. Unknown values are None."""
     row = {
+        "neighbour_latents": mode,
         "steps": repaint.num_inference_steps,
         "jump_length": repaint.jump_length,
         "resamplings": repaint.resamplings,
@@ -47,10 +48,21 @@ def build_seam_table(rows: Sequence[Mapping]) -> Table:
     def shown(row: Mapping, name: str) -> str | None:
         return None if row[name] is None else f"{row[name]:.2f} ({row[f'{name}_low']:.2f} to {row[f'{name}_high']:.2f})"
 
-    names = ("steps", "jump_length", "resamplings", "known_guidance", "eta", "evaluations", "objects_per_ha", "seams")
+    names = (
+        "neighbour_latents",
+        "steps",
+        "jump_length",
+        "resamplings",
+        "known_guidance",
+        "eta",
+        "evaluations",
+        "objects_per_ha",
+        "seams",
+    )
     rounded = [{**row, "objects_per_ha": round(row["objects_per_ha"])} for row in rows]
     cells = [(*(row[name] for name in names), *(shown(row, name) for name in MEASURES)) for row in rounded]
     columns = (
+        "neighbour latents",
         "steps",
         "jump length",
         "resamplings",

@@ -178,8 +178,15 @@ def build_overall_table(scores: Mapping) -> Table:
             f"heights scaled to [0, 1] by the bounds of this model, {bounds['low']:.2f} to {bounds['high']:.2f} m; the "
             "paper does not state its bounds",
         ),
-        ("AP3D", scores["ap3d"], PAPER["ap3d"], "mean over categories and ten IoU3D thresholds, 0.05 to 0.50"),
+        (
+            "AP3D",
+            scores["ap3d"],
+            PAPER["ap3d"],
+            "mean over categories and ten IoU3D thresholds, 0.05 to 0.50, of the proposals above the paper's existence "
+            "threshold of 0.3",
+        ),
         ("AP3D@50", scores["ap3d_50"], PAPER["ap3d_50"], "mean over categories at the IoU3D threshold 0.50"),
+        ("AP3D, ranked", scores["ap3d_ranked"], None, "the same over all proposals, ranked by existence probability"),
         ("mean IoU3D", matched["mean_iou3d"], None, "over matched pairs of boxes"),
         (
             "found",

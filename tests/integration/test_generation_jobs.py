@@ -148,18 +148,20 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
     assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
 
-    row, guided = sweep_seams(
+    row, guided, *as_paper = sweep_seams(
         SweepConfig(
             model=model,
             input=str(samples),
             source="generated-samples",
             settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
+            neighbour_latents=("reencode", "paper"),
             output=str(tmp_path / "sweep"),
         )
     )
+    assert [part["neighbour_latents"] for part in (row, guided, *as_paper)] == ["reencode"] * 2 + ["paper"] * 2
     assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
     assert guided["evaluations"] == 4 and guided["known_guidance"] == 1 and guided["objects_per_ha"] > 0
-    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)]
+    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)] * 2
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 2
 
     scores = evaluate(

@@ -140,9 +140,9 @@ def test_seam_sweep_row_has_cost_and_visibility():
     ratios = {name: None for name in MEASURES} | {"height_step": Estimate(1.2, 1.0, 1.5)}
     cars = replace_objects_by_cars(make_random_ground(0), [(10, 0), (20, 3)])
     assert count_objects_per_ha([cars, make_random_ground(1)]) == pytest.approx(2 / 0.8192)  # two scenes of 64 m x 64 m
-    row = make_seam_row(RePaintConfig(), 200, 12.3, ratios)
+    row = make_seam_row("paper", RePaintConfig(), 200, 12.3, ratios)
     assert row["evaluations"] == 2410 and row["height_step_high"] == 1.5 and row["cut_objects"] is None
     (cells,) = build_seam_table([row]).rows
-    assert cells[:8] == (250, 10, 10, 0.0, 1.0, 2410, 12, 200)
-    assert cells[9] == "1.20 (1.00 to 1.50)" and cells[10] is None
+    assert cells[:9] == ("paper", 250, 10, 10, 0.0, 1.0, 2410, 12, 200)
+    assert cells[10] == "1.20 (1.00 to 1.50)" and cells[11] is None
     assert "2410" in render_seam_sweep_html([row], [], ["how"]).replace(",", "").replace("\u202f", "")

@@ -17,6 +17,7 @@ from models.composition.outpaint import (
     rank_four_colors,
     rank_outward,
 )
+from models.composition.seam_blending import extract_new_part
 from models.layout import LayoutSpec
 from models.scene import KITTI_GROUND_CLASSES, Grid
 from models.tensors import make_empty_scene
@@ -104,6 +105,21 @@ def test_block_grid_fronts_are_independent():
     assert needed == set(product(range(3), repeat=2))
     with pytest.raises(ValueError, match="cannot list the blocks"):
         endless.indices()
+
+
+def test_outpainting_of_the_paper_neither_blends_nor_removes_copies(truth):
+    scene = crop_truth(truth, (0, 0))
+    new = np.zeros(scene.occupied.shape[1:], bool)
+    new[: len(new) // 2] = True
+    raised = scene.translate(0, 0, 0.5)
+    generated = replace(scene, height_m=raised.height_m, center_m=scene.center_m, occupied=scene.occupied)
+    plain = extract_new_part(generated, scene, new, blend=False)
+    assert np.array_equal(plain.height_m[:, new], generated.height_m[:, new])  # the step of 0.5 m stays
+    inside = new[scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])]
+    assert len(plain) == inside.sum()
+    blended = extract_new_part(generated, scene, new)
+    assert len(blended) == 0 or len(blended) < len(plain)  # all objects are copies of known objects
+    assert scene.occupied[:, new].any() and not np.array_equal(blended.height_m[:, new], generated.height_m[:, new])
 
 
 def test_block_grid_rejects_wrong_overlaps():

@@ -9,7 +9,7 @@ import pytest
 from helpers import random_scene
 
 from models.layout import Bounds, LayoutSpec
-from models.scene import CATEGORIES, Scene
+from models.scene import CATEGORIES, VEGETATION, Scene
 from models.tensors import DecodedLayout, encode_layout
 from pipelines.evaluation.reconstruction import (
     SceneRecord,
@@ -45,6 +45,26 @@ def encode_perfectly(scene: Scene, spec: LayoutSpec) -> DecodedLayout:
 
 def make_record(scene: Scene, layout: DecodedLayout, spec: LayoutSpec = SPEC) -> SceneRecord:
     return make_scene_record(scene, layout, LATENT, spec, make_voxel_grid(spec))
+
+
+def test_reconstruction_removes_duplicates_as_generation_does():
+    """Every primitive is proposed twice; the second proposal is less likely."""
+    scene = random_scene(0, n=20)
+    spec = replace(SPEC, slots=tuple(max(slots, 40) for slots in SPEC.slots))
+    once = encode_perfectly(scene, spec)
+    twice = replace(
+        once,
+        features=np.concatenate([once.features, once.features]),
+        existence=np.concatenate([once.existence, 0.8 * once.existence]),
+        category=np.concatenate([once.category, once.category]),
+    )
+    solid = ~np.isin(scene.category, VEGETATION)
+    counts = {}
+    for deduplicate in (False, True):
+        made = make_scene_record(scene, twice, LATENT, spec, make_voxel_grid(spec), deduplicate=deduplicate)
+        counts[deduplicate] = made.pairs.predictions.sum()
+    assert solid.sum() > 5 and counts[False] == 2 * len(scene)
+    assert counts[True] == 2 * len(scene) - solid.sum()  # tree crowns overlap in reality, so they are kept
 
 
 def test_reconstruction_of_perfect_decoder_scores_one():
