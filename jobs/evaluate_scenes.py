@@ -2,6 +2,7 @@
 """Compare generated scenes with real scenes, and evaluate layout-VAE reconstruction.
 
     jobs/evaluate_scenes.py --real DIR --generated DIR
+    jobs/evaluate_scenes.py --real DIR --generated DIR --controls      which scores notice which damage
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
     jobs/evaluate_scenes.py --real DIR --generated DIR --max-scenes 10000 --reference min-distance --min-distance-m 10
     jobs/evaluate_scenes.py --real DIR --generated samples.npz --inception FILE
@@ -13,10 +14,15 @@ are the paper's: k = 3, and at most 1,000 training scenes, selected by farthest 
 compares N real scenes with N generated scenes. Each label has the same share of the generated scenes. Every score has a
 95 % confidence interval over scenes.
 
+Every score stands next to its ceiling: the same score of N other real scenes. With --controls, the job also scores
+damaged copies of these scenes: objects moved, turned, permuted, dropped, duplicated or from another scene, and ground
+shifted or roughened. A score is worth reading for a fault if it rates the damaged scenes worse than the ceiling.
+
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
 also writes reconstruction.html (the best and the worst scenes) and reconstruction.parquet (one row per scene). FID,
 sFID, KID, IS, precision and recall need a local file of Inception weights. Without Inception weights, the job reports
-distances of layout statistics and of features of a fixed random network, under separate names. Run the same command
+distances of layout statistics, of relations between objects and ground, and of features of EfficientNet-Lite0 (extra
+lite0) and of a fixed random network, under separate names. Run the same command
 again to resume after an interruption.
 """
 
@@ -51,6 +57,16 @@ class Config:
     """Minimum distance of poses in metres for --reference min-distance."""
     balance_labels: bool = True
     """Use the same number of generated scenes for each label, if there are enough scenes."""
+    controls: bool = False
+    """Also score damaged copies of real scenes, to show which scores notice which damage."""
+    ceiling_split: str = ""
+    """Split of the other real scenes, the ceiling; halves takes two halves of --real-split at least 64 m apart
+    (default: test for the real split train, otherwise train; halves if that gives more scenes)."""
+    peers: tuple[str, ...] = ()
+    """Dataset directories of other methods' scenes to show in the validity table, such as imported scenes (default:
+    none)."""
+    lite0: bool | None = None
+    """Use the features of EfficientNet-Lite0 (default: if the extra lite0 is installed)."""
     k: tuple[int, ...] = (3,)
     """Numbers of nearest neighbours for precision, recall, density and coverage."""
     supersample: int = 1

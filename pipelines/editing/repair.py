@@ -42,7 +42,7 @@ def snap_to_ground(scene: Scene, chosen: np.ndarray, slab_offset_m: float, which
     Returns:
         The repaired scene.
     """
-    found = find_faults(scene, slab_offset_m, GOAL_TOLERANCE_M)
+    found = find_faults(scene, slab_offset_m, GOAL_TOLERANCE_M, ("floating", "sunken"))
     wrong = np.zeros(len(scene), bool)
     for name in ("floating", "sunken"):
         wrong |= chosen & found[name][0] & (which in ("both", name))

@@ -2,8 +2,12 @@
 
 features.py computes the features. Each score has a 95 % interval over scenes (metrics/intervals.py). Only scores of
 Inception features have the usual names (fid, sfid, kid, inception_score, precision, ...). The names of other scores
-have a prefix: `layout_` for layout statistics, and `random_` for a network with random weights. reconstruction.py
-scores reconstructions.
+have a prefix: `layout_` for layout statistics, `relation_` for relation statistics, `lite0_` for EfficientNet-Lite0,
+and `random_` for a network with random weights. `two_sample_auc` uses layout and relation statistics.
+
+A score means something only next to two other values from the same run: a ceiling (other real scenes) and controls
+(damaged real scenes). `score_sets` computes all of them with the same reference scenes and the same number of scenes.
+reconstruction.py scores reconstructions.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import ray
 from models.scene import CATEGORIES
 from pipelines.metrics import distributions, statistics, validity
 from pipelines.metrics.adm_npz import ReferenceMoments
+from pipelines.metrics.controls import CONTROLS
 from pipelines.metrics.frechet import (
     StoredGaussian,
     compute_frechet_distance,
@@ -38,9 +43,14 @@ from pipelines.metrics.neighbours import (
     prepare_features,
     require_comparable,
 )
+from pipelines.metrics.relations import RELATION_HISTOGRAMS, RELATIONS
+from pipelines.metrics.two_sample import FOLDS, MIN_SCENES, classify_samples
 
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
+RELATION_LIMIT = 5.0  # Standardised relation statistics are clipped to this value; rare categories have outliers.
+# Scores that are read first. At least two of them must notice each control.
+HEADLINES = ("two_sample_auc", "relation_frechet", "lite0_frechet", "lite0_coverage_k3")
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
 MEMORISED_QUANTILE = 0.01  # Quantile of the distances from real scenes to their nearest other real scene.
 
@@ -66,25 +76,178 @@ def compare_datasets(
         Nested scores. Scores with an interval are Estimates.
     """
     scores: dict[str, Any] = {"scenes": {"real": len(real["scene_id"]), "generated": len(generated["scene_id"])}}
+    scores |= compute_set_scores(real, generated, ground_classes, k)
     if "statistics" in real and "statistics" in generated:
-        layout = statistics.standardize_statistics(real["statistics"], generated["statistics"])
-        scores |= {"layout_frechet": estimate_frechet(*layout), "layout_mmd": compute_kernel_distance(*layout)}
         scores |= compute_layout_scores(real, generated, ground_classes)
-    scores |= {
-        f"random_{name}": value
-        for name, value in compute_feature_scores(real["random"], generated["random"], k).items()
-    }
     if "pool3" in real and "pool3" in generated:
-        names = {"frechet": "fid", "mmd": "kid"}
-        found = compute_feature_scores(real["pool3"], generated["pool3"], k)
-        scores |= {names.get(name, name): value for name, value in found.items()}
-        scores["sfid"] = estimate_frechet(real["spatial"], generated["spatial"])
         if reference:
             scores["fid"] = compute_frechet_to(reference.pool3, generated["pool3"])
             scores["sfid"] = compute_frechet_to(reference.spatial, generated["spatial"]) if reference.spatial else None
         scores["inception_score"] = compute_inception_score(generated["logits"])
         scores["inception_score_real"] = compute_inception_score(real["logits"])
     return scores
+
+
+def compute_set_scores(
+    real: Described, generated: Described, ground_classes: Sequence[str] = (), k: Sequence[int] = (3,)
+) -> dict[str, Any]:
+    """Compute the scores that compare two sets of scenes as wholes.
+
+    Args:
+        real: Features of the real scenes.
+        generated: Features of the generated scenes, or of a ceiling or control.
+        ground_classes: Names of the ground classes in the layout statistics.
+        k: Neighbourhood sizes of precision and recall.
+
+    Returns:
+        Estimates by name, and `two_sample_features`.
+    """
+    scores: dict[str, Any] = {}
+    if "statistics" in real and "statistics" in generated:
+        layout = statistics.standardize_statistics(real["statistics"], generated["statistics"])
+        relations = [
+            part.clip(-RELATION_LIMIT, RELATION_LIMIT)
+            for part in statistics.standardize_statistics(real["relations"], generated["relations"])
+        ]
+        for name, sides in (("relation", relations), ("layout", layout)):
+            scores[f"{name}_frechet"] = estimate_frechet(*sides)
+            scores[f"{name}_mmd"] = compute_kernel_distance(*sides)
+        places = group_places(real["place"]), group_places(generated["place"])
+        if min(map(len, places)) >= MIN_SCENES and min(len(np.unique(side)) for side in places) >= FOLDS:
+            features = [np.concatenate([side["relations"], side["statistics"]], axis=1) for side in (real, generated)]
+            names = [*RELATIONS, *statistics.list_statistic_names(ground_classes)]
+            found = classify_samples(features[0], features[1], names, places)
+            scores |= {"two_sample_auc": found.auc, "two_sample_features": found.features}
+    spaces = {"pool3": ("", {"frechet": "fid", "mmd": "kid"}), "lite0": ("lite0_", {"mmd": "kid"})}
+    for features, (prefix, names) in (spaces | {"random": ("random_", {})}).items():
+        if features in real and features in generated:
+            found = compute_feature_scores(real[features], generated[features], k)
+            scores |= {prefix + names.get(name, name): value for name, value in found.items()}
+    if "spatial" in real and "spatial" in generated:
+        scores["sfid"] = estimate_frechet(real["spatial"], generated["spatial"])
+    return scores
+
+
+def group_places(places: np.ndarray) -> np.ndarray:
+    """Group scenes by drive if there are enough drives, otherwise by place.
+
+    Args:
+        places: (n,) places from features.py, such as "kitti360/<drive>/3/-1".
+
+    Returns:
+        (n,) names of the groups.
+    """
+    drives = np.array([name.rsplit("/", 2)[0] for name in places])
+    return drives if len(np.unique(drives)) >= FOLDS else places
+
+
+# ------------------------------------------------------------------------------------------- ceiling and controls
+
+
+@ray.remote(num_cpus=1)
+def score_set_task(
+    real: dict[str, np.ndarray], side: dict[str, np.ndarray], ground_classes: Sequence[str], k: Sequence[int]
+) -> dict[str, Estimate]:
+    """Score one set, including the validity measures, as flat Estimates."""
+    scores = {
+        name: value
+        for name, value in compute_set_scores(real, side, ground_classes, k).items()
+        if isinstance(value, Estimate)
+    }
+    if "validity" in side:
+        scores |= {f"validity.{name}": rate for name, rate in rate_validity(side).items() if rate is not None}
+    return scores
+
+
+def rate_validity(side: Described) -> dict[str, Estimate | None]:
+    """Estimate the rate of each of validity.MEASURES.
+
+    Args:
+        side: Features of a set of scenes.
+
+    Returns:
+        Rates by name. None: the measure applies to no object.
+    """
+    return dict(zip(validity.MEASURES, compute_pair_ratios(side["validity"]), strict=True))
+
+
+def score_sets(
+    real: Described, sets: Mapping[str, Described], ground_classes: Sequence[str] = (), k: Sequence[int] = (3,)
+) -> dict[str, dict[str, Estimate]]:
+    """Score several sets of scenes against the same real scenes, in parallel Ray tasks.
+
+    Args:
+        real: Features of the reference scenes.
+        sets: Features of each set, for example of generated scenes, of other real scenes and of damaged scenes.
+        ground_classes: Names of the ground classes in the layout statistics.
+        k: Neighbourhood sizes of precision and recall.
+
+    Returns:
+        Scores of each set. Names of validity measures begin with `validity.`.
+    """
+    shared = ray.put(dict(real))
+    tasks = {name: score_set_task.remote(shared, dict(side), ground_classes, k) for name, side in sets.items()}
+    return dict(zip(tasks, ray.get(list(tasks.values())), strict=True))
+
+
+def measure_badness(name: str, value: float) -> float:
+    """Convert a score to a number that is larger for worse scores.
+
+    Args:
+        name: Name of the score.
+        value: Value of the score.
+
+    Returns:
+        The value itself, its negative, or the distance from 0.5 for an AUC.
+    """
+    if name.endswith("_auc"):
+        return abs(value - 0.5)
+    higher_is_better = ("precision", "recall", "density", "coverage", "inception_score", "road_connectivity")
+    return -value if any(word in name for word in higher_is_better) else value
+
+
+def is_sensitive(name: str, control: Estimate, ceiling: Estimate) -> bool:
+    """Return whether a score rates a control worse than the ceiling, with disjoint 95 % intervals.
+
+    Args:
+        name: Name of the score.
+        control: Score of the control.
+        ceiling: Score of other real scenes.
+
+    Returns:
+        True if the score notices the damage.
+    """
+    is_disjoint = control.low > ceiling.high or control.high < ceiling.low
+    return is_disjoint and measure_badness(name, control.value) > measure_badness(name, ceiling.value)
+
+
+def find_sensitive_scores(sets: Mapping[str, Mapping[str, Estimate]]) -> dict[str, list[str]]:
+    """Find the controls that each score notices.
+
+    Args:
+        sets: Scores by set; "ceiling" and any number of controls.
+
+    Returns:
+        Names of the controls for each score of the ceiling.
+    """
+    ceiling, names = sets["ceiling"], [name for name in sets if name in CONTROLS]
+    return {
+        score: [name for name in names if score in sets[name] and is_sensitive(score, sets[name][score], value)]
+        for score, value in ceiling.items()
+    }
+
+
+def list_headlines(scores: Mapping[str, Any]) -> list[str]:
+    """Return the headline scores; without EfficientNet-Lite0, those of the untrained network take their places.
+
+    Args:
+        scores: Scores of a set.
+
+    Returns:
+        Names of HEADLINES that exist in `scores`.
+    """
+    names = (name if name in scores else name.replace("lite0_", "random_") for name in HEADLINES)
+    return [name for name in names if name in scores]
 
 
 # ----------------------------------------------------------------------------------------------------- features
@@ -217,19 +380,38 @@ def compute_layout_scores(real: Described, generated: Described, ground_classes:
     categories = slice(0, len(CATEGORIES))
     # The distance between two halves of the real scenes is about the lowest distance that a source can reach.
     halves = real["statistics"][::2], real["statistics"][1::2]
-    floor = distributions.compute_histogram_distances(real["histograms"][::2], real["histograms"][1::2])
-    distances = distributions.compute_histogram_distances(real["histograms"], generated["histograms"])
     counts = distributions.compute_count_distances(*(part["statistics"][:, categories] for part in sides.values()))
     count_floor = distributions.compute_count_distances(*(half[:, categories] for half in halves))
     return {
         "statistics": {name: {side: means[side][i] for side in sides} for i, name in enumerate(names)},
         "count_distance": {name: {"between": counts[name], "within_real": count_floor[name].value} for name in counts},
-        "distance": {
-            name: {"between": found, "within_real": floor[name].value if name in floor else None}
-            for name, found in distances.items()
-        },
+        "distance": compare_histograms(real, generated, "histograms", distributions.HISTOGRAMS),
+        "relation_distance": compare_histograms(real, generated, "relation_histograms", RELATION_HISTOGRAMS),
         "validity": {name: {side: rates[side][i] for side in sides} for i, name in enumerate(validity.MEASURES)},
+        "category_validity": {side: compute_category_rates(part["category_validity"]) for side, part in sides.items()},
         "label_fidelity": dict(zip(validity.LABEL_MEASURES, compute_pair_ratios(generated["fidelity"]), strict=True)),
+    }
+
+
+def compare_histograms(
+    real: Described, generated: Described, column: str, histograms: Sequence[distributions.Histogram]
+) -> dict[str, dict]:
+    """Compute the distance of each histogram between the sides, and between two halves of the real scenes."""
+    found = distributions.compute_histogram_distances(real[column], generated[column], histograms)
+    floor = distributions.compute_histogram_distances(real[column][::2], real[column][1::2], histograms)
+    return {
+        name: {"between": value, "within_real": floor[name].value if name in floor else None}
+        for name, value in found.items()
+    }
+
+
+def compute_category_rates(records: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    """Estimate the rate of each object measure for each category that the measure applies to."""
+    shape = len(validity.OBJECT_MEASURES), len(CATEGORIES)
+    rates = compute_pair_ratios(records)
+    return {
+        measure: {CATEGORIES[c]: rate for c in range(shape[1]) if (rate := rates[m * shape[1] + c]) is not None}
+        for m, measure in enumerate(validity.OBJECT_MEASURES)
     }
 
 

@@ -6,6 +6,7 @@ An interrupted run therefore resumes with the missing parts.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -16,8 +17,10 @@ import torch
 
 from models.scene import Scene
 from models.tensors import resample_scene_ground
-from pipelines.metrics import distributions, inception, statistics, validity
+from pipelines.metrics import distributions, inception, lite0, statistics, validity
 from pipelines.metrics.adm_npz import iterate_pictures
+from pipelines.metrics.controls import damage_scene
+from pipelines.metrics.relations import compute_scene_relations
 from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import make_numbered_rows, map_actors, map_rows
@@ -28,15 +31,20 @@ from pipelines.schema.tables import Shard
 
 READER_CPUS = 0.5
 PICTURES_PER_PART = 512
-VERSION = 1  # Version of the features; files with another version are computed again.
+VERSION = 2  # Version of the features; files with another version are computed again.
+PLACE_M = 128.0
 PICTURE_PX = 256  # Paper, Sec. 4.1, Metrics.
-# Types of the numbers in each column except scene_id. A column contains one list of numbers per scene.
+# Types of the numbers in each column except scene_id and place. A column contains one list of numbers per scene.
 FEATURE_TYPES = {
     "statistics": np.float64,
     "histograms": np.uint32,
+    "relations": np.float64,
+    "relation_histograms": np.uint32,
     "validity": np.float64,
+    "category_validity": np.float64,
     "fidelity": np.float64,
     "random": np.float32,
+    "lite0": np.float32,
     "pool3": np.float32,
     "spatial": np.float32,
     "logits": np.float32,
@@ -50,10 +58,14 @@ class FeatureConfig:
     Attributes:
         supersample: Number of points per pixel along each axis; a pixel is the mean of its points.
         inception: File with the Inception weights; "" means no Inception features.
+        lite0: File with the converted weights of EfficientNet-Lite0 (lite0.py); "" means no such features.
+        control: Damage to apply to each scene before its features are computed (controls.py); "" means none.
     """
 
     supersample: int = 1
     inception: str = ""
+    lite0: str = ""
+    control: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,25 +84,33 @@ class ImageFile:
 SceneSet = SceneSubset | ImageFile  # One side of a comparison.
 
 
-def compute_features(pictures: np.ndarray, network: inception.Inception | None) -> dict[str, np.ndarray]:
-    """Compute random features (n, 480) of pictures (n, H, W, 3) uint8, and Inception features if a network is given."""
+def compute_features(pictures: np.ndarray, looks: FeatureConfig) -> dict[str, np.ndarray]:
+    """Compute random features (n, 480) of pictures (n, H, W, 3) uint8, and those of the networks with given weights."""
     named = {"random": inception.compute_random_features(pictures)}
-    if network is not None:
+    if looks.lite0:
+        named["lite0"] = lite0.compute_lite0_features(load_cached_lite0(looks.lite0), pictures)
+    if looks.inception:
+        network = load_cached_inception(*storage.fingerprint_file(looks.inception))
         named |= inception.compute_inception_features(network, pictures)._asdict()
     return named
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
-    """Compute layout statistics, histograms, validity (n, 14) and label fidelity (n, 6) of scenes of a dataset."""
+    """Compute layout statistics, relations, histograms, validity and label fidelity of scenes of a dataset."""
     slab_offset_m = validity.find_slab_offset_m(dataset.spec.surface)
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("statistics", "histograms", "validity", "fidelity")}
+    rows: dict[str, list[np.ndarray]] = defaultdict(list)
     for scene in scenes:
         classes = dataset.spec.ground_classes
         height, occupied = resample_scene_ground(scene, classes, scene.grid)
         scene = replace(scene, ground_classes=classes, height_m=height, occupied=occupied)
         rows["statistics"].append(statistics.compute_layout_statistics(scene))
         rows["histograms"].append(distributions.compute_scene_histograms(scene))
-        rows["validity"].append(validity.compute_scene_validity(scene, slab_offset_m).ravel())
+        relations = compute_scene_relations(scene, slab_offset_m)
+        rows["relations"].append(relations.vector)
+        rows["relation_histograms"].append(relations.histograms)
+        by_category, connectivity = validity.compute_category_validity(scene, slab_offset_m)
+        rows["validity"].append(validity.sum_validity(by_category, connectivity).ravel())
+        rows["category_validity"].append(by_category.ravel())
         rows["fidelity"].append(judge_labels(scene, dataset).ravel())
     return {name: np.stack(values) for name, values in rows.items()}
 
@@ -112,18 +132,35 @@ def compute_part(
     torch.set_num_threads(1)
     shard, rows = parts[number]
     scenes = shard.scenes(rows)
+    if looks.control:
+        scenes = damage_scenes(scenes, number, parts, looks.control)
     pictures = np.stack([render_bev(scene, PICTURE_PX, looks.supersample) for scene in scenes])
-    columns = compute_features(pictures, load_network(looks))
+    columns = compute_features(pictures, looks)
     if dataset:
         columns = compute_scene_rows(scenes, dataset) | columns
-    write_part(directory, number, [scene.scene_id for scene in scenes], columns)
+    names, places = [scene.scene_id for scene in scenes], [find_place(scene) for scene in scenes]
+    write_part(directory, number, names, places, columns)
     return {"scenes": len(scenes)}
 
 
-def load_network(looks: FeatureConfig) -> inception.Inception | None:
-    """Load the Inception network, if weights are given. A process loads the network once, and again if the file
-    changes."""
-    return load_cached_inception(*storage.fingerprint_file(looks.inception)) if looks.inception else None
+def damage_scenes(scenes: list[Scene], number: int, parts: list[tuple[Shard, list[int]]], control: str) -> list[Scene]:
+    """Damage the scenes of a part. Each scene has a donor in the part that is half the list of parts away.
+
+    If there is only one part, the donor is half the part away.
+    """
+    shard, rows = parts[(number + max(1, len(parts) // 2)) % len(parts)]
+    shift = len(rows) // 2 if len(parts) == 1 else 0
+    donors = shard.scenes([rows[(k + shift) % len(rows)] for k in range(len(scenes))])
+    return [
+        damage_scene(control, scene, donor, (number, k))
+        for k, (scene, donor) in enumerate(zip(scenes, donors, strict=True))
+    ]
+
+
+@lru_cache(maxsize=1)
+def load_cached_lite0(path: str) -> lite0.Lite0:
+    """Load EfficientNet-Lite0 once per process; the name of the file contains the digest of the weights."""
+    return lite0.load_lite0(path)
 
 
 @lru_cache(maxsize=1)
@@ -142,8 +179,7 @@ class ImageFeatureExtractor:
 
     def __init__(self, path: str, parts: list[range], looks: FeatureConfig, directory: str) -> None:
         torch.set_num_threads(1)
-        self.path, self.parts, self.directory = path, parts, directory
-        self.network = load_network(looks)
+        self.path, self.parts, self.directory, self.looks = path, parts, directory, looks
         self.batches, self.next_part = iter(()), len(parts)
 
     def __call__(self, row: dict) -> dict:
@@ -155,7 +191,7 @@ class ImageFeatureExtractor:
             self.next_part += 1
         part = self.parts[number]
         names = [f"{index:07d}" for index in part]
-        write_part(self.directory, number, names, compute_features(pictures[: len(part)], self.network))
+        write_part(self.directory, number, names, names, compute_features(pictures[: len(part)], self.looks))
         return {"scenes": len(part)}
 
 
@@ -164,9 +200,23 @@ def make_part_path(directory: str, number: int) -> str:
     return storage.join_uri(directory, f"part-{number:05d}.parquet")
 
 
-def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[str, np.ndarray]) -> None:
-    """Write the file of a part: one row per scene, with the scene id and one list of numbers per column."""
-    arrays = {"scene_id": pa.array(scene_ids, pa.string())}
+def find_place(scene: Scene) -> str:
+    """Return the name of the place of a scene. Real scenes of one place look alike, so tests keep them together.
+
+    A place is a square of PLACE_M in the world frame of a drive; its name begins with the drive. Each generated scene
+    is a place of its own.
+    """
+    if scene.split == "generated":
+        return scene.scene_id
+    x, y = (int(value // PLACE_M) for value in scene.world_xyz_m[:2])
+    return f"{scene.source}/{scene.sequence}/{x}/{y}"
+
+
+def write_part(
+    directory: str, number: int, scene_ids: list[str], places: list[str], columns: dict[str, np.ndarray]
+) -> None:
+    """Write the file of a part: one row per scene, with scene id, place and one list of numbers per column."""
+    arrays = {"scene_id": pa.array(scene_ids, pa.string()), "place": pa.array(places, pa.string())}
     for name, values in columns.items():
         flat = pa.array(np.ascontiguousarray(values, FEATURE_TYPES[name]).ravel())
         arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -174,10 +224,10 @@ def write_part(directory: str, number: int, scene_ids: list[str], columns: dict[
 
 
 def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
-    """Read all parts in order; return scene_id (n,) and the other columns (n, width)."""
+    """Read all parts in order; return scene_id (n,), place (n,) and the other columns (n, width)."""
     table = pa.concat_tables([storage.read_parquet(make_part_path(directory, number)) for number in range(count)])
-    described = {"scene_id": table["scene_id"].to_numpy()}
-    for name in table.column_names[1:]:
+    described = {name: table[name].to_numpy() for name in table.column_names[:2]}
+    for name in table.column_names[2:]:
         column = table[name].combine_chunks()
         described[name] = column.flatten().to_numpy().reshape(len(table), -1)
     return described
@@ -207,7 +257,7 @@ def compute_scene_features(
         on_scenes: Called with the number of scenes of each finished part.
 
     Returns:
-        scene_id (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
+        scene_id (n,), place (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
     """
     ranges: list[range] = []
     shards: list[tuple[Shard, list[int]]] = []
@@ -266,5 +316,6 @@ def make_options_record(looks: FeatureConfig) -> dict:
     """Return the options that determine the features. A hash of the weights replaces the name of their file."""
     return asdict(looks) | {
         "version": VERSION,
+        "lite0": looks.lite0.rsplit("/", 1)[-1],  # The name contains the digest.
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",
     }

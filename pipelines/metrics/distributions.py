@@ -9,7 +9,7 @@ bin width limits the resolution.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,14 +33,16 @@ class Histogram:
 
     Attributes:
         name: Name of the histogram, such as pole.height_m.
-        edges: Edges of the bins (m). The first and last bins also count values beyond the outer edges. None: the bins
-            are named.
+        edges: Edges of the bins, in `length_unit`. The first and last bins also count values beyond the outer edges.
+            None: the bins are named.
         bins: Names of the bins, for bins that have no order.
+        length_unit: Unit of the edges.
     """
 
     name: str
     edges: np.ndarray | None = None
     bins: tuple[str, ...] = ()
+    length_unit: str = "m"
 
     def __len__(self) -> int:
         return len(self.bins) if self.edges is None else len(self.edges) - 1
@@ -48,13 +50,13 @@ class Histogram:
     @property
     def unit(self) -> str:
         """Return the unit of the distance between two histograms of this type."""
-        return "bits" if self.edges is None else "m"
+        return "bits" if self.edges is None else self.length_unit
 
     def count(self, values: np.ndarray) -> np.ndarray:
         """Count values per bin.
 
         Args:
-            values: Values (m), or bin numbers for named bins.
+            values: Values in the unit of the edges, or bin numbers for named bins.
 
         Returns:
             (bins,) int64 counts.
@@ -151,12 +153,15 @@ def measure_road_widths(scene: Scene) -> tuple[np.ndarray, np.ndarray | None]:
 # --------------------------------------------------------------------------------------------------- two sources
 
 
-def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict[str, Estimate]:
+def compute_histogram_distances(
+    real: np.ndarray, generated: np.ndarray, histograms: Sequence[Histogram] = HISTOGRAMS
+) -> dict[str, Estimate]:
     """Compute the distance between two sources for each histogram.
 
     Args:
         real: (n, bins) counts of real scenes.
         generated: (m, bins) counts of generated scenes.
+        histograms: Histograms in the order of the bins.
 
     Returns:
         Dictionary from the name of a histogram to the distance in the unit of the histogram. Histograms that are empty
@@ -164,7 +169,8 @@ def compute_histogram_distances(real: np.ndarray, generated: np.ndarray) -> dict
     """
     drawn = [compute_weights(len(side), key) for key, side in enumerate((real, generated))]
     found = {}
-    for histogram, end in zip(HISTOGRAMS, ENDS, strict=True):
+    ends = np.cumsum([len(histogram) for histogram in histograms])
+    for histogram, end in zip(histograms, ends, strict=True):
         columns = slice(end - len(histogram), end)
         sums = [w @ side[:, columns].astype(np.float64) for w, side in zip(drawn, (real, generated), strict=True)]
         if min(part[0].sum() for part in sums) == 0:

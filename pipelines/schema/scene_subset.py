@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 import pyarrow as pa
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from pipelines.runtime import storage
 from pipelines.schema.tables import Shard, find_shards
 
 Pick = Literal["spread", "first", "farthest", "apart", "balanced"]
+Half = Literal["first", "second"]
 COLUMNS = ["sequence", "x_m", "y_m", "vegetation_density", "vehicle_density"]
+HALVES_APART_M = 64.0  # Scenes of two halves show no common ground, because a crop has a side of 64 m.
 ONE_WORLD = ("kitti360",)  # Sources in which all drives share one world frame.
 
 
@@ -37,6 +40,7 @@ class SceneSubset:
         limit: Maximum number of scenes (default: all).
         pick: Selection rule.
         apart_m: Minimum distance between poses for the rule "apart" (m).
+        half: Select only from the "first" or the "second" half of the places; "" means all (`split_halves`).
     """
 
     root: str
@@ -45,6 +49,7 @@ class SceneSubset:
     limit: int | None = None
     pick: Pick | str = "spread"
     apart_m: float = 0.0
+    half: Half | str = ""
 
     def __post_init__(self) -> None:
         if self.limit is not None and self.limit < 1:
@@ -97,6 +102,10 @@ class SceneSubset:
         Returns:
             Selected row numbers, in order of selection.
         """
+        if self.half:
+            places = split_halves(*read_poses(scenes, source))[("first", "second").index(self.half)]
+            inner = replace(self, half="")
+            return places[inner.chosen(scenes.take(places), source[places])]
         total = len(scenes)
         wanted = min(total, self.limit or total)
         if self.pick == "first":
@@ -164,6 +173,34 @@ def read_poses(scenes: pa.Table, source: np.ndarray) -> tuple[np.ndarray, np.nda
     world = np.where(np.isin(source, ONE_WORLD), "", scenes["sequence"].to_numpy().astype(str))
     world = np.unique(np.char.add(np.char.add(source.astype(str), "/"), world), return_inverse=True)[1]
     return np.stack([scenes["x_m"].to_numpy(), scenes["y_m"].to_numpy()], axis=1), world
+
+
+def split_halves(xy_m: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split scenes into two halves that show different places.
+
+    The scenes are ordered by world frame and, within a frame, along the direction in which the poses spread most. The
+    first half is the first half of this order. The second half consists of the remaining scenes that lie at least
+    HALVES_APART_M from each scene of the first half.
+
+    Args:
+        xy_m: (n, 2) position of each pose (m).
+        world: (n,) index of each pose's world frame.
+
+    Returns:
+        Indices of the first and of the second half, in ascending order.
+    """
+    along_m = np.empty(len(world))
+    for frame in np.unique(world):
+        here = world == frame
+        centred = xy_m[here] - xy_m[here].mean(axis=0)
+        along_m[here] = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+    order = np.lexsort([along_m, world])
+    first, rest = np.split(order, [(len(order) + 1) // 2])
+    near = np.zeros(len(rest), bool)
+    for frame in np.intersect1d(world[first], world[rest]):
+        mine, theirs = first[world[first] == frame], world[rest] == frame
+        near[theirs] = cKDTree(xy_m[mine]).query(xy_m[rest[theirs]])[0] < HALVES_APART_M
+    return np.sort(first), np.sort(rest[~near])
 
 
 def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:
