@@ -198,10 +198,8 @@ def measure_badness(name: str, value: float) -> float:
         value: Value of the score.
 
     Returns:
-        The value itself, its negative, or the distance from 0.5 for an AUC.
+        The value itself, or its negative.
     """
-    if name.endswith("_auc"):
-        return abs(value - 0.5)
     higher_is_better = ("precision", "recall", "density", "coverage", "inception_score", "road_connectivity")
     return -value if any(word in name for word in higher_is_better) else value
 

@@ -2,7 +2,8 @@
 
 The test follows Lopez-Paz & Oquab (2017), with the area under the ROC curve (AUC) instead of the accuracy. An AUC of
 0.5 means that the classifier finds no difference. The classifier and its folds are fixed by seeds, so that the same
-features always give the same result.
+features always give the same result. A cross-validated AUC may fall below 0.5 if there are few places: without a
+difference to learn, the places in the training folds predict the opposite of those in the test fold.
 """
 
 from __future__ import annotations
@@ -82,16 +83,18 @@ def classify_samples(
     groups = np.unique(np.concatenate([np.asarray(side, str) for side in places]), return_inverse=True)[1]
     features = fill_missing(np.concatenate([real, generated]), len(real))
     is_generated = np.repeat([0, 1], [len(real), len(generated)])
-    score = np.empty(len(features))
+    score, fold = np.empty(len(features)), np.empty(len(features), int)
     folds = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=seed)
-    for train, test in folds.split(features, is_generated, groups):
-        trees = ExtraTreesClassifier(TREES, min_samples_leaf=MIN_LEAF, random_state=seed, n_jobs=1)
+    for number, (train, test) in enumerate(folds.split(features, is_generated, groups)):
+        trees = ExtraTreesClassifier(
+            TREES, min_samples_leaf=MIN_LEAF, class_weight="balanced", random_state=seed, n_jobs=1
+        )
         trees.fit(features[train], is_generated[train])
-        score[test] = np.asarray(trees.predict_proba(features[test]))[:, 1]
+        fold[test], score[test] = number, np.asarray(trees.predict_proba(features[test]))[:, 1]
     alone = {name: compute_auc(*_keep_known(real[:, k], generated[:, k])) for k, name in enumerate(names)}
     telling = sorted(alone, key=lambda name: -abs(alone[name] - 0.5))[:SHOWN]
     return TwoSampleTest(
-        estimate_auc(score[: len(real)], score[len(real) :]), {name: round(alone[name], 4) for name in telling}
+        estimate_auc(score, is_generated, groups, fold), {name: round(alone[name], 4) for name in telling}
     )
 
 
@@ -134,21 +137,50 @@ def compute_auc(real: np.ndarray, generated: np.ndarray) -> float:
     return float((ranks[n:].sum() - m * (m + 1) / 2) / (n * m))
 
 
-def estimate_auc(real: np.ndarray, generated: np.ndarray) -> Estimate:
-    """Estimate the AUC with the 95 % interval of DeLong et al. (1988).
+def estimate_auc(
+    score: np.ndarray, is_generated: np.ndarray, groups: np.ndarray | None = None, fold: np.ndarray | None = None
+) -> Estimate:
+    """Estimate the AUC of cross-validated scores.
+
+    Scores are compared only within a fold, because the classifiers of different folds have different thresholds. The
+    interval is that of DeLong et al. (1988) for independent samples, with the extension of Obuchowski (1997) to groups:
+    scenes of one group count as dependent.
 
     Args:
-        real: (n,) scores of real scenes.
-        generated: (m,) scores of generated scenes.
+        score: (n,) scores.
+        is_generated: (n,) 0 for real scenes, 1 for generated scenes.
+        groups: (n,) group of each scene; None: each scene is a group.
+        fold: (n,) fold of each scene; None: one fold.
 
     Returns:
-        AUC and interval, clipped to [0, 1].
+        AUC and its 95 % interval, clipped to [0, 1].
+
+    Raises:
+        ValueError: No fold has scenes of both sides.
     """
-    n, m = len(real), len(generated)
-    ranks = rankdata(np.concatenate([real, generated]))
-    # Placements: for each scene, the share of the scenes of the other side that have a smaller score.
-    of_real = (ranks[:n] - rankdata(real)) / m
-    of_generated = (ranks[n:] - rankdata(generated)) / n
-    value = float(of_generated.mean())
-    margin = NORMAL_975 * np.sqrt(of_real.var(ddof=1) / n + of_generated.var(ddof=1) / m)
-    return Estimate(value, float(max(value - margin, 0)), float(min(value + margin, 1)))
+    groups = np.arange(len(score)) if groups is None else groups
+    fold = np.zeros(len(score), int) if fold is None else fold
+    placement, weight = np.zeros(len(score)), np.zeros(len(score))
+    pairs = 0
+    for number in np.unique(fold):
+        sides = [np.flatnonzero((fold == number) & (is_generated == side)) for side in (0, 1)]
+        n, m = map(len, sides)
+        if not n or not m:
+            continue
+        ranks = rankdata(score[np.concatenate(sides)])
+        # The placement is the share of pairs with the other side in which the generated scene has the larger score.
+        placement[sides[0]] = 1 - (ranks[:n] - rankdata(score[sides[0]])) / m
+        placement[sides[1]] = (ranks[n:] - rankdata(score[sides[1]])) / n
+        weight[sides[0]], weight[sides[1]] = m, n  # Number of pairs of each scene.
+        pairs += n * m
+    if not pairs:
+        raise ValueError("no fold has both real and generated scenes; give scenes of more places")
+    value = float((weight * placement)[is_generated == 1].sum() / pairs)
+    variance = 0.0
+    for side in (0, 1):
+        here = (is_generated == side) & (weight > 0)
+        _, index = np.unique(groups[here], return_inverse=True)
+        sums = np.bincount(index, (weight * (placement - value))[here]) / pairs
+        variance += (sums**2).sum() * len(sums) / max(len(sums) - 1, 1)
+    margin = NORMAL_975 * variance**0.5
+    return Estimate(value, max(value - margin, 0.0), min(value + margin, 1.0))

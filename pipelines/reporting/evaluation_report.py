@@ -63,7 +63,7 @@ MEANINGS = {
     "layout_mmd": "kernel distance of object counts, object sizes and ground areas; equal sources have 0",
     "two_sample_auc": (
 "area under the ROC curve of a classifier that separates generated and real scenes by relations and layout; 0.5 is"
-" perfect"
+" perfect, and lower values occur by chance if there are few places"
 ),
     "relation_frechet": (
 "Frechet distance of relations: positions and directions relative to the road, to neighbours and to supports, and the"

@@ -10,11 +10,23 @@ from helpers import kill_ray_workers
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.evaluate_scenes import evaluate
-from pipelines.evaluation.evaluate import compare_datasets, compute_memorisation
+from models.scene import Scene
+from pipelines.evaluation.evaluate import (
+    compare_datasets,
+    compute_memorisation,
+    compute_set_scores,
+    find_sensitive_scores,
+    is_sensitive,
+)
 from pipelines.evaluation.features import FeatureConfig, compute_scene_features, load_scenes
 from pipelines.metrics.adm_npz import write_npz
+from pipelines.metrics.controls import CONTROLS, damage_scene
 from pipelines.metrics.inception import Inception
 from pipelines.metrics.intervals import Estimate
+from pipelines.metrics.relations import compute_scene_relations
+from pipelines.metrics.statistics import compute_layout_statistics
+from pipelines.metrics.validity import SLAB_OFFSET_M
+from pipelines.preprocess.sources.town.generator import generate_town
 from pipelines.rendering.render import render_bev
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
@@ -79,7 +91,82 @@ def test_scene_features_are_unchanged_by_worker_kill(smoke, tmp_path):
 
     again = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "killed"), on_scenes=kill)
     assert len(killed) == 1 and whole.keys() == again.keys()
-    assert all(np.array_equal(whole[name], again[name], equal_nan=name == "statistics") for name in whole)
+    assert all(
+        np.array_equal(whole[name], again[name], equal_nan=name in ("statistics", "relations")) for name in whole
+    )
+
+
+def test_evaluate_scores_ceiling_and_controls(smoke, tmp_path):
+    data = str(smoke / "datasets/smoke")
+    options = {"real": data, "generated": data, "generated_split": "test", "balance_labels": False, "num_actors": 1}
+    config = Config(controls=True, peers=(data,), output=str(tmp_path / "out"), **options)
+    scores = evaluate(config)["generation"]
+    assert list(scores["sets"]) == ["ceiling", *CONTROLS]
+    names = set(scores["sets"]["ceiling"])
+    assert {"relation_frechet", "layout_frechet", "random_coverage_k3", "validity.overlapping"} <= names
+    assert all(set(values) <= names for values in scores["sets"].values())
+    assert set(scores["sensitive"]) == names and {c for found in scores["sensitive"].values() for c in found} <= set(
+        CONTROLS
+    )
+    assert scores["sets"]["dropped"]["layout_frechet"] != scores["sets"]["ceiling"]["layout_frechet"]
+    assert scores["sets"]["moved"]["layout_frechet"] == scores["sets"]["ceiling"]["layout_frechet"]
+    assert scores["peers"]["smoke"]["road_connectivity"]["value"] > 0
+    page = (tmp_path / "out/evaluation.html").read_text()
+    for words in (
+        "Scores of damaged scenes",
+        "other real scenes (ceiling)",
+        "Validity by category",
+        "deviation",
+        "smoke",
+    ):
+        assert words in page
+    halves = evaluate(Config(ceiling_split="halves", output=str(tmp_path / "halves"), **options))["generation"]
+    assert list(halves["sets"]) == ["ceiling"] and 2 <= halves["scenes"]["real"] < scores["scenes"]["real"] * 2
+    with pytest.raises(ValueError, match="no real scenes for the ceiling \\(--ceiling-split nowhere\\)"):
+        evaluate(Config(ceiling_split="nowhere", output=str(tmp_path / "x"), **options))
+
+
+def test_headline_scores_notice_every_control():
+    """Of the headline scores without pictures, at least one notices each control; layout statistics do not."""
+
+    def sample_scenes(seed: int) -> list[list[Scene]]:
+        drives = [generate_town(100 * seed + k) for k in range(8)]
+        return [[drive.scene(int(n), "test") for n in np.linspace(0, len(drive) - 1, 10)] for drive in drives]
+
+    def describe(drives: list[list[Scene]], control: str = "") -> dict[str, np.ndarray]:
+        rows, places = [], []
+        for k, scenes in enumerate(drives):
+            if control:
+                scenes = [damage_scene(control, s, scenes[i - 5], (k, i)) for i, s in enumerate(scenes)]
+            rows += [(compute_layout_statistics(s), compute_scene_relations(s, SLAB_OFFSET_M).vector) for s in scenes]
+            places += [f"town/{id(drives)}-{k}/0/0"] * len(scenes)
+        statistics, relations = map(np.stack, zip(*rows, strict=True))
+        return {"scene_id": np.arange(80), "place": np.array(places), "statistics": statistics, "relations": relations}
+
+    real, other = describe(sample_scenes(1)), sample_scenes(2)
+    classes = [str(k) for k in range(real["statistics"].shape[1] - 44)]
+    sets = {
+        name: compute_set_scores(real, describe(other, name.replace("ceiling", "")), classes)
+        for name in ("ceiling", *CONTROLS)
+    }
+    names = ("two_sample_auc", "relation_frechet", "layout_frechet")
+    found = find_sensitive_scores({name: {n: scores[n] for n in names} for name, scores in sets.items()})
+    assert set(found["two_sample_auc"]) >= set(CONTROLS) - {"dropped"}
+    assert set(found["relation_frechet"]) | set(found["two_sample_auc"]) == set(CONTROLS)
+    assert not {"moved", "turned", "permuted", "ground_roughened"} & set(found["layout_frechet"])
+    auc = sets["ceiling"]["two_sample_auc"]
+    assert auc.low < 0.5
+
+
+def test_sensitivity_needs_worse_value_and_disjoint_intervals():
+    ceiling = Estimate(0.5, 0.45, 0.55)
+    assert is_sensitive("two_sample_auc", Estimate(0.7, 0.6, 0.8), ceiling)
+    assert not is_sensitive("two_sample_auc", Estimate(0.3, 0.2, 0.4), ceiling)
+    assert not is_sensitive("two_sample_auc", Estimate(0.6, 0.54, 0.66), ceiling)
+    assert is_sensitive("random_frechet", Estimate(0.7, 0.6, 0.8), ceiling)
+    assert not is_sensitive("random_frechet", Estimate(0.3, 0.2, 0.4), ceiling)  # better, not worse
+    assert is_sensitive("lite0_coverage_k3", Estimate(0.3, 0.2, 0.4), ceiling)
+    assert not is_sensitive("precision_k3", Estimate(0.7, 0.6, 0.8), ceiling)
 
 
 def compare_features(real: np.ndarray, generated: np.ndarray) -> dict:

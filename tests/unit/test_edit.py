@@ -290,15 +290,18 @@ def test_repair_fixes_disturbed_town_and_keeps_valid_objects(town_scenes):
         mended, (done,) = replay_edits(disturbed, [edit.Repair(ALL)])
         before, after = (compute_validity_rates(compute_scene_validity(s, SLAB_OFFSET_M)) for s in (disturbed, mended))
         assert before["floating"] + before["sunken"] > 0.05 and after["floating"] == after["sunken"] == 0
-        assert after["overlapping"] == 0
-        overlapping.append(before["overlapping"])
-        wrong = np.any([bad for bad, _ in list(find_faults(disturbed, SLAB_OFFSET_M).values())[:3]], axis=0)
+        assert after["overlapping_iou3d"] == 0
+        # Repair does not optimise this measure: objects inside others may remain.
+        overlapping.append((before["overlapping"], after["overlapping"]))
+        faults = ("overlapping_iou3d", "floating", "sunken")
+        wrong = np.any([bad for bad, _ in find_faults(disturbed, SLAB_OFFSET_M, names=faults).values()], axis=0)
         partners = (compute_iou3d_matrix(extract_boxes(disturbed), extract_boxes(disturbed)) > 0.05)[wrong].any(axis=0)
         assert set(done.primitive) <= set(
             np.flatnonzero(wrong | partners)
         )  # repair changes only faulty primitives and their partners
         assert (done.change == "removed").mean() < 0.5
-    assert np.mean(overlapping) > 0.02
+    before, after = np.mean(overlapping, axis=0)
+    assert 0.02 < after < before
 
 
 # ----------------------------------------------------------------------------------------------------- edit lists

@@ -327,7 +327,7 @@ def count_unit_meshes(path) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", ["generated_low_0", "high_121", "low_12", "medium_240"])
-def test_files_of_the_authors_give_the_count_of_their_unit_meshes(real_data, name):
+def test_files_of_the_authors_give_count_of_unit_meshes(real_data, name):
     path = real_data / "glb" / f"{name}.glb"
     scene = import_glb(path)
     assert dict(zip(CATEGORIES, scene.counts().tolist(), strict=True)) == count_unit_meshes(path)

@@ -176,7 +176,7 @@ def test_relations_notice_what_layout_statistics_do_not():
     assert get_relation(scene, "vehicle_small.gap_m", slab_offset_m=0.3) == pytest.approx(0.3)
 
 
-def test_relations_are_undefined_not_zero_without_objects_or_road():
+def test_relations_are_undefined_without_objects_or_road():
     empty = make_street_scene()
     vector, histograms = compute_scene_relations(empty, 0.0)
     assert len(vector) == len(RELATIONS) and len(histograms) == sum(map(len, RELATION_HISTOGRAMS))

@@ -21,16 +21,36 @@ def test_auc_equals_scikit_learn_with_ties():
     for _ in range(5):
         real, generated = rng.integers(0, 8, 60).astype(float), rng.integers(2, 9, 40).astype(float)
         want = roc_auc_score(np.repeat([0, 1], [60, 40]), np.concatenate([real, generated]))
-        assert compute_auc(real, generated) == pytest.approx(want) == estimate_auc(real, generated).value
+        assert compute_auc(real, generated) == pytest.approx(want)
+        assert estimate_auc(np.concatenate([real, generated]), np.repeat([0, 1], [60, 40])).value == pytest.approx(want)
 
 
 def test_interval_contains_the_true_auc_in_95_percent_of_samples():
     rng, true = np.random.default_rng(1), 0.7602499  # Phi(1 / sqrt 2), for a shift of one standard deviation
     covered = 0
     for _ in range(400):
-        found = estimate_auc(rng.normal(size=80), rng.normal(size=60) + 1)
+        found = estimate_auc(rng.normal(size=140) + np.repeat([0, 1], [80, 60]), np.repeat([0, 1], [80, 60]))
         covered += found.low <= true <= found.high
     assert 0.92 <= covered / 400 <= 0.98
+
+
+def test_interval_of_grouped_scenes_contains_the_true_auc():
+    """Scenes of a drive are alike; an interval that took them as independent would be far too narrow."""
+    rng, side = np.random.default_rng(2), np.repeat([0, 1], [200, 200])
+    groups, covered = np.repeat(np.arange(40), 10), np.zeros(2)
+    for _ in range(300):
+        score = rng.normal(size=40)[groups] + 0.3 * rng.normal(size=400)
+        for k, found in enumerate((estimate_auc(score, side, groups), estimate_auc(score, side))):
+            covered[k] += found.low <= 0.5 <= found.high
+    assert 0.9 <= covered[0] / 300 <= 0.98 and covered[1] / 300 < 0.7
+
+
+def test_scores_are_compared_only_within_a_fold():
+    side, fold = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
+    assert estimate_auc(np.array([0.1, 0.2, 0.8, 0.9]), side, fold=fold).value == 1
+    assert estimate_auc(np.array([0.1, 0.2, 0.8, 0.9]), side).value == 0.75
+    with pytest.raises(ValueError, match="no fold has both"):
+        estimate_auc(np.zeros(4), np.array([0, 0, 1, 1]), fold=fold)
 
 
 def test_equal_sides_are_not_told_apart_and_a_shift_is_named():
@@ -50,7 +70,7 @@ def test_missing_values_give_a_side_away():
     assert again.auc.low < 0.5 < again.auc.high
 
 
-def test_scenes_of_a_place_are_not_split_between_training_and_test():
+def test_scenes_of_a_place_stay_in_one_fold():
     """Each place has its own look. If a place were split, the classifier would recognise it."""
     rng = np.random.default_rng(3)
     looks = rng.normal(scale=5, size=(20, len(NAMES)))

@@ -107,7 +107,7 @@ def test_block_grid_fronts_are_independent():
         endless.indices()
 
 
-def test_outpainting_of_the_paper_neither_blends_nor_removes_copies(truth):
+def test_paper_outpainting_does_not_blend_or_remove_copies(truth):
     scene = crop_truth(truth, (0, 0))
     new = np.zeros(scene.occupied.shape[1:], bool)
     new[: len(new) // 2] = True

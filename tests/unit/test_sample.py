@@ -21,7 +21,7 @@ def test_sampler_repairs_sampled_scenes(tmp_path):
         made = list(read_scenes(str(tmp_path), source=one.source))
         found = [find_faults(scene, SLAB_OFFSET_M) for scene in made]
         scenes.append(made)
-        number.append([sum(f[name][0].sum() for f in found) for name in ("overlapping", "floating", "sunken")])
+        number.append([sum(f[name][0].sum() for f in found) for name in ("overlapping_iou3d", "floating", "sunken")])
     for before, after in zip(*scenes, strict=True):
         assert np.array_equal(before.category, after.category)
     (overlapping, floating, sunken), after = number
