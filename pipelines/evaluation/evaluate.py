@@ -49,8 +49,6 @@ from pipelines.metrics.two_sample import FOLDS, MIN_SCENES, classify_samples
 Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
 RELATION_LIMIT = 5.0  # Standardised relation statistics are clipped to this value; rare categories have outliers.
-# Scores that are read first. At least two of them must notice each control.
-HEADLINES = ("two_sample_auc", "relation_frechet", "lite0_frechet", "lite0_coverage_k3")
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
 MEMORISED_QUANTILE = 0.01  # Quantile of the distances from real scenes to their nearest other real scene.
 
@@ -233,19 +231,6 @@ def find_sensitive_scores(sets: Mapping[str, Mapping[str, Estimate]]) -> dict[st
         score: [name for name in names if score in sets[name] and is_sensitive(score, sets[name][score], value)]
         for score, value in ceiling.items()
     }
-
-
-def list_headlines(scores: Mapping[str, Any]) -> list[str]:
-    """Return the headline scores; without EfficientNet-Lite0, those of the untrained network take their places.
-
-    Args:
-        scores: Scores of a set.
-
-    Returns:
-        Names of HEADLINES that exist in `scores`.
-    """
-    names = (name if name in scores else name.replace("lite0_", "random_") for name in HEADLINES)
-    return [name for name in names if name in scores]
 
 
 # ----------------------------------------------------------------------------------------------------- features

@@ -7,7 +7,7 @@ ground and keep the objects. Scene id, density labels, pose and grid of a scene 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,8 @@ GROUND_SHIFT_M = 4.0
 ROUGH_AMPLITUDE_M, ROUGH_PERIOD_M = 0.5, 2.0
 INSET_M = 0.01  # Minimum distance of a clipped centre from the border of the grid.
 
+# Scores that are read first. At least two of them must notice each control.
+HEADLINES = ("two_sample_auc", "relation_frechet", "lite0_frechet", "lite0_coverage_k3")
 # Descriptions of the controls for reports.
 CONTROLS = {
     "moved": "each object moves horizontally by up to 4 m and keeps its height above ground",
@@ -188,3 +190,16 @@ def _raise_objects(scene: Scene, ground_m: np.ndarray) -> Scene:
     center_m = scene.center_m.copy()
     center_m[:, 2] += np.nan_to_num(scene.ground_under()[0] - ground_m)
     return replace(scene, center_m=center_m)
+
+
+def list_headline_scores(scores: Mapping[str, object]) -> list[str]:
+    """Return the headline scores; without EfficientNet-Lite0, those of the untrained network take their places.
+
+    Args:
+        scores: Scores of a set.
+
+    Returns:
+        Names of HEADLINES that exist in `scores`.
+    """
+    names = (name if name in scores else name.replace("lite0_", "random_") for name in HEADLINES)
+    return [name for name in names if name in scores]

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from models.tensors import EXISTENCE_THRESHOLD
-from pipelines.reporting.chart import Chart
+from pipelines.metrics.controls import CONTROLS, list_headline_scores
+from pipelines.reporting.chart import Chart, format_number
 from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
 
 HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; other parts of the card contain them.
@@ -138,12 +139,34 @@ class ModelCard:
             f"## Scores\n\nThe table compares {sides['generated']:,} generated scenes with {sides['real']:,} real "
             f"scenes of split {self.real_split}. The table also contains scores of the layout VAE, "
             f"which reconstructed {self.scores['reconstruction']['scenes']:,} scenes. "
-            "Brackets contain 95 % intervals over scenes. `metrics.json` contains all scores, and "
-            "docs/concepts/evaluation.md explains them.\n"
+            "Brackets contain 95 % intervals over scenes. The ceiling is the score of the same number of other real "
+            "scenes. `metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
         )
-        yield from render_table(
-            ("score", "value"), ((name, format_value(value)) for name, value in list_headlines(self.scores))
+        ceiling = generation.get("sets", {}).get("ceiling", {})
+        rows = [
+            (name, format_value(value), format_value(ceiling.get(name.removeprefix("generation."))) or "–")
+            for name, value in list_headlines(self.scores)
+            if not name.endswith(".real")
+        ]
+        yield from render_table(("score", "value", "other real scenes (ceiling)"), rows)
+        yield from self._controls()
+
+    def _controls(self) -> Iterator[str]:
+        """Yield the headline scores of other real scenes, of generated scenes and of damaged scenes."""
+        generation = self.scores["generation"]
+        if "sensitive" not in generation:
+            return
+        sets, sensitive = generation["sets"], generation["sensitive"]
+        names = list_headline_scores(sets["ceiling"])
+        yield (
+            "The next table shows whether the scores notice damage. A star marks damaged real scenes that score worse "
+            "than other real scenes, with disjoint 95 % intervals.\n"
         )
+        rows = []
+        for label, values in (("generated", generation), *sets.items()):
+            cells = [f"{format_number(values[n]['value'])}{' *' if label in sensitive[n] else ''}" for n in names]
+            rows.append((CONTROLS.get(label, {"ceiling": "other real scenes"}.get(label, label)), *cells))
+        yield from render_table(("scenes", *(name.replace("_", " ") for name in names)), rows)
 
     def _limits(self) -> Iterator[str]:
         validity = self.scores["generation"]["validity"]
