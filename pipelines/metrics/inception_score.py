@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from pipelines.metrics.frechet import check_features
@@ -11,10 +13,11 @@ SPLIT_SAMPLES = 5000  # Samples per split, as in ADM's evaluator.
 
 
 def compute_inception_score(logits: np.ndarray) -> Estimate:
-    """Compute the exponential of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples (ADM).
+    """Compute the exponential of the mean KL(p(y|x) || p(y)), averaged over consecutive splits of 5000 samples.
 
-    The mean divergence is the entropy of the mean distribution minus the mean entropy. Let w be the weights of a
-    resample. The score of the resample therefore needs only two products: w with p, and w with the entropies.
+    The splits follow ADM's evaluator, which the paper uses: Evaluator.compute_inception_score in
+    evaluations/evaluator.py of openai/guided-diffusion (commit 22e0df8), with split_size=5000. The last split may be
+    shorter and has the same weight.
 
     Args:
         logits: (n, classes) logits pool3 @ W **without bias**, as in ADM.
@@ -25,16 +28,49 @@ def compute_inception_score(logits: np.ndarray) -> Estimate:
     Raises:
         ValueError: The logits are empty, are not 2-d or are not finite.
     """
-    logits = check_features(logits, "logit", at_least=1).astype(np.float64)
-    logits -= logits.max(axis=1, keepdims=True)
-    log_p = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
-    scores = []
-    for start in range(0, len(log_p), SPLIT_SAMPLES):
-        part = log_p[start : start + SPLIT_SAMPLES]
-        p = np.exp(part)
-        drawn = compute_weights(len(p), key=start)
-        scores.append(np.exp(compute_entropy(drawn @ p) - drawn @ compute_entropy(p)))
+    logits = check_features(logits, "logit", at_least=1)
+    return compute_streamed_inception_score([logits])
+
+
+def compute_streamed_inception_score(parts: Iterable[np.ndarray]) -> Estimate:
+    """Compute the Inception score of logits that arrive in parts, with one split of 5000 samples in memory.
+
+    Args:
+        parts: Logits (n, classes) of consecutive samples; the sizes of the parts do not change the score.
+
+    Returns:
+        Score with its 95 % interval.
+
+    Raises:
+        ValueError: There are no logits, or they are not 2-d or not finite.
+    """
+    scores, waiting, count = [], [], 0
+    for part in parts:
+        part = check_features(part, "logit", at_least=0)
+        while len(part):
+            taken, part = np.split(part, [SPLIT_SAMPLES - count])
+            waiting, count = [*waiting, taken], count + len(taken)
+            if count == SPLIT_SAMPLES:
+                scores.append(_score_split(np.concatenate(waiting), len(scores) * SPLIT_SAMPLES))
+                waiting, count = [], 0
+    if waiting:
+        scores.append(_score_split(np.concatenate(waiting), len(scores) * SPLIT_SAMPLES))
+    if not scores:
+        raise ValueError("logit features hold 0 samples, at least 1 are needed")
     return make_estimate(np.mean(scores, axis=0))
+
+
+def _score_split(logits: np.ndarray, key: int) -> np.ndarray:
+    """Return the score of one split and of its resamples.
+
+    The mean divergence is the entropy of the mean distribution minus the mean entropy. Let w be the weights of a
+    resample. The score of the resample therefore needs only two products: w with p, and w with the entropies.
+    """
+    logits = logits.astype(np.float64)
+    logits -= logits.max(axis=1, keepdims=True)
+    p = np.exp(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
+    drawn = compute_weights(len(p), key)
+    return np.exp(compute_entropy(drawn @ p) - drawn @ compute_entropy(p))
 
 
 def compute_entropy(p: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ scenes and the key.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,11 +42,24 @@ def draw_resamples(count: int, key: int = 0) -> np.ndarray:
         (1 + DRAWS, count) float64, how often each scene is sampled. Row 0 contains only ones. Each
         other row is one draw.
     """
+    return np.stack(list(iterate_resamples(count, key)))
+
+
+def iterate_resamples(count: int, key: int = 0) -> Iterator[np.ndarray]:
+    """Yield the rows of `draw_resamples` one at a time, for sets of which all draws do not fit in memory.
+
+    Args:
+        count: Number of scenes.
+        key: Part of the random seed.
+
+    Yields:
+        (count,) float64, how often each scene is sampled; 1 + DRAWS arrays.
+    """
     random = np.random.default_rng([count, key])
-    picked = random.integers(count, size=(DRAWS, count), dtype=np.int64)
-    picked += count * np.arange(DRAWS)[:, None]
-    drawn = np.bincount(picked.ravel(), minlength=DRAWS * count).reshape(DRAWS, count)
-    return np.vstack([np.ones((1, count)), drawn])
+    yield np.ones(count)
+    for _ in range(DRAWS):
+        picked = random.integers(count, size=count, dtype=np.int64)
+        yield np.bincount(picked, minlength=count).astype(np.float64)
 
 
 def compute_weights(count: int, key: int = 0) -> np.ndarray:
@@ -123,5 +136,7 @@ def estimate_from_influence(value: float, influences: Sequence[np.ndarray]) -> E
     Returns:
         Score with its 95 % interval.
     """
-    shifts = sum(compute_weights(len(part), key) @ part for key, part in enumerate(influences))
-    return make_estimate(np.asarray(value + shifts))
+    shifts = np.zeros(1 + DRAWS)
+    for key, part in enumerate(influences):
+        shifts += [row @ part / len(part) for row in iterate_resamples(len(part), key)]
+    return make_estimate(value + shifts)
