@@ -6,6 +6,9 @@
     jobs/evaluate_scenes.py --real DIR --generated DIR --inception weights-inception-2015-12-05-6726825d.pth
     jobs/evaluate_scenes.py --real DIR --generated DIR --max-scenes 10000 --reference min-distance --min-distance-m 10
     jobs/evaluate_scenes.py --real DIR --generated samples.npz --inception FILE
+    jobs/evaluate_scenes.py --real DIR --generated DIR --inception FILE --protocol paper-pr
+    jobs/evaluate_scenes.py --real DIR --generated DIR --inception FILE --protocol paper-fid
+    jobs/evaluate_scenes.py --real DIR --generated DIR --inception FILE --protocol pdd --reference min-distance
     jobs/evaluate_scenes.py --real DIR --lvae MODEL
 
 The job reads only the scene tables. If --lvae is given and none of --generated, --run and --generated-source is given,
@@ -17,6 +20,11 @@ compares N real scenes with N generated scenes. Each label has the same share of
 Every score stands next to its ceiling: the same score of N other real scenes. With --controls, the job also scores
 damaged copies of these scenes: objects moved, turned, permuted, dropped, duplicated or from another scene, and ground
 shifted or roughened. A score is worth reading for a fault if it rates the damaged scenes worse than the ceiling.
+
+A protocol sets the options that it fixes. It is an error to give another value for such an option. paper-pr compares
+1,000 farthest training poses with 1,000 generated scenes (k = 3). paper-fid compares all training scenes with as many
+generated scenes, by FID, sFID and IS only, and reads the features part by part. pdd compares at most 50,000 generated
+scenes with training poses, and drops white pictures and pictures with a black pixel on both sides.
 
 The job writes metrics.json, metrics.parquet and evaluation.html, and logs all results to MLflow. With --lvae, the job
 also writes reconstruction.html (the best and the worst scenes) and reconstruction.parquet (one row per scene). FID,
@@ -48,11 +56,14 @@ class Config:
     """Read only generated scenes of source generated-<run> (default: all sources)."""
     generated_source: str = ""
     """Read only generated scenes of this source, such as edited-<run> or imported-<name> (default: all sources)."""
-    max_scenes: int = 1000
-    """Maximum number of real and of generated scenes; both numbers are equal. The paper uses 1000, 5000 and 10000."""
-    reference: Literal["farthest-point", "min-distance", "uniform"] = "farthest-point"
+    protocol: Literal["", "paper-pr", "paper-fid", "pdd"] = ""
+    """Protocol that fixes the selection of scenes and the scores (default: none, the other options decide)."""
+    max_scenes: int | None = None
+    """Maximum number of real and of generated scenes; both numbers are equal. The paper uses 1000, 5000 and 10000
+    (default: 1000)."""
+    reference: Literal["farthest-point", "min-distance", "uniform"] | None = None
     """Rule that selects the real scenes: farthest point sampling of poses, a minimum distance of poses, or even
-    spacing."""
+    spacing (default: farthest-point)."""
     min_distance_m: float = 10.0
     """Minimum distance of poses in metres for --reference min-distance."""
     balance_labels: bool = True
@@ -67,12 +78,15 @@ class Config:
     none)."""
     lite0: bool | None = None
     """Use the features of EfficientNet-Lite0 (default: if the extra lite0 is installed)."""
-    k: tuple[int, ...] = (3,)
-    """Numbers of nearest neighbours for precision, recall, density and coverage."""
+    k: tuple[int, ...] = ()
+    """Numbers of nearest neighbours for precision, recall, density and coverage (default: 3)."""
     supersample: int = 1
     """Supersampling factor N: each pixel of a picture is the mean of N x N samples."""
     inception: str = ""
     """File of Inception weights for FID, sFID, KID, IS, precision and recall (default: none)."""
+    vgg16: str = ""
+    """File of VGG16 weights for the paper's analysis of memorisation, such as torchvision's vgg16-397923af.pth
+    (default: none, distances to the nearest real scene use other features and are named nearest_distance)."""
     lvae: str = ""
     """Also evaluate the reconstruction of real scenes by this layout VAE (default: none)."""
     lvae_split: str = "test"

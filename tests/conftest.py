@@ -62,7 +62,13 @@ MARKERS = {
     "faults": ("ray", "faults"),
     "browser": ("ray", "browser"),
 }  # folder -> markers of its tests
-SMOKE_MODULES = {"test_evaluate_job", "test_generation_jobs", "test_publish_job", "test_voxel_import_job"}
+SMOKE_MODULES = {
+    "test_evaluate_job",
+    "test_generation_jobs",
+    "test_protocol_job",
+    "test_publish_job",
+    "test_voxel_import_job",
+}
 SLOW_MODULES = ("test_faults", "test_train_jobs", "test_commands", "test_ablation_job", "test_preprocess_job")
 
 

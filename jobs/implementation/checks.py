@@ -17,6 +17,7 @@ from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, require_model_labels
+from jobs.support.protocols import apply_protocol
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset
@@ -131,14 +132,19 @@ def check_outpaint_scenes(config: OutpaintConfig) -> None:
 
 
 def check_evaluate_scenes(config: EvaluateConfig) -> None:
+    apply_protocol(config)
     for name, least in (("num_examples", 0), ("max_scenes", 2), ("supersample", 1)):
-        if (value := getattr(config, name)) < least:
+        if (value := getattr(config, name)) is not None and value < least:
             raise ValueError(f"--{name.replace('_', '-')} is {value}, expected {least} or more")
     if config.max_reconstructed_scenes is not None and not config.lvae:
         raise ValueError("--max-reconstructed-scenes needs --lvae; --max-scenes limits the generated scenes")
     if config.inception and not storage.exists(make_absolute(config.inception)):
         raise ValueError(
             f"--inception {config.inception}: no such file; docs/concepts/evaluation.md describes how to obtain it"
+        )
+    if config.vgg16 and not storage.exists(make_absolute(config.vgg16)):
+        raise ValueError(
+            f"--vgg16 {config.vgg16}: no such file; docs/concepts/evaluation.md describes how to obtain it"
         )
     if config.lvae and not storage.exists(storage.join_uri(make_absolute(config.lvae), "config.json")):
         raise ValueError(f"--lvae {config.lvae}: no layout VAE here; run jobs/train_lvae.py first")

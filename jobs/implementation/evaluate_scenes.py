@@ -13,25 +13,37 @@ from rich.table import Table
 from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
 from jobs.support.cli import home_path, make_absolute, resolve_path
+from jobs.support.protocols import PROTOCOLS, apply_protocol
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
 from pipelines.evaluation.evaluate import (
     compare_datasets,
-    compute_memorisation,
     convert_estimates,
     find_sensitive_scores,
     rate_validity,
+    score_nearest_distances,
     score_sets,
 )
-from pipelines.evaluation.example_images import select_shown_images
-from pipelines.evaluation.features import FeatureConfig, ImageFile, SceneSet, compute_scene_features
+from pipelines.evaluation.example_images import select_even_images, select_shown_images
+from pipelines.evaluation.features import (
+    FeatureConfig,
+    FeatureParts,
+    ImageFile,
+    SceneSet,
+    compute_scene_features,
+    drop_blank,
+    write_scene_features,
+)
 from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
+from pipelines.evaluation.streamed import compare_streamed
 from pipelines.metrics.adm_npz import read_picture_shape, read_reference_moments
 from pipelines.metrics.controls import CONTROLS
 from pipelines.metrics.inception import describe_weights
+from pipelines.metrics.inception_score import compute_streamed_inception_score
 from pipelines.metrics.lite0 import convert_lite0_weights, describe_lite0
-from pipelines.reporting.evaluation_report import format_value, list_headlines, render_evaluation_html
+from pipelines.metrics.vgg16 import describe_vgg16
+from pipelines.reporting.evaluation_report import ExamplePictures, format_value, list_headlines, render_evaluation_html
 from pipelines.reporting.reconstruction_report import render_reconstruction_html
 from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
@@ -45,6 +57,7 @@ HALVES = {"real": "first", "ceiling": "second"}
 def evaluate(config: Config) -> dict:
     """Evaluate, write all files, and return the nested metrics of metrics.json."""
     check_evaluate_scenes(config)
+    config = apply_protocol(config)
     dataset: Dataset | None = None
     if config.lvae or not config.real.endswith(".npz"):
         dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
@@ -58,11 +71,14 @@ def evaluate(config: Config) -> dict:
         if config.lvae and dataset is not None:
             scores["reconstruction"] = score_reconstruction(config, dataset, output, bar)
         if wanted:
-            scores["generation"] = evaluate_generation(config, dataset, sides, output, bar)
+            is_streamed = bool(config.protocol) and PROTOCOLS[config.protocol].is_streamed
+            evaluate_sides = evaluate_streamed if is_streamed else evaluate_generation
+            scores["generation"] = evaluate_sides(config, dataset, sides, output, bar)
     storage.write_json(describe_inputs(config, dataset, sides), storage.join_uri(output, "evaluation.json"))
     tags = {
         "real": config.real or home_path("datasets", "town"),
         "split": config.real_split,
+        "protocol": config.protocol,
         "generated": wanted,
         "lvae": config.lvae and make_absolute(config.lvae),
     }
@@ -91,10 +107,16 @@ def evaluate_generation(
     config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
 ) -> dict:
     """Score generated scenes, write evaluation.html, and write the features of each scene to described/."""
+    drops_blank = bool(config.protocol) and PROTOCOLS[config.protocol].drops_blank
     looks = FeatureConfig(
-        config.supersample, config.inception and make_absolute(config.inception), prepare_lite0(config)
+        config.supersample,
+        config.inception and make_absolute(config.inception),
+        prepare_lite0(config),
+        vgg16=config.vgg16 and make_absolute(config.vgg16),
+        blank=drops_blank,
     )
     described: dict[str, dict[str, np.ndarray]] = {}
+    dropped: dict[str, int] = {}
 
     def describe(name: str, side: SceneSet, how: FeatureConfig) -> None:
         task = bar.add_task(f"describe {name}", total=side.limit)
@@ -102,6 +124,13 @@ def evaluate_generation(
         described[name] = compute_scene_features(
             side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
         )
+        if drops_blank:
+            described[name], dropped[name] = drop_blank(described[name])
+            if (left := len(described[name]["row"])) < 2:
+                raise ValueError(
+                    f"--protocol {config.protocol} drops {dropped[name]} of {dropped[name] + left} pictures of"
+                    f" {side.root} ({name}), because they are white or contain a black pixel; at least 2 are needed"
+                )
 
     for name, side in sides.items():
         describe(name, side, looks)
@@ -119,10 +148,8 @@ def evaluate_generation(
         if config.controls:
             scores["sensitive"] = find_sensitive_scores(scores["sets"])
     bar.advance(task)
-    features = next(name for name in ("pool3", "lite0", "random") if name in described["real"])
-    found = compute_memorisation(described["real"][features], described["generated"][features])
-    shown_name = {"pool3": "Inception pool3", "lite0": "EfficientNet-Lite0", "random": "untrained"}[features]
-    scores["memorisation"] = found | {"features": shown_name}
+    nearest_name, nearest = score_nearest_distances(described["real"], described["generated"])
+    scores[nearest_name] = nearest
     bar.advance(task)
     peers = describe_peers(config, dataset, output, bar)
     if peers:
@@ -130,8 +157,53 @@ def evaluate_generation(
     counts = {
         name: described[name]["statistics"][:, :11] for name in ("real", "generated") if "statistics" in described[name]
     }
-    shown = select_shown_images(sides["real"], sides["generated"], described["generated"], scores["memorisation"])
-    html = render_evaluation_html(convert_estimates(scores), counts, shown, describe_protocol(config, sides, looks))
+    shown = select_shown_images(sides["real"], sides["generated"], described, nearest)
+    scores["protocol"] = config.protocol or None
+    words = describe_protocol(config, sides, looks)
+    if drops_blank:
+        scores["dropped"] = {name: dropped[name] for name in sides}
+        numbers = ", ".join(f"{dropped[name]} of {sides[name].limit} ({name})" for name in sides)
+        words.append(f"Dropped pictures (entirely white, or any pixel of pure black): {numbers}.")
+    html = render_evaluation_html(convert_estimates(scores), counts, shown, words)
+    storage.write_text(html, storage.join_uri(output, "evaluation.html"))
+    return scores
+
+
+def evaluate_streamed(
+    config: Config, dataset: Dataset | None, sides: dict[str, SceneSet], output: str, bar: Progress
+) -> dict:
+    """Compute Frechet distances and the Inception score part by part, and write evaluation.html.
+
+    The dataset is not passed to the features, so only features of pictures are computed.
+    """
+    inception = config.inception and make_absolute(config.inception)
+    looks = FeatureConfig(
+        config.supersample, inception, "" if inception else prepare_lite0(config), random=not inception
+    )
+    wanted = [(name, name, looks) for name in sides]
+    if config.controls:
+        wanted += [(name, "ceiling", replace(looks, control=name)) for name in CONTROLS]
+    parts: dict[str, FeatureParts] = {}
+    for name, side, how in wanted:
+        task = bar.add_task(f"describe {name}", total=sides[side].limit)
+        directory = storage.join_uri(output, "described", name)
+        parts[name] = write_scene_features(
+            sides[side], None, how, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
+        )
+    task = bar.add_task("compare", total=1)
+    found = compare_streamed(parts["real"], {name: part for name, part in parts.items() if name != "real"})
+    bar.advance(task)
+    counts = {name: count_scenes(sides[name]) for name in ("real", "generated")}
+    scores: dict = {"scenes": counts, "protocol": config.protocol} | found.pop("generated")
+    if inception:
+        scores["inception_score_real"] = compute_streamed_inception_score(parts["real"].iterate_column("logits"))
+    if found:
+        scores["sets"] = found
+    if config.controls:
+        scores["sensitive"] = find_sensitive_scores(found)
+    real, generated = (select_even_images(sides[name], counts[name]) for name in ("real", "generated"))
+    words = describe_protocol(config, sides, looks)
+    html = render_evaluation_html(convert_estimates(scores), {}, ExamplePictures(real, generated), words)
     storage.write_text(html, storage.join_uri(output, "evaluation.html"))
     return scores
 
@@ -169,9 +241,16 @@ def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Pr
 def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]:
     """Return the same number of real, of generated and, for real scenes, of other real scenes (the ceiling).
 
+    A protocol decides the numbers (`select_protocol_sides`).
+
     Raises:
         ValueError: Real and generated pictures differ in size, or the ceiling has no scenes.
     """
+    protocol = PROTOCOLS[config.protocol] if config.protocol else None
+    if protocol and dataset is not None and protocol.num_generated is None:
+        num_generated = count_scenes(select_real(config, dataset, config.real_split))
+    else:
+        num_generated = protocol.num_generated if protocol else config.max_scenes
     source = config.generated_source or (f"generated-{config.run}" if config.run else None)
     generated = resolve_path(config.generated, "generated")
     labels: Pick = "balanced" if config.balance_labels else "spread"
@@ -180,26 +259,62 @@ def select_sides(config: Config, dataset: Dataset | None) -> dict[str, SceneSet]
     for name, path in (("real", make_absolute(config.real) if config.real else ""), ("generated", generated)):
         if path.endswith(".npz"):
             count, *sizes[name], _ = read_picture_shape(path)
-            sides[name] = ImageFile(path, min(count, config.max_scenes))
+            sides[name] = ImageFile(path, min(count, num_generated or count))
         elif name == "real" and dataset is not None:
             sizes[name], sides[name] = [256, 256], select_real(config, dataset, config.real_split)
         else:
-            side = SceneSubset(path, source, config.generated_split or None, config.max_scenes, labels)
+            side = SceneSubset(path, source, config.generated_split or None, num_generated or None, labels)
             sizes[name], sides[name] = [256, 256], side
     if sizes["real"] != sizes["generated"]:
         raise ValueError(
             f"real pictures have {sizes['real']} pixels, generated pictures have {sizes['generated']} pixels: "
             "expected the same size"
         )
+    if protocol and dataset is not None:
+        return select_protocol_sides(config, dataset, sides, num_generated or 0)
     if dataset is not None and isinstance(sides["real"], SceneSubset):
         sides |= select_ceiling(config, dataset, sides["real"], count_scenes(sides["generated"]))
     count = min(count_scenes(side) for side in sides.values())
     return {name: replace(side, limit=count) for name, side in sides.items()}
 
 
+def select_protocol_sides(
+    config: Config, dataset: Dataset, sides: dict[str, SceneSet], num_generated: int
+) -> dict[str, SceneSet]:
+    """Return the sides with the numbers of scenes of the protocol.
+
+    The ceiling has as many scenes as the generated side. If the other split has fewer scenes, there is no ceiling.
+
+    Raises:
+        ValueError: A side has fewer scenes than the protocol needs, or --controls or --ceiling-split is given and there
+            are too few other real scenes. The message names both numbers.
+    """
+    counts = {name: count_scenes(side) for name, side in sides.items()}
+    needed = {"real": config.max_scenes or 1, "generated": num_generated}
+    if PROTOCOLS[config.protocol].is_exact:
+        for name, count in counts.items():
+            if count < needed[name]:
+                raise ValueError(
+                    f"--protocol {config.protocol} needs {needed[name]} {name} scenes, but {sides[name].root} has"
+                    f" {count}"
+                )
+    split = config.ceiling_split or "test"
+    others = select_real(replace(config, max_scenes=counts["generated"] or None), dataset, split)
+    if (count := count_scenes(others)) >= counts["generated"]:
+        sides, counts = sides | {"ceiling": others}, counts | {"ceiling": count}
+    elif config.controls or config.ceiling_split:
+        option = "--controls" if config.controls else f"--ceiling-split {split}"
+        raise ValueError(
+            f"{option} with --protocol {config.protocol} needs {counts['generated']} other real scenes, but split"
+            f" {split} of {dataset.root} has {count}"
+        )
+    # A side without scenes raises an error that names its directory when its shards are read.
+    return {name: replace(side, limit=max(counts[name], 1)) for name, side in sides.items()}
+
+
 def select_real(config: Config, dataset: Dataset, split: str, half: str = "") -> SceneSubset:
     """Return real scenes of a split, selected by the rule of --reference."""
-    rule = REFERENCES[config.reference]
+    rule = REFERENCES[config.reference or "farthest-point"]
     return SceneSubset(dataset.root, dataset.source, split, config.max_scenes, rule, config.min_distance_m, half)
 
 
@@ -238,8 +353,8 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     how = {
         "farthest-point": "farthest point sampling of poses",
         "min-distance": f"poses at least {config.min_distance_m:g} m apart",
-        "uniform": "evenly spread",
-    }[config.reference]
+        "uniform": "evenly spread" if config.max_scenes else "all scenes",
+    }[config.reference or "farthest-point"]
     chosen = {
         "real": f"split {config.real_split}, {how}",
         "generated": "the same number of scenes per label, if there are enough scenes"
@@ -250,7 +365,9 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
         if isinstance(side := sides.get(name), SceneSubset):
             half = f", {side.half} half of the places" if side.half else ""
             chosen[name] = f"split {side.split}{half}, {how}"
-    words = [
+    summary = PROTOCOLS[config.protocol].summary if config.protocol else "the options select scenes and scores"
+    words = [f"Protocol: {config.protocol or 'none'} ({summary})."]
+    words += [
         f"{name.capitalize()}: {side.limit} of {side.root}, "
         f"{'the first' if isinstance(side, ImageFile) else chosen[name]}."
         for name, side in sides.items()
@@ -259,7 +376,10 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     words.append(
         f"Each picture shows a scene from above: 256 x 256 pixels, class colours, no shading, white background{drawn}."
     )
+    if config.protocol and "ceiling" not in sides:
+        words.append("There is no ceiling, because the other splits have fewer scenes than the generated side.")
     words += [describe_lite0()] if looks.lite0 else []
+    words += [describe_vgg16(looks.vgg16)] if looks.vgg16 else []
     return [*words, describe_weights(looks.inception)] if looks.inception else words
 
 

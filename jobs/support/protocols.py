@@ -52,8 +52,7 @@ PROTOCOLS: dict[str, Protocol] = {
     "paper-fid": Protocol(
         "FID, sFID and Inception score as in the paper: all scenes of the training split, as many generated scenes",
         COMMON,
-        {"max_scenes": ALL_SCENES, "reference": ALL_SCENES}
-        | dict.fromkeys(("k", "peers", "vgg16"), ONLY_MOMENTS),
+        {"max_scenes": ALL_SCENES, "reference": ALL_SCENES} | dict.fromkeys(("k", "peers", "vgg16"), ONLY_MOMENTS),
         is_streamed=True,
     ),
     "pdd": Protocol(
@@ -95,6 +94,8 @@ def apply_protocol(config: Config) -> Config:
     for name, allowed in protocol.choices.items():
         if getattr(config, name) not in (None, *allowed):
             _reject(config, name, f"which allows {' and '.join(allowed)}")
+    if config.lvae and not (config.generated or config.run or config.generated_source):
+        raise ValueError(f"--protocol {config.protocol} needs generated scenes: give --generated, or omit --protocol")
     if config.real.endswith(".npz"):
         _reject(config, "real", "which selects training scenes and needs a dataset directory")
     if config.ceiling_split == "halves":

@@ -50,7 +50,14 @@ Described = Mapping[str, np.ndarray]
 ROWS_PER_TASK = 4096
 RELATION_LIMIT = 5.0  # Standardised relation statistics are clipped to this value; rare categories have outliers.
 NEIGHBOURS = 3  # Number of nearest real scenes that are reported per generated scene.
-MEMORISED_QUANTILE = 0.01  # Quantile of the distances from real scenes to their nearest other real scene.
+LIMIT_QUANTILE = 0.01  # Quantile of the distances from real scenes to their nearest other real scene.
+# Features of the distances to the nearest real scene, best first, and their names in the report.
+NEAREST_FEATURES = {
+    "vgg16": "VGG16 fc",
+    "pool3": "Inception pool3",
+    "lite0": "EfficientNet-Lite0",
+    "random": "untrained",
+}
 
 
 def compare_datasets(
@@ -322,13 +329,29 @@ def find_within_task(
     return find_within(real, generated, real_balls, generated_balls, rows)
 
 
-def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
-    """Compare the distances from generated to real samples with the distances between real samples (paper, supplement).
+def score_nearest_distances(real: Described, generated: Described) -> tuple[str, dict]:
+    """Compute the distances to the nearest real scene with the best features that both sides have.
+
+    Returns:
+        Name of the score, and `compute_nearest_distances` with the name of the features. The name is `memorisation`
+        only for VGG16, the network of the paper's analysis; otherwise it names the features, such as
+        `nearest_distance_lite0`.
+    """
+    features = next(name for name in NEAREST_FEATURES if name in real and name in generated)
+    found = compute_nearest_distances(real[features], generated[features])
+    name = "memorisation" if features == "vgg16" else f"nearest_distance_{features}"
+    return name, found | {"features": NEAREST_FEATURES[features]}
+
+
+def compute_nearest_distances(real: np.ndarray, generated: np.ndarray) -> dict:
+    """Compare the distances from generated to real samples with the distances between real samples.
+
+    With VGG16 features, this is the paper's analysis of memorisation (supplement).
 
     Returns:
         `generated`: statistics of the distance from each generated sample to the nearest real sample. `real`:
-        statistics of the distance from each real sample to the nearest other real sample. `memorised`: share of
-        generated samples with a distance below the 1 % quantile of the distances of real samples. `copies`: share of
+        statistics of the distance from each real sample to the nearest other real sample. `below_limit`: share
+        of generated samples with a distance below the 1 % quantile of the distances of real samples. `copies`: share of
         generated samples at distance 0. `nearest` (m, 3): for each generated sample, the indices of the three nearest
         real samples; the nearest comes first. `distance` (m, 3): distances from each generated sample to these nearest
         real samples.
@@ -345,8 +368,8 @@ def compute_memorisation(real: np.ndarray, generated: np.ndarray) -> dict:
             "minimum": float(values.min()),
             "maximum": float(values.max()),
         }
-    limit = np.quantile(own, MEMORISED_QUANTILE)
-    found["memorised"] = estimate_mean(distance[:, 0] < limit)
+    limit = np.quantile(own, LIMIT_QUANTILE)
+    found["below_limit"] = estimate_mean(distance[:, 0] < limit)
     found["copies"] = estimate_mean(distance[:, 0] == 0)
     return found | {"nearest": index, "distance": distance}
 

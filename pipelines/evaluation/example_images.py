@@ -27,27 +27,36 @@ def select_example_images(side: SceneSet, indices: np.ndarray) -> list[np.ndarra
 
 
 def select_shown_images(
-    real: SceneSet, generated: SceneSet, described: Mapping[str, np.ndarray], memorised: Mapping
+    real: SceneSet, generated: SceneSet, sides: Mapping[str, Mapping[str, np.ndarray]], nearest_distance: Mapping
 ) -> ExamplePictures:
     """Select evenly spaced pictures, generated pictures closest to real pictures, and pictures with the most faults.
 
     Args:
         real: Real side.
         generated: Generated side.
-        described: Features of the generated scenes.
-        memorised: Result of `evaluate.compute_memorisation`.
+        sides: Features of the scenes of "real" and "generated". If scenes were dropped, the column `row` holds the
+            position of each scene in its side.
+        nearest_distance: Result of `evaluate.compute_nearest_distances`.
 
     Returns:
         Pictures for the page.
     """
-    count = len(described["scene_id"])
-    even = select_evenly(count, min(SHOWN, count))
-    alike = memorised["distance"][:, 0].argsort(kind="stable")[: SHOWN // 3]
-    nearest = select_example_images(real, memorised["nearest"][alike].ravel())
+    described = sides["generated"]
+
+    def draw(name: str, indices: np.ndarray) -> list[np.ndarray]:
+        rows = sides[name]["row"][indices] if "row" in sides[name] else indices
+        return select_example_images(real if name == "real" else generated, rows)
+
+    def draw_evenly(name: str) -> list[np.ndarray]:
+        count = len(sides[name]["scene_id"])
+        return draw(name, select_evenly(count, min(SHOWN, count)))
+
+    alike = nearest_distance["distance"][:, 0].argsort(kind="stable")[: SHOWN // 3]
+    nearest = draw("real", nearest_distance["nearest"][alike].ravel())
     each = len(nearest) // len(alike)
     neighbours = [
-        (picture, nearest[k * each : (k + 1) * each], memorised["distance"][index].tolist())
-        for k, (index, picture) in enumerate(zip(alike, select_example_images(generated, alike), strict=True))
+        (picture, nearest[k * each : (k + 1) * each], nearest_distance["distance"][index].tolist())
+        for k, (index, picture) in enumerate(zip(alike, draw("generated", alike), strict=True))
     ]
     worst = []
     if "validity" in described:
@@ -55,5 +64,10 @@ def select_shown_images(
         faults = described["validity"][:, :-2:2].sum(axis=1)
         most = np.argsort(-faults, kind="stable")[: SHOWN // 2]
         reasons = [f"{faults[index]:.0f} faults" for index in most]
-        worst = list(zip(select_example_images(generated, most), reasons, strict=True))
-    return ExamplePictures(select_example_images(real, even), select_example_images(generated, even), neighbours, worst)
+        worst = list(zip(draw("generated", most), reasons, strict=True))
+    return ExamplePictures(draw_evenly("real"), draw_evenly("generated"), neighbours, worst)
+
+
+def select_even_images(side: SceneSet, count: int) -> list[np.ndarray]:
+    """Return at most SHOWN evenly spaced pictures of the first `count` scenes of a side."""
+    return select_example_images(side, select_evenly(count, min(SHOWN, count)))

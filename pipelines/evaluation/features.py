@@ -7,7 +7,7 @@ An interrupted run therefore resumes with the missing parts.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
@@ -17,7 +17,7 @@ import torch
 
 from models.scene import Scene
 from models.tensors import resample_scene_ground
-from pipelines.metrics import distributions, inception, lite0, statistics, validity
+from pipelines.metrics import distributions, inception, lite0, statistics, validity, vgg16
 from pipelines.metrics.adm_npz import iterate_pictures
 from pipelines.metrics.controls import damage_scene
 from pipelines.metrics.relations import compute_scene_relations
@@ -48,6 +48,8 @@ FEATURE_TYPES = {
     "pool3": np.float32,
     "spatial": np.float32,
     "logits": np.float32,
+    "vgg16": np.float32,
+    "blank": np.uint8,
 }
 
 
@@ -60,12 +62,18 @@ class FeatureConfig:
         inception: File with the Inception weights; "" means no Inception features.
         lite0: File with the converted weights of EfficientNet-Lite0 (lite0.py); "" means no such features.
         control: Damage to apply to each scene before its features are computed (controls.py); "" means none.
+        vgg16: File with the weights of VGG16 (vgg16.py); "" means no such features.
+        random: Whether to compute the features of the random network.
+        blank: Whether to mark pictures that the PDD protocol drops (`find_blank_pictures`).
     """
 
     supersample: int = 1
     inception: str = ""
     lite0: str = ""
     control: str = ""
+    vgg16: str = ""
+    random: bool = True
+    blank: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,14 +93,38 @@ SceneSet = SceneSubset | ImageFile  # One side of a comparison.
 
 
 def compute_features(pictures: np.ndarray, looks: FeatureConfig) -> dict[str, np.ndarray]:
-    """Compute random features (n, 480) of pictures (n, H, W, 3) uint8, and those of the networks with given weights."""
-    named = {"random": inception.compute_random_features(pictures)}
+    """Compute the features of pictures (n, H, W, 3) uint8 that the options name; each is an array (n, width)."""
+    named = {"random": inception.compute_random_features(pictures)} if looks.random else {}
+    if looks.blank:
+        named["blank"] = find_blank_pictures(pictures)[:, None]
+    if looks.vgg16:
+        network = load_cached_vgg16(*storage.fingerprint_file(looks.vgg16))
+        named["vgg16"] = vgg16.compute_vgg16_features(network, pictures)
     if looks.lite0:
         named["lite0"] = lite0.compute_lite0_features(load_cached_lite0(looks.lite0), pictures)
     if looks.inception:
         network = load_cached_inception(*storage.fingerprint_file(looks.inception))
         named |= inception.compute_inception_features(network, pictures)._asdict()
     return named
+
+
+def find_blank_pictures(pictures: np.ndarray) -> np.ndarray:
+    """Return which pictures (n, H, W, 3) the PDD fork drops: entirely white, or with any pixel of pure black."""
+    is_white = (pictures == 255).all(axis=(1, 2, 3))
+    has_black = (pictures == 0).all(axis=3).any(axis=(1, 2))
+    return is_white | has_black
+
+
+def drop_blank(described: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+    """Drop the scenes with a mark in the column `blank`.
+
+    Returns:
+        Columns of the other scenes, with the column `row` (n,), the position of each scene in the side; and the number
+        of dropped scenes.
+    """
+    kept = np.flatnonzero(described["blank"][:, 0] == 0)
+    found = {name: values[kept] for name, values in described.items() if name != "blank"}
+    return found | {"row": kept}, len(described["blank"]) - len(kept)
 
 
 def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.ndarray]:
@@ -169,6 +201,12 @@ def load_cached_inception(path: str, *_: str | int) -> inception.Inception:
     return inception.load_inception(path)
 
 
+@lru_cache(maxsize=1)
+def load_cached_vgg16(path: str, *_: str | int) -> vgg16.VGG16:
+    """Load VGG16; the cache uses the fingerprint of the file as key."""
+    return vgg16.load_vgg16(path)
+
+
 class ImageFeatureExtractor:
     """Actor that computes and writes the features of one part: a range of pictures of an .npz.
 
@@ -223,14 +261,38 @@ def write_part(
     storage.write_parquet(pa.table(arrays), make_part_path(directory, number))
 
 
-def read_parts(directory: str, count: int) -> dict[str, np.ndarray]:
-    """Read all parts in order; return scene_id (n,), place (n,) and the other columns (n, width)."""
-    table = pa.concat_tables([storage.read_parquet(make_part_path(directory, number)) for number in range(count)])
-    described = {name: table[name].to_numpy() for name in table.column_names[:2]}
-    for name in table.column_names[2:]:
-        column = table[name].combine_chunks()
-        described[name] = column.flatten().to_numpy().reshape(len(table), -1)
-    return described
+@dataclass(frozen=True)
+class FeatureParts:
+    """Files with the features of a side, one per part.
+
+    Attributes:
+        directory: Directory of the files.
+        count: Number of parts.
+    """
+
+    directory: str
+    count: int
+
+    def list_columns(self) -> list[str]:
+        """Return the names of the columns with numbers."""
+        return storage.read_parquet(make_part_path(self.directory, 0)).column_names[2:]
+
+    def iterate_column(self, name: str) -> Iterator[np.ndarray]:
+        """Yield a column (n, width) part by part; only one part is in memory."""
+        for number in range(self.count):
+            yield read_column(storage.read_parquet(make_part_path(self.directory, number), [name]), name)
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Read all parts in order; return scene_id (n,), place (n,) and the other columns (n, width)."""
+        paths = [make_part_path(self.directory, number) for number in range(self.count)]
+        table = pa.concat_tables([storage.read_parquet(path) for path in paths])
+        described = {name: table[name].to_numpy() for name in table.column_names[:2]}
+        return described | {name: read_column(table, name) for name in table.column_names[2:]}
+
+
+def read_column(table: pa.Table, name: str) -> np.ndarray:
+    """Return a column of lists of numbers as an array (n, width)."""
+    return table[name].combine_chunks().flatten().to_numpy().reshape(len(table), -1)
 
 
 def compute_scene_features(
@@ -241,7 +303,23 @@ def compute_scene_features(
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Compute the features of each scene of a side.
+    """Compute the features of each scene of a side, as `write_scene_features` does, and read them.
+
+    Returns:
+        scene_id (n,), place (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
+    """
+    return write_scene_features(side, dataset, looks, directory, num_actors, on_scenes).read()
+
+
+def write_scene_features(
+    side: SceneSet,
+    dataset: Dataset | None,
+    looks: FeatureConfig,
+    directory: str,
+    num_actors: int = 1,
+    on_scenes: Callable[[int], None] | None = None,
+) -> FeatureParts:
+    """Compute the features of each scene of a side and write one file per part.
 
     If `directory` already contains the file of a part, the function reads this file. For scenes, a part is a shard and
     is computed by one Ray task. For an .npz, a part has PICTURES_PER_PART pictures and is computed by one actor call.
@@ -257,7 +335,7 @@ def compute_scene_features(
         on_scenes: Called with the number of scenes of each finished part.
 
     Returns:
-        scene_id (n,), place (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
+        The files, in the order of the shards or pictures.
     """
     ranges: list[range] = []
     shards: list[tuple[Shard, list[int]]] = []
@@ -296,7 +374,7 @@ def compute_scene_features(
     for row in rows:
         if on_scenes:
             on_scenes(row["scenes"])
-    return read_parts(directory, len(counts))
+    return FeatureParts(directory, len(counts))
 
 
 def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> list[Scene]:
@@ -313,9 +391,15 @@ def load_scenes(parts: list[tuple[Shard, list[int]]], indices: np.ndarray) -> li
 
 
 def make_options_record(looks: FeatureConfig) -> dict:
-    """Return the options that determine the features. A hash of the weights replaces the name of their file."""
-    return asdict(looks) | {
+    """Return the options that determine the features. A hash of the weights replaces the name of their file.
+
+    Options that version 0.2 added are recorded only if they differ from the default, so earlier features are kept.
+    """
+    record = asdict(looks) | {
         "version": VERSION,
         "lite0": looks.lite0.rsplit("/", 1)[-1],  # The name contains the digest.
         "inception": inception.hash_weights(looks.inception) if looks.inception else "",
+        "vgg16": vgg16.hash_vgg16_weights(looks.vgg16) if looks.vgg16 else "",
     }
+    unchanged = {"vgg16": "", "random": True, "blank": False}
+    return {name: value for name, value in record.items() if name not in unchanged or value != unchanged[name]}

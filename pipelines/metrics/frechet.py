@@ -216,10 +216,28 @@ def compute_frechet_influence(
     Returns:
         (n,) influences with mean 0.
     """
+    values = compute_uncentred_influence(features, own, other_mean, through)
+    return values - values.mean()
+
+
+def compute_uncentred_influence(
+    features: np.ndarray, own: Moments, other_mean: np.ndarray, through: np.ndarray
+) -> np.ndarray:
+    """Compute the influences of `compute_frechet_influence` plus a constant, for a part of a set.
+
+    Args:
+        features: (n, d) features of a part of the set.
+        own: Moments of the whole set.
+        other_mean: (d,) mean of the other set.
+        through: (d, r) matrix W of the set, from `compute_influence_maps`.
+
+    Returns:
+        (n,) influences. Over the whole set, subtract their mean.
+    """
     values = np.empty(len(features))
     for start in range(0, len(features), BLOCK_ROWS):
         rows = slice(start, start + BLOCK_ROWS)
         centred = features[rows] - own.mean
         values[rows] = np.square(centred).sum(axis=1) - np.square(centred @ through).sum(axis=1)
         values[rows] += 2 * centred @ (own.mean - other_mean)
-    return values - values.mean()
+    return values

@@ -134,8 +134,9 @@ def render_evaluation_html(
         Pictures("Real scenes", [Picture("", image, "real") for image in shown.real], columns=6),
         Pictures("Generated scenes", [Picture("", image, "generated") for image in shown.generated], columns=6),
         build_score_table(scores),
-        build_neighbourhood_table(scores),
     ]
+    if any("precision_k" in name for name in scores):
+        sections.append(build_neighbourhood_table(scores))
     if "sensitive" in scores:
         sections += [build_control_table(scores), describe_controls()]
     if "two_sample_features" in scores:
@@ -152,7 +153,13 @@ def render_evaluation_html(
         worst = [Picture(reason, image, "generated") for image, reason in shown.worst]
         note = "These generated scenes have the most faults."
         sections.append(Pictures("Worst generated scenes", worst, columns=6, note=note))
-    sections += [draw_neighbour_pictures(shown), build_memorisation_table(scores["memorisation"])]
+    if shown.neighbours:
+        sections.append(draw_neighbour_pictures(shown))
+    sections += [
+        build_nearest_table(name, scores[name])
+        for name in scores
+        if name == "memorisation" or name.startswith("nearest_distance")
+    ]
     sections.append(Text("Protocol", [*protocol, INTERVALS]))
     title = f"{scores['scenes']['generated']} generated scenes compared with {scores['scenes']['real']} real scenes"
     return render_report_html("Evaluation", sections, title)
@@ -209,7 +216,7 @@ def make_summary(scores: Mapping) -> KeyFigures:
     return KeyFigures("Summary", figures)
 
 
-NO_CEILING = "not measured: a ceiling needs a dataset of real scenes"
+NO_CEILING = "not measured: a ceiling needs as many other real scenes in a dataset"
 
 
 def build_score_table(scores: Mapping) -> Table:
@@ -408,7 +415,8 @@ def draw_neighbour_pictures(shown: ExamplePictures) -> Pictures:
     return Pictures("Nearest real scenes", pictures, columns=columns, note=note)
 
 
-def build_memorisation_table(found: Mapping) -> Table:
+def build_nearest_table(name: str, found: Mapping) -> Table:
+    """Make the table of distances to the nearest real scene; its title names memorisation only for VGG16."""
     rows = [
         (words, *(format_value(found[side][name]) for side in ("generated", "real")))
         for name, words in (("mean", "mean"), ("median", "median"), ("minimum", "minimum"), ("maximum", "maximum"))
@@ -416,7 +424,12 @@ def build_memorisation_table(found: Mapping) -> Table:
     note = (
         f"Distances are measured in {found['features']} features. The limit is the 1 % quantile of the distances of "
         "real scenes to their nearest other real scene. The share of generated scenes below the limit is "
-        f"{format_value(found['memorised'])}. The share of exact copies is {format_value(found['copies'])}."
+        f"{format_value(found['below_limit'])}. The share of exact copies is {format_value(found['copies'])}."
     )
     columns = ("statistic", "generated to real", "real to other real")
-    return Table("Distance to the nearest real scene", columns, rows, note=note)
+    if name == "memorisation":
+        title = "Memorisation: distance to the nearest real scene"
+    else:
+        title = f"Distance to the nearest real scene ({name})"
+        note += " The paper's analysis of memorisation uses VGG16 features: pass --vgg16 FILE."
+    return Table(title, columns, rows, note=note)

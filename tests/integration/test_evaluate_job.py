@@ -13,7 +13,7 @@ from jobs.implementation.evaluate_scenes import evaluate
 from models.scene import Scene
 from pipelines.evaluation.evaluate import (
     compare_datasets,
-    compute_memorisation,
+    compute_nearest_distances,
     compute_set_scores,
     find_sensitive_scores,
     is_sensitive,
@@ -66,7 +66,8 @@ def test_evaluate_scores_tables_and_their_images_equally(smoke, weights, tmp_pat
     for directory in ("tables", "npz"):
         written = json.loads((tmp_path / directory / "metrics.json").read_text())["generation"]
         page = (tmp_path / directory / "evaluation.html").read_text()
-        assert written["memorisation"]["generated"]["mean"]["value"] > 0
+        assert written["nearest_distance_pool3"]["generated"]["mean"]["value"] > 0
+        assert "memorisation" not in written
         assert "scores are not comparable with published scores" in page and page.count("<img") > 10
 
 
@@ -190,8 +191,8 @@ def test_compare_handles_degenerate_features(cluster):
         compare_features(some, np.where(np.arange(20)[:, None] == 4, np.nan, some))
     with pytest.raises(ValueError, match="--k 3 needs more than 3 scenes on each side, got 20 and 3"):
         compare_features(some, some[:3])
-    found = compute_memorisation(some, np.concatenate([some[:5], some[5:] + 9]))
-    assert found["copies"].value == 0.25 and found["memorised"].value == 0.25 and found["nearest"][3, 0] == 3
+    found = compute_nearest_distances(some, np.concatenate([some[:5], some[5:] + 9]))
+    assert found["copies"].value == 0.25 and found["below_limit"].value == 0.25 and found["nearest"][3, 0] == 3
 
 
 @pytest.mark.parametrize(
