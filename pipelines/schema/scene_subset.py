@@ -17,6 +17,7 @@ Pick = Literal["spread", "first", "farthest", "apart", "balanced"]
 Half = Literal["first", "second"]
 COLUMNS = ["sequence", "x_m", "y_m", "vegetation_density", "vehicle_density"]
 HALVES_APART_M = 64.0  # Scenes of two halves show no common ground, because a crop has a side of 64 m.
+HALVES_CUTS = 33  # Number of cuts to try.
 ONE_WORLD = ("kitti360",)  # Sources in which all drives share one world frame.
 
 
@@ -179,15 +180,16 @@ def split_halves(xy_m: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.nd
     """Split scenes into two halves that show different places.
 
     The scenes are ordered by world frame and, within a frame, along the direction in which the poses spread most. The
-    first half is the first half of this order. The second half consists of the remaining scenes that lie at least
-    HALVES_APART_M from each scene of the first half.
+    first half is the beginning of this order. The second half consists of the remaining scenes that lie at least
+    HALVES_APART_M from each scene of the first half. The order is cut where the smaller half is largest.
 
     Args:
         xy_m: (n, 2) position of each pose (m).
         world: (n,) index of each pose's world frame.
 
     Returns:
-        Indices of the first and of the second half, in ascending order.
+        Indices of the first and of the second half, in ascending order. If all scenes lie close together, the second
+        half is empty.
     """
     along_m = np.empty(len(world))
     for frame in np.unique(world):
@@ -195,12 +197,19 @@ def split_halves(xy_m: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.nd
         centred = xy_m[here] - xy_m[here].mean(axis=0)
         along_m[here] = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
     order = np.lexsort([along_m, world])
-    first, rest = np.split(order, [(len(order) + 1) // 2])
+    cuts = np.unique(np.linspace(1, (len(order) + 1) // 2, HALVES_CUTS).astype(int))
+    halves = [(order[:cut], _drop_near(order[:cut], order[cut:], xy_m, world)) for cut in cuts]
+    first, second = max(halves, key=lambda pair: min(map(len, pair)))
+    return np.sort(first), np.sort(second)
+
+
+def _drop_near(first: np.ndarray, rest: np.ndarray, xy_m: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Return the scenes of `rest` that lie at least HALVES_APART_M from each scene of `first`."""
     near = np.zeros(len(rest), bool)
     for frame in np.intersect1d(world[first], world[rest]):
         mine, theirs = first[world[first] == frame], world[rest] == frame
         near[theirs] = cKDTree(xy_m[mine]).query(xy_m[rest[theirs]])[0] < HALVES_APART_M
-    return np.sort(first), np.sort(rest[~near])
+    return rest[~near]
 
 
 def select_farthest(xy_m: np.ndarray, world: np.ndarray, count: int) -> np.ndarray:

@@ -12,6 +12,7 @@ from pipelines.schema.scene_subset import (
     select_balanced,
     select_evenly,
     select_farthest,
+    split_halves,
 )
 from pipelines.schema.tables import Shard
 
@@ -93,3 +94,16 @@ def test_selection_reads_two_shards(tmp_path):
 def test_selection_rejects_wrong_options(options, message):
     with pytest.raises(ValueError, match=message):
         SceneSubset("nowhere", **options)
+
+
+def test_halves_show_different_places():
+    rng = np.random.default_rng(0)
+    drive = np.stack([np.linspace(0, 150, 300), rng.normal(size=300)], axis=1)  # one drive of 150 m
+    first, second = split_halves(drive, np.zeros(300, int))
+    gaps = np.hypot(*(drive[first][:, None] - drive[second][None]).T)
+    assert gaps.min() >= 64 and min(len(first), len(second)) > 70 and not set(first) & set(second)
+    first, second = split_halves(drive[:100], np.zeros(100, int))  # 50 m: no place is 64 m away
+    assert len(second) == 0 and len(first) > 0
+    worlds = np.repeat(np.arange(4), 25)  # four drives in separate worlds: two drives per half
+    first, second = split_halves(drive[:100], worlds)
+    assert set(worlds[first]) == {0, 1} and set(worlds[second]) == {2, 3} and len(first) == len(second) == 50
