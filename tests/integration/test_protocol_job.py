@@ -39,8 +39,8 @@ def count_training_scenes(data: str) -> int:
 
 
 def test_paper_pr_compares_exact_numbers_with_a_ceiling(data, tmp_path):
-    options = {"real": data, "generated": data, "protocol": "paper-pr", "lite0": False, "num_actors": 1}
-    found = evaluate(Config(generated_split="test", output=str(tmp_path / "a"), **options))["generation"]
+    base = Config(real=data, generated=data, protocol="paper-pr", lite0=False, num_actors=1)
+    found = evaluate(replace(base, generated_split="test", output=str(tmp_path / "a")))["generation"]
     assert found["scenes"] == {"real": SMALL, "generated": SMALL} and found["protocol"] == "paper-pr"
     assert {"random_precision_k3", "random_recall_k3"} <= found.keys()
     assert "ceiling" in found["sets"] and "nearest_distance_random" in found and "memorisation" not in found
@@ -49,24 +49,24 @@ def test_paper_pr_compares_exact_numbers_with_a_ceiling(data, tmp_path):
     assert "Protocol: paper-pr" in page and "farthest point sampling" in page and "nearest_distance_random" in page
     write_npz(str(tmp_path / "few.npz"), [render_scenes(data, 3)], 3)
     with pytest.raises(ValueError, match=rf"paper-pr needs {SMALL} generated scenes, but .*few\.npz has 3"):
-        evaluate(Config(**options | {"generated": str(tmp_path / "few.npz"), "output": str(tmp_path / "b")}))
+        evaluate(replace(base, generated=str(tmp_path / "few.npz"), output=str(tmp_path / "b")))
 
 
 def test_paper_fid_streams_all_training_scenes(data, tmp_path):
     total = count_training_scenes(data)
     write_npz(str(tmp_path / "few.npz"), [render_scenes(data, total - 1)], total - 1)
     write_npz(str(tmp_path / "many.npz"), [render_scenes(data, total + 2)], total + 2)
-    options = {"real": data, "protocol": "paper-fid", "lite0": False, "num_actors": 1}
+    base = Config(real=data, generated=str(tmp_path / "many.npz"), protocol="paper-fid", lite0=False, num_actors=1)
     with pytest.raises(ValueError, match=rf"needs {total} generated scenes, but .*few\.npz has {total - 1}"):
-        evaluate(Config(generated=str(tmp_path / "few.npz"), output=str(tmp_path / "a"), **options))
-    evaluate(Config(generated=str(tmp_path / "many.npz"), output=str(tmp_path / "b"), **options))
+        evaluate(replace(base, generated=str(tmp_path / "few.npz"), output=str(tmp_path / "a")))
+    evaluate(replace(base, output=str(tmp_path / "b")))
     written = json.loads((tmp_path / "b/metrics.json").read_text())["generation"]
     assert written["scenes"] == {"real": total, "generated": total} and written["protocol"] == "paper-fid"
     assert written["random_frechet"]["value"] == pytest.approx(0, abs=1e-3)  # the same scenes
     assert not {"layout_frechet", "random_precision_k3", "validity", "nearest_distance_random", "sets"} & set(written)
     assert "There is no ceiling" in (tmp_path / "b/evaluation.html").read_text()
     with pytest.raises(ValueError, match=rf"--controls with --protocol paper-fid needs {total} other real scenes"):
-        evaluate(Config(generated=str(tmp_path / "many.npz"), controls=True, output=str(tmp_path / "c"), **options))
+        evaluate(replace(base, controls=True, output=str(tmp_path / "c")))
 
 
 def test_pdd_drops_and_counts_blank_pictures(data, tmp_path):
@@ -75,9 +75,8 @@ def test_pdd_drops_and_counts_blank_pictures(data, tmp_path):
     pictures[4, 10, 10] = 0
     pictures[7, 0, 0] = 0
     write_npz(str(tmp_path / "samples.npz"), [pictures], 9)
-    options = {"real": data, "generated": str(tmp_path / "samples.npz"), "protocol": "pdd", "lite0": False}
-    found = evaluate(Config(reference="min-distance", output=str(tmp_path / "a"), num_actors=1, **options))
-    found = found["generation"]
+    base = Config(real=data, generated=str(tmp_path / "samples.npz"), protocol="pdd", lite0=False, num_actors=1)
+    found = evaluate(replace(base, reference="min-distance", output=str(tmp_path / "a")))["generation"]
     assert found["dropped"]["generated"] == 3 and found["dropped"]["real"] == 0
     apart = SceneSubset(data, Dataset.open(data).source, "train", None, "apart", 10.0)
     assert found["scenes"] == {"real": sum(len(rows) for _, rows in apart.shards()), "generated": 6}
@@ -86,4 +85,4 @@ def test_pdd_drops_and_counts_blank_pictures(data, tmp_path):
     white = np.full((4, 256, 256, 3), 255, np.uint8)
     write_npz(str(tmp_path / "white.npz"), [white], 4)
     with pytest.raises(ValueError, match=r"drops 4 of 4 pictures of .*white\.npz \(generated\)"):
-        evaluate(Config(**options | {"generated": str(tmp_path / "white.npz"), "output": str(tmp_path / "b")}))
+        evaluate(replace(base, generated=str(tmp_path / "white.npz"), output=str(tmp_path / "b")))
