@@ -10,6 +10,7 @@ import os
 
 from jobs.encode_latents import Config as EncodeConfig
 from jobs.evaluate_scenes import Config as EvaluateConfig
+from jobs.implementation.protocols import apply_protocol
 from jobs.inpaint_scenes import Config as InpaintConfig
 from jobs.outpaint_scenes import Config as OutpaintConfig
 from jobs.preprocess_scenes import Av2, Kitti360, Own, Town
@@ -17,7 +18,6 @@ from jobs.publish_model import Config as PublishConfig
 from jobs.sample_scenes import Config as SampleConfig
 from jobs.support.cli import home_path, make_absolute, require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, require_model_labels
-from jobs.support.protocols import apply_protocol
 from jobs.train_dit import Config as DiTConfig
 from jobs.train_lvae import Config as LVAEConfig
 from models.presets import DIT_PRESETS, LVAE_PRESETS, find_preset

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.checks import check_evaluate_scenes
+from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from jobs.support.cli import home_path, make_absolute, resolve_path
-from jobs.support.protocols import PROTOCOLS, apply_protocol
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES

@@ -8,7 +8,7 @@ import pytest
 
 from jobs.evaluate_scenes import Config
 from jobs.implementation.evaluate_scenes import evaluate
-from jobs.support.protocols import PROTOCOLS
+from jobs.implementation.protocols import PROTOCOLS
 from pipelines.evaluation.features import load_scenes
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.rendering.render import render_bev

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jobs.evaluate_scenes import Config
-from jobs.support.protocols import PROTOCOLS, apply_protocol
+from jobs.implementation.protocols import PROTOCOLS, apply_protocol
 from pipelines.evaluation.evaluate import estimate_frechet, score_nearest_distances
 from pipelines.evaluation.features import (
     FeatureConfig,
