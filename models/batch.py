@@ -14,10 +14,10 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class LayoutBatch:
-    """A batch of normalised layouts L = {H, B, F} (paper, Sec. 3.1); every value lies in [0, 1].
+    """A batch of normalised layouts L = {H, B, F} (paper, Sec. 3.1); masks and features lie in [0, 1].
 
     Attributes:
-        height: Normalised ground heights H.
+        height: Normalised ground heights H. Heights within the bounds of the LayoutSpec lie in [0, 1].
         occupied: Ground masks B with values 0 and 1.
         features: Normalised centres and Cholesky parameters F; 0 in padded slots.
         real: True for each slot that holds a primitive (padding flag p of the paper).

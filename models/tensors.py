@@ -61,7 +61,7 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
     pixel is the mean height of its occupied part. On a finer grid, each pixel has the value of the nearest input pixel.
 
     Args:
-        height: (G, H, W) heights, in metres or as unsigned integers.
+        height: (G, H, W) heights, in metres or as integers.
         occupied: (G, H, W) masks.
         own: Grid of the input rasters.
         grid: Grid of the result.
@@ -79,11 +79,11 @@ def resample_ground(height: np.ndarray, occupied: np.ndarray, own: Grid, grid: G
         return height, occupied
     if own.rows % grid.rows == 0:
         f = own.rows // grid.rows
-        wide = np.uint32 if height.dtype.kind == "u" else height.dtype
+        wide = {"u": np.uint32, "i": np.int64}.get(height.dtype.kind, height.dtype)
         count, total = _sum_blocks(occupied.view(np.uint8), f, np.uint8), _sum_blocks(height, f, wide)
         keep = 2 * count.astype(np.int16) >= f * f
         mean = total / np.maximum(count, 1).astype(np.float32)
-        mean = np.rint(mean) if height.dtype.kind == "u" else mean
+        mean = np.rint(mean) if height.dtype.kind in "ui" else mean
         return np.where(keep, mean, 0).astype(height.dtype), keep
     if grid.rows % own.rows == 0:
         f = grid.rows // own.rows
@@ -128,7 +128,7 @@ def assign_slots(category: np.ndarray, center_m: np.ndarray, spec: LayoutSpec) -
     return ((np.cumsum(slots) - slots)[group] + rank)[kept], order[kept]
 
 
-def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
+def encode_layout(scene: Scene, spec: LayoutSpec, clip_heights: bool = True) -> dict[str, np.ndarray]:
     """Encode a scene as compact arrays, which are small enough to send between processes.
 
     `LayoutBatch.from_compact` converts these arrays to a batch.
@@ -136,25 +136,28 @@ def encode_layout(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
     Args:
         scene: Scene that covers the area of `spec.grid`, with any resolution.
         spec: LayoutSpec that defines the encoding.
+        clip_heights: Whether to clip ground heights to the bounds of the spec.
 
     Returns:
-        Dictionary with height (G, H, W) uint16, occupied (G, H, W) bool, features (N, 9) float32 and real (N,) bool. A
-        height of 65535 stands for the upper bound.
+        Dictionary with height (G, H, W), occupied (G, H, W) bool, features (N, 9) float32 and real (N,) bool. Heights
+        are uint16 if clipped, otherwise int32. A height of 65535 stands for the upper bound.
 
     Raises:
         ValueError: The scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
             other.
     """
     parameters = compute_cholesky_parameters(scene.rotation, scene.size_m)
-    return encode_ground(scene, spec) | encode_primitives(scene.category, scene.center_m, parameters, spec)
+    primitives = encode_primitives(scene.category, scene.center_m, parameters, spec)
+    return encode_ground(scene, spec, clip_heights) | primitives
 
 
-def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
+def encode_ground(scene: Scene, spec: LayoutSpec, clip_heights: bool = True) -> dict[str, np.ndarray]:
     """Encode the rasters of a scene.
 
     Args:
         scene: Scene that covers the area of `spec.grid`, with any resolution.
         spec: LayoutSpec that defines the encoding.
+        clip_heights: Whether to clip heights to the bounds of the spec.
 
     Returns:
         The entries `height` and `occupied` of `encode_layout`.
@@ -164,25 +167,27 @@ def encode_ground(scene: Scene, spec: LayoutSpec) -> dict[str, np.ndarray]:
             other.
     """
     height_m, occupied = select_ground_classes(scene, spec.ground_classes)
-    height = np.zeros(height_m.shape, np.uint16)
-    height[occupied] = encode_height(height_m[occupied], spec)
+    height = np.zeros(height_m.shape, np.uint16 if clip_heights else np.int32)
+    height[occupied] = encode_height(height_m[occupied], spec, clip_heights)
     height, occupied = resample_ground(height, occupied, scene.grid, spec.grid)
     return {"height": height, "occupied": occupied}
 
 
-def encode_height(height_m: np.ndarray, spec: LayoutSpec) -> np.ndarray:
-    """Quantise heights to 16 bits.
+def encode_height(height_m: np.ndarray, spec: LayoutSpec, clip_heights: bool = True) -> np.ndarray:
+    """Quantise heights in steps of 1/65535 of the interval between the height bounds.
 
     Args:
         height_m: Heights (metres, scene frame), any shape.
         spec: LayoutSpec with the height bounds, which are mapped to 0 and 65535.
+        clip_heights: Whether to clip heights to the bounds.
 
     Returns:
-        uint16 array of the same shape; heights outside the bounds are clipped.
+        Array of the same shape: uint16 if heights are clipped, otherwise int32. Both have the same values within the
+        bounds.
     """
     (low,), (high,) = spec.height_bounds_m.low, spec.height_bounds_m.high
     scaled = (height_m - np.float32(low)) * np.float32(65535 / (high - low))
-    return np.rint(scaled.clip(0, 65535)).astype(np.uint16)
+    return np.rint(scaled.clip(0, 65535)).astype(np.uint16) if clip_heights else np.rint(scaled).astype(np.int32)
 
 
 def encode_primitives(
@@ -211,6 +216,9 @@ def encode_primitives(
 def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
     """Encode scenes as one batch on the CPU.
 
+    Ground heights are not clipped, because the ground branch extrapolates beyond its height bounds. With clipped
+    heights, all ground above the upper bound is flattened (docs/experiments/town_model_on_kitti360.md).
+
     Args:
         scenes: Scenes that cover the area of `spec.grid`.
         spec: LayoutSpec that defines the encoding.
@@ -222,7 +230,7 @@ def make_layout_batch(scenes: list[Scene], spec: LayoutSpec) -> LayoutBatch:
         ValueError: A scene covers a different area than `spec.grid`, or neither resolution is a whole multiple of the
             other.
     """
-    layouts = [encode_layout(scene, spec) for scene in scenes]
+    layouts = [encode_layout(scene, spec, clip_heights=False) for scene in scenes]
     stacked = {name: np.stack([layout[name] for layout in layouts]) for name in layouts[0]}
     return LayoutBatch.from_compact({name: torch.from_numpy(value) for name, value in stacked.items()})
 

@@ -26,6 +26,7 @@ from pipelines.metrics.reconstruction import (
     MEMORY,
     SCORED,
     THRESHOLDS,
+    BoundsCounts,
     GroundSums,
     Matches,
     PairSums,
@@ -34,6 +35,7 @@ from pipelines.metrics.reconstruction import (
     compute_pair_scores,
     compute_voxel_confusion,
     compute_voxel_scores,
+    count_outside_bounds,
     join_matches,
     match_scene,
     measure_memory_bytes,
@@ -128,6 +130,7 @@ class SceneRecord:
         pairs: Per-category sums over pairs of matched primitives.
         confusion: (classes, classes) number of voxels; rows are true classes, and columns are predicted classes.
         outside: Numbers of ground pixels and of objects outside the voxel grid.
+        bounds: Numbers of ground pixels and of objects outside the bounds of the model.
         memory: Size of the scene in each representation of MEMORY (bytes).
         labels: (measures, 2) label fidelity: whether the reconstruction and the true scene have the same label. If this
             is unknown, the values are 0.
@@ -139,13 +142,14 @@ class SceneRecord:
     pairs: PairSums
     confusion: np.ndarray
     outside: OutsideCounts
+    bounds: BoundsCounts
     memory: np.ndarray
     labels: np.ndarray
 
     def to_row(self) -> dict:
         """Return the sums as flat arrays for Arrow."""
         out = {"confusion": self.confusion.ravel(), "memory": self.memory, "labels": self.labels.ravel()}
-        for part in ("ground", "raster", "matches", "pairs", "outside"):
+        for part in ("ground", "raster", "matches", "pairs", "outside", "bounds"):
             value = getattr(self, part)
             out |= {f"{part}_{name}": np.ravel(getattr(value, name)) for name in value.__dataclass_fields__}
         return out
@@ -165,6 +169,7 @@ class SceneRecord:
             pairs=part("pairs", PairSums),
             confusion=np.asarray(row["confusion"]).reshape(NUM_CLASSES, NUM_CLASSES),
             outside=part("outside", OutsideCounts, objects=(-1, 3)),
+            bounds=part("bounds", BoundsCounts),
             memory=np.asarray(row["memory"]),
             labels=np.asarray(row["labels"]).reshape(-1, 2),
         )
@@ -206,6 +211,7 @@ def make_scene_record(
         pairs=sum_pairs(truth, rebuilt),
         confusion=compute_voxel_confusion(true_voxels, voxelize(rebuilt, voxels)),
         outside=count_outside(truth, voxels),
+        bounds=count_outside_bounds(truth, spec),
         memory=measure_memory_bytes(make_layout_batch([truth], spec), latent, true_voxels),
         labels=judge_labels(rebuilt, dataset),
     )
@@ -336,7 +342,7 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
     )
     matches = join_matches([r.matches for r in records])
     detection = {name: compute_detection_scores(matches, **options) for name, options in AP_VARIANTS.items()}
-    left_out = _sum(r.outside for r in records)
+    left_out, bounds = _sum(r.outside for r in records), _sum(r.bounds for r in records)
     num_objects, num_partly, num_wholly = left_out.objects.T
     present = np.flatnonzero(num_objects)
     return {
@@ -350,6 +356,8 @@ def compute_reconstruction_scores(records: list[SceneRecord], spec: LayoutSpec, 
         "height_rmse_m": ground.height_rmse_m,
         "height_mse_normalised": ground.height_mse,
         "height_bounds_m": {"low": low[0], "high": high[0]},
+        "ground_outside_bounds": float(bounds.ground[1] / max(bounds.ground[0], 1)),
+        "objects_outside_bounds": float(bounds.objects[1] / max(bounds.objects[0], 1)),
         "ground_class_iou": ground.class_iou,
         "class_height_mae_m": ground.class_height_mae_m,
         "class_height_rmse_m": ground.class_height_rmse_m,

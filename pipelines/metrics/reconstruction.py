@@ -14,8 +14,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from models.batch import LayoutBatch
+from models.geometry.cholesky import compute_cholesky_parameters
 from models.geometry.iou3d import compute_ellipsoid_iou3d_matrix, compute_iou3d_matrix, extract_boxes
-from models.scene import CATEGORIES, ELLIPSOID, Scene
+from models.layout import Bounds, LayoutSpec
+from models.scene import CATEGORIES, CATEGORY_INDEX, ELLIPSOID, Scene
+from models.tensors import select_ground_classes
 from pipelines.geometry.voxels import NUM_CLASSES
 from pipelines.schema.palette import CLASS_ID, EMPTY
 
@@ -152,6 +155,47 @@ def compute_ground_scores(
         class_height_rmse_m=by_class(np.sqrt(squared_m2)),
         class_height_mse=by_class(squared_m2 / (high - low)[truly] ** 2),
     )
+
+
+@dataclass(frozen=True)
+class BoundsCounts:
+    """Numbers of ground pixels and of primitives outside the bounds of a LayoutSpec. The numbers can be added.
+
+    Attributes:
+        ground: (2,) int64: number of occupied pixels, and number of occupied pixels whose height is outside the bounds.
+        objects: (2,) int64: number of primitives, and number of primitives with a centre height or a Cholesky parameter
+            outside the bounds.
+    """
+
+    ground: np.ndarray
+    objects: np.ndarray
+
+    def __add__(self, other: BoundsCounts) -> BoundsCounts:
+        return BoundsCounts(self.ground + other.ground, self.objects + other.objects)
+
+
+def count_outside_bounds(scene: Scene, spec: LayoutSpec) -> BoundsCounts:
+    """Count the ground pixels and the primitives that a model with these bounds never saw in training.
+
+    Args:
+        scene: Scene.
+        spec: LayoutSpec of the model. Ground classes and categories that the spec does not have are not counted.
+
+    Returns:
+        The counts of one scene.
+    """
+    height_m, occupied = select_ground_classes(scene, spec.ground_classes)
+    known = np.isin(scene.category, [CATEGORY_INDEX[name] for name in spec.categories])
+    parameters = compute_cholesky_parameters(scene.rotation[known], scene.size_m[known])
+    center_z_m = Bounds(spec.center_bounds_m.low[2:], spec.center_bounds_m.high[2:])
+    beyond = _exceeds(scene.center_m[known, 2:], center_z_m) | _exceeds(parameters, spec.cholesky_bounds)
+    ground = _exceeds(height_m[occupied][:, None], spec.height_bounds_m)
+    return BoundsCounts(np.array([len(ground), ground.sum()]), np.array([len(beyond), beyond.sum()]))
+
+
+def _exceeds(values: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """Return (n,) bool: whether a row of `values` (n, k) has an entry outside its bounds."""
+    return np.any((values < np.array(bounds.low)) | (values > np.array(bounds.high)), axis=1)
 
 
 # ----------------------------------------------------------------------------------------------------------- AP3D

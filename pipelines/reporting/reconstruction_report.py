@@ -84,7 +84,11 @@ def make_key_figures(scores: Mapping) -> KeyFigures:
         [
             Figure(scores["scenes"], "scenes", "encoded and decoded"),
             Figure(_format_percent(scores["ground_iou"]), "ground IoU"),
-            Figure(f"{scores['height_rmse_m']:.3f} m", "ground height RMSE"),
+            Figure(
+                f"{scores['height_rmse_m']:.3f} m",
+                "ground height RMSE",
+                f"{_format_percent(scores['ground_outside_bounds'])} of pixels outside the model's height bounds",
+            ),
             Figure(_format_percent(scores["ap3d"]), "AP3D"),
             Figure(_format_percent(scores["ap3d_50"]), "AP3D@50"),
             Figure(
@@ -170,6 +174,20 @@ def build_overall_table(scores: Mapping) -> Table:
             f"{scores['raster_px']} pixels, and resampling errors are excluded",
         ),
         ("height RMSE, m", scores["height_rmse_m"], None, "over pixels that are occupied in the true scene"),
+        (
+            "ground outside the bounds",
+            scores["ground_outside_bounds"],
+            None,
+            "share of occupied pixels whose true height is outside the height bounds of this model, "
+            f"{bounds['low']:.2f} to {bounds['high']:.2f} m; the model saw no such heights in training",
+        ),
+        (
+            "objects outside the bounds",
+            scores["objects_outside_bounds"],
+            None,
+            "share of true objects with a centre height or a Cholesky parameter outside the bounds of this model; "
+            "these values are clipped before encoding",
+        ),
         ("height MAE, m", scores["height_mae_m"], None, "over pixels that are occupied in the true scene"),
         (
             "height MSE, normalised",

@@ -116,7 +116,7 @@ def test_reconstruction_record_round_trips():
     scene = random_scene(2, n=20)
     one = make_record(scene, encode_perfectly(scene, SPEC))
     again = SceneRecord.from_row(one.to_row())
-    for name in ("ground", "matches", "pairs", "outside"):
+    for name in ("ground", "matches", "pairs", "outside", "bounds"):
         first, second = getattr(one, name), getattr(again, name)
         for field in first.__dataclass_fields__:
             np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
