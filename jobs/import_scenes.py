@@ -25,7 +25,7 @@ from jobs.support.cli import run
 
 @dataclass(frozen=True)
 class Config:
-    files: Annotated[tuple[str, ...], tyro.conf.Positional]
+    files: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Files, directories to search recursively, or quoted patterns such as 'DIR/*.glb'."""
     name: str = "scenes"
     """Name of the import: scenes get source=imported-<name>."""

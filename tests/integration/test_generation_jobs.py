@@ -162,7 +162,7 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
     assert guided["evaluations"] == 4 and guided["known_guidance"] == 1 and guided["objects_per_ha"] > 0
     assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)] * 2
-    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 2
+    assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 4
 
     scores = evaluate(
         Config(
@@ -355,6 +355,8 @@ def test_scene_features_resume_interrupted_run(smoke, tmp_path, monkeypatch):
     parts[0].unlink()
     again = module.compute_scene_features(chosen, dataset, config, str(directory))
     assert [part.stat().st_mtime_ns for part in kept] == times
-    assert all(np.array_equal(first[name], again[name], equal_nan=name == "statistics") for name in first)
+    assert all(
+        np.array_equal(first[name], again[name], equal_nan=name in ("statistics", "relations")) for name in first
+    )
     module.compute_scene_features(chosen, dataset, module.FeatureConfig(supersample=2), str(directory))
     assert all(part.stat().st_mtime_ns > time for part, time in zip(kept, times, strict=True))
