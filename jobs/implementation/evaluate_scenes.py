@@ -33,7 +33,6 @@ from pipelines.evaluation.features import (
     SceneSet,
     compute_scene_features,
     drop_blank,
-    write_scene_features,
 )
 from pipelines.evaluation.reconstruction import draw_scenes, evaluate_reconstruction
 from pipelines.evaluation.streamed import compare_streamed
@@ -123,7 +122,7 @@ def evaluate_generation(
         directory = storage.join_uri(output, "described", name)
         described[name] = compute_scene_features(
             side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
-        )
+        ).read()
         if drops_blank:
             described[name], dropped[name] = drop_blank(described[name])
             if (left := len(described[name]["row"])) < 2:
@@ -187,7 +186,7 @@ def evaluate_streamed(
     for name, side, how in wanted:
         task = bar.add_task(f"describe {name}", total=sides[side].limit)
         directory = storage.join_uri(output, "described", name)
-        parts[name] = write_scene_features(
+        parts[name] = compute_scene_features(
             sides[side], None, how, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
         )
     task = bar.add_task("compare", total=1)
@@ -234,7 +233,7 @@ def describe_peers(config: Config, dataset: Dataset | None, output: str, bar: Pr
             storage.join_uri(output, "described", f"peer-{name}"),
             config.num_actors,
             lambda n, task=task: bar.advance(task, n),
-        )
+        ).read()
     return found
 
 

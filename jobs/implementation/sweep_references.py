@@ -42,7 +42,7 @@ def run_sweep(config: Config) -> list[dict]:
             directory = storage.join_uri(output, "described", name)
             described = compute_scene_features(
                 side, dataset, looks, directory, config.num_actors, lambda n, task=task: bar.advance(task, n)
-            )
+            ).read()
             features[name] = described["pool3" if config.inception else "random"]
         places = read_poses(*read_described_columns(parts["real"]))
         labels = list_label_pairs(read_described_columns(parts["generated"])[0])

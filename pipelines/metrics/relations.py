@@ -46,6 +46,7 @@ GROUP_OF = np.array([next(k for k, names in enumerate(GROUPS.values()) if name i
 # Objects to which a sign, a lamp or a signal can be attached.
 SUPPORTERS = tuple(CATEGORY_INDEX[name] for name in ("construction_big", "construction_small", "pole"))
 SUPPORTS = ("ground", "pole, wall or building", "nothing")
+UNSUPPORTED = len(SUPPORTS) - 1
 
 PER_CATEGORY = (
     "road_edge_m",  # Mean signed distance of the centre from the nearest edge of the road; negative on the road.
@@ -145,7 +146,20 @@ def compute_scene_relations(scene: Scene, slab_offset_m: float) -> SceneRelation
         Vector and histograms.
     """
     height_m, classes = fuse_ground(scene)
-    objects = measure_objects(scene, slab_offset_m, height_m, classes)
+    return summarise_relations(scene, measure_objects(scene, slab_offset_m, height_m, classes), classes)
+
+
+def summarise_relations(scene: Scene, objects: ObjectRelations, classes: np.ndarray) -> SceneRelations:
+    """Compute the relation statistics of one scene from the relations of its objects.
+
+    Args:
+        scene: Scene.
+        objects: Relations of the objects, as `measure_objects` returns them.
+        classes: (H, W) class of the fused ground, an index into GROUND_CLASSES; -1: no ground.
+
+    Returns:
+        Vector and histograms.
+    """
     perimeter, small_parts = measure_borders(classes, scene.grid.resolution_m)
     widths_m = measure_edge_widths(classes, scene.grid.resolution_m)
     spread = [widths_m.mean(), widths_m.std()] if len(widths_m) else [np.nan, np.nan]
@@ -230,26 +244,21 @@ def find_road_edge(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row, col
 
 
-def measure_edge_relations(
-    scene: Scene, classes: np.ndarray, chosen: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def measure_edge_relations(scene: Scene, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measure the position and the direction of objects relative to the nearest edge of the road.
 
     Args:
         scene: Scene with n objects.
         classes: (H, W) class of the fused ground, an index into GROUND_CLASSES; -1: no ground.
-        chosen: (n,) bool; objects to measure. None: all objects.
 
     Returns:
         Signed distance (n,) of the centre from the edge (m), negative on the road; and angle (n,) between the length
-        axis and the edge, in [0, pi / 2] (radians). Both are NaN for other objects, and if there is no edge.
+        axis and the edge, in [0, pi / 2] (radians). Both are NaN if there is no edge.
     """
-    signed_m, angle_rad = np.full((2, len(scene)), np.nan)
-    some = np.flatnonzero(np.ones(len(scene), bool) if chosen is None else chosen)
     row, col = find_road_edge(classes)
-    if len(row) < EDGE_PIXELS or not len(some):
-        return signed_m, angle_rad
-    xy_m = scene.center_m[some, :2].astype(np.float64)
+    if len(row) < EDGE_PIXELS or not len(scene):
+        return np.full(len(scene), np.nan), np.full(len(scene), np.nan)
+    xy_m = scene.center_m[:, :2].astype(np.float64)
     edge_m = np.stack([scene.grid.x_m()[row], scene.grid.y_m()[col]], axis=1)
     tree = cKDTree(edge_m)
     distance_m, nearest = tree.query(xy_m)
@@ -260,9 +269,8 @@ def measure_edge_relations(
     direction_rad = 0.5 * np.arctan2(2 * xy.sum(axis=1), (xx - yy).sum(axis=1))  # Axis of the largest spread.
     pixel, inside = _find_pixels(scene, xy_m)
     on_road = inside & IS_ROAD[classes[pixel]]
-    signed_m[some] = np.where(on_road, -distance_m, distance_m).clip(-EDGE_LIMIT_M, EDGE_LIMIT_M)
-    angle_rad[some] = _fold_angle(scene.yaw_rad[some] - direction_rad[place])
-    return signed_m, angle_rad
+    signed_m = np.where(on_road, -distance_m, distance_m).clip(-EDGE_LIMIT_M, EDGE_LIMIT_M)
+    return signed_m, _fold_angle(scene.yaw_rad - direction_rad[place])
 
 
 def _fold_angle(angle_rad: np.ndarray) -> np.ndarray:
@@ -324,7 +332,7 @@ def find_support(scene: Scene, gap_m: np.ndarray) -> np.ndarray:
     Returns:
         (n,) index into SUPPORTS.
     """
-    support = np.where(gap_m <= SUPPORT_M, 0, len(SUPPORTS) - 1)
+    support = np.where(gap_m <= SUPPORT_M, 0, UNSUPPORTED)
     hanging = np.flatnonzero(support.astype(bool) & ~np.isin(scene.category, VEGETATION))
     supporters = np.flatnonzero(np.isin(scene.category, SUPPORTERS))
     if len(hanging) and len(supporters):
@@ -424,7 +432,7 @@ def _average_by_category(category: np.ndarray, objects: ObjectRelations) -> np.n
             np.where(known, below == SIDEWALK, np.nan),
             road_points / np.maximum(total, 1),
             objects.gap_m.clip(-SUPPORT_RANGE_M, SUPPORT_RANGE_M),
-            objects.support < len(SUPPORTS) - 1,
+            objects.support != UNSUPPORTED,
         ],
         axis=1,
     ).reshape(-1, len(PER_CATEGORY))

@@ -30,7 +30,7 @@ from models.scene import (
     Scene,
 )
 from pipelines.geometry.masks import label_parts
-from pipelines.metrics.relations import SUPPORTERS, SUPPORTS, find_support, fuse_ground, measure_edge_relations
+from pipelines.metrics.relations import UNSUPPORTED, ObjectRelations, fuse_ground, measure_objects
 from pipelines.schema.density_labels import DensityThresholds, classify_density
 
 # Measures that use the height or class of the ground apply only to primitives with ground under their centre.
@@ -60,7 +60,7 @@ LABEL_MEASURES = (
 OVERLAP_SHARE = 0.25
 OVERLAP_IOU3D = 0.05
 ON_GROUND_M2 = 1.0
-FOOTPRINT_STEP_M = 0.25
+FOOTPRINT_STEP_M = 0.5
 LANE_ANGLE_RAD = np.pi / 4
 TOLERANCE_M = 0.5
 SLAB_OFFSET_M = 0.3  # Height of slab tops above the surface (KITTI-360, town). Argoverse 2 has no slabs.
@@ -94,6 +94,7 @@ def find_faults(
     slab_offset_m: float,
     tolerance_m: float = TOLERANCE_M,
     names: Sequence[str] = OBJECT_MEASURES,
+    objects: ObjectRelations | None = None,
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Find the implausible primitives, for each of OBJECT_MEASURES.
 
@@ -102,6 +103,7 @@ def find_faults(
         slab_offset_m: Height of the scene's ground raster above the surface on which objects stand (m).
         tolerance_m: Maximum distance of an object from the surface (m).
         names: Measures to compute.
+        objects: Relations of the primitives; None: they are measured if a measure needs them.
 
     Returns:
         For each measure, two (n,) bool arrays: whether a primitive is implausible, and whether the measure applies to
@@ -119,6 +121,7 @@ def find_faults(
     vehicles, constructions = np.isin(category, VEHICLES), np.isin(category, CONSTRUCTIONS)
     drivable, road = (_make_mask(scene, classes) for classes in (DRIVABLE_CLASSES, ROAD_CLASSES))
     attached = np.isin(category, ATTACHED)
+    relations = cache(lambda: objects or measure_objects(scene, slab_offset_m, *fuse_ground(scene)))
     overlaps = cache(lambda: _find_overlapping(scene))
     sidewalk = _make_mask(scene, ("sidewalk",)) & ~road
     areas_m2 = cache(lambda: _measure_footprints_m2(scene, constructions, np.stack([road, sidewalk], axis=-1)))
@@ -131,8 +134,11 @@ def find_faults(
         "off_road_vehicles": lambda: (~drivable[pixel], vehicles & known),
         "constructions_on_road": lambda: (areas_m2()[:, 0] > ON_GROUND_M2, constructions),
         "constructions_on_sidewalk": lambda: (areas_m2()[:, 1] > ON_GROUND_M2, constructions),
-        "unattached": lambda: (_find_unattached(scene, attached, above_m), attached & inside),
-        "across_lane_vehicles": lambda: _find_across_lane(scene, vehicles & road[pixel] & inside),
+        "unattached": lambda: (relations().support == UNSUPPORTED, attached & inside),
+        "across_lane_vehicles": lambda: (
+            relations().edge_angle_rad > LANE_ANGLE_RAD,
+            vehicles & road[pixel] & inside & np.isfinite(relations().edge_angle_rad),
+        ),
     }
     found = {name: find[name]() for name in names}
     return {name: (bad & among, among) for name, (bad, among) in found.items()}
@@ -151,19 +157,22 @@ def compute_scene_validity(scene: Scene, slab_offset_m: float) -> np.ndarray:
     return sum_validity(*compute_category_validity(scene, slab_offset_m))
 
 
-def compute_category_validity(scene: Scene, slab_offset_m: float) -> tuple[np.ndarray, np.ndarray]:
+def compute_category_validity(
+    scene: Scene, slab_offset_m: float, objects: ObjectRelations | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Compute the validity record of one scene for each category.
 
     Args:
         scene: Scene.
         slab_offset_m: Height of the scene's ground raster above the surface on which objects stand (m).
+        objects: Relations of the primitives; None: they are measured.
 
     Returns:
         (10, 11, 2) numerators and denominators of OBJECT_MEASURES for each category, and (2,) numerator and denominator
         of the road connectivity.
     """
     record = np.zeros((len(OBJECT_MEASURES), len(CATEGORIES), 2))
-    for k, (bad, among) in enumerate(find_faults(scene, slab_offset_m).values()):
+    for k, (bad, among) in enumerate(find_faults(scene, slab_offset_m, objects=objects).values()):
         for side, mask in enumerate((bad, among)):
             record[k, :, side] = np.bincount(scene.category[mask], minlength=len(CATEGORIES))
     return record, np.array(_find_largest_component(_make_mask(scene, ROAD_CLASSES)), np.float64)
@@ -253,20 +262,6 @@ def _measure_footprints_m2(scene: Scene, chosen: np.ndarray, masks: np.ndarray) 
     for k in range(masks.shape[-1]):
         areas_m2[some, k] = np.bincount(owner, on[:, k], minlength=len(some)) / points * size_m.prod(axis=1)
     return areas_m2
-
-
-def _find_unattached(scene: Scene, attached: np.ndarray, above_m: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: whether nothing supports a chosen primitive."""
-    part = np.flatnonzero(attached | np.isin(scene.category, SUPPORTERS))
-    unattached = np.zeros(len(scene), bool)
-    unattached[part] = find_support(scene.select(part), above_m[part]) == len(SUPPORTS) - 1
-    return unattached
-
-
-def _find_across_lane(scene: Scene, vehicles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) bool: whether a vehicle is turned by more than LANE_ANGLE_RAD; and whether its angle is known."""
-    _, angle_rad = measure_edge_relations(scene, fuse_ground(scene)[1], vehicles)
-    return angle_rad > LANE_ANGLE_RAD, vehicles & np.isfinite(angle_rad)
 
 
 def _find_overlapping(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pipelines.metrics.inception import hash_weights
+from pipelines.metrics.networks import INPUT_SIZE, compute_resized_features, hash_weights
 
-INPUT_SIZE = 224
 FEATURES = 4096
 BATCH_SIZE = 16
 KNOWN_FILE = "vgg16-397923af.pth of torchvision (https://download.pytorch.org/models/vgg16-397923af.pth)"
@@ -106,7 +104,7 @@ def load_vgg16(path: str | Path) -> VGG16:
 
 
 def hash_vgg16_weights(path: str | Path) -> str:
-    """Return the hexadecimal sha256 of a weight file.
+    """Return the hexadecimal sha256 of a weight file (`networks.hash_weights`).
 
     Args:
         path: Weight file.
@@ -117,9 +115,7 @@ def hash_vgg16_weights(path: str | Path) -> str:
     Raises:
         ValueError: The file is missing, or its name contains a different sha256.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such file; VGG16 weights must be local, such as {KNOWN_FILE}")
-    return hash_weights(path)
+    return hash_weights(path, "VGG16", KNOWN_FILE)
 
 
 def describe_vgg16(path: str | Path) -> str:
@@ -140,12 +136,10 @@ def describe_vgg16(path: str | Path) -> str:
     return f"VGG16 weights {path}, sha256 {sha256}: {verdict}"
 
 
-@torch.inference_mode()
 def compute_vgg16_features(network: VGG16, pictures: np.ndarray) -> np.ndarray:
-    """Compute the VGG16 features of pictures in batches of 16.
+    """Compute the VGG16 features of pictures in batches of 16 (`compute_resized_features`).
 
-    Each picture is resized to 224 x 224 pixels, bilinearly with antialiasing and without cropping, because the border
-    of a scene counts as much as its centre. Pixels are divided by 255 and normalised with ImageNet's statistics.
+    Pixels are divided by 255 and normalised with ImageNet's statistics.
 
     Args:
         network: Network on any device.
@@ -157,16 +151,9 @@ def compute_vgg16_features(network: VGG16, pictures: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: The pictures have another type or shape.
     """
-    if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[-1] != 3:
-        raise ValueError(f"pictures must be uint8 (n, height, width, 3), got {pictures.dtype} {pictures.shape}")
-    device = next(network.parameters()).device
-    mean, deviation = (torch.tensor(part, device=device).view(3, 1, 1) for part in (PIXEL_MEAN, PIXEL_DEVIATION))
-    features = np.empty((len(pictures), FEATURES), np.float32)
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # TF32 keeps only 10 of the 23 mantissa bits.
-        for start in range(0, len(pictures), BATCH_SIZE):
-            batch = torch.from_numpy(np.array(pictures[start : start + BATCH_SIZE], order="C")).to(device)
-            x = batch.permute(0, 3, 1, 2).float()
-            if x.shape[2:] != (INPUT_SIZE, INPUT_SIZE):
-                x = F.interpolate(x, (INPUT_SIZE, INPUT_SIZE), mode="bilinear", antialias=True)
-            features[start : start + BATCH_SIZE] = network((x / 255 - mean) / deviation).cpu().numpy()
-    return features
+    return compute_resized_features(network, pictures, FEATURES, BATCH_SIZE, _normalise)
+
+
+def _normalise(x: Tensor) -> Tensor:
+    mean, deviation = (x.new_tensor(part).view(3, 1, 1) for part in (PIXEL_MEAN, PIXEL_DEVIATION))
+    return (x / 255 - mean) / deviation

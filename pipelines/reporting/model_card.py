@@ -9,7 +9,13 @@ from dataclasses import asdict, dataclass
 from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.metrics.controls import CONTROLS, list_headline_scores
 from pipelines.reporting.chart import Chart, format_number
-from pipelines.reporting.evaluation_report import VALIDITY, format_value, list_headlines
+from pipelines.reporting.evaluation_report import (
+    NEIGHBOURHOOD,
+    VALIDITY,
+    build_neighbourhood_table,
+    format_value,
+    list_headlines,
+)
 
 HIDDEN = ("stage", "dataset", "lvae")  # Options that are paths or digests; other parts of the card contain them.
 
@@ -143,12 +149,24 @@ class ModelCard:
             "scenes. `metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
         )
         ceiling = generation.get("sets", {}).get("ceiling", {})
+        left_out = (".memory_bytes.", ".validity.", ".label_fidelity.", *(f"{name}_k" for name in NEIGHBOURHOOD))
         rows = [
             (name, format_value(value), format_value(ceiling.get(name.removeprefix("generation."))) or "–")
             for name, value in list_headlines(self.scores)
-            if not name.endswith(".real")
+            if not any(part in name for part in left_out)
         ]
         yield from render_table(("score", "value", "other real scenes (ceiling)"), rows)
+        neighbourhoods = build_neighbourhood_table(generation)
+        yield from render_table(neighbourhoods.columns, [tuple(map(str, row)) for row in neighbourhoods.rows])
+        ceiling = self.scores["reconstruction"]["label_fidelity"]
+        rows = [
+            (name.replace("_", " "), format_value(value), format_value(ceiling[name]))
+            for name, value in generation["label_fidelity"].items()
+            if value is not None
+        ]
+        yield from render_table(
+            ("density label as requested", "generated", "reconstructions, existence > 0.3 (ceiling)"), rows
+        )
         yield from self._controls()
 
     def _controls(self) -> Iterator[str]:

@@ -83,14 +83,14 @@ def test_scene_features_are_unchanged_by_worker_kill(smoke, tmp_path):
     """The test kills the worker as soon as the job has written the first part."""
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     chosen = SceneSubset(dataset.root, "town", "train")
-    whole = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "whole"))
+    whole = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "whole")).read()
     killed = []
 
     def kill(scenes: int) -> None:
         if scenes and not killed:
             killed.extend(kill_ray_workers("describe_scenes"))
 
-    again = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "killed"), on_scenes=kill)
+    again = compute_scene_features(chosen, dataset, FeatureConfig(), str(tmp_path / "killed"), on_scenes=kill).read()
     assert len(killed) == 1 and whole.keys() == again.keys()
     assert all(
         np.array_equal(whole[name], again[name], equal_nan=name in ("statistics", "relations")) for name in whole

@@ -326,7 +326,7 @@ def test_evaluate_real_against_itself_is_near_perfect(smoke, tmp_path):
     dataset = Dataset.open(str(smoke / "datasets/smoke"))
     side = compute_scene_features(
         SceneSubset(dataset.root, "town", "train"), dataset, FeatureConfig(), str(tmp_path / "described")
-    )
+    ).read()
     scores = compare_datasets(side, side, dataset.spec.ground_classes)
     assert abs(scores["layout_frechet"].value) < 1e-4 and abs(scores["random_frechet"].value) < 1e-4
     assert scores["random_precision_k3"].value == scores["random_recall_k3"].value == 1.0
@@ -348,12 +348,12 @@ def test_scene_features_resume_interrupted_run(smoke, tmp_path, monkeypatch):
         module.FeatureConfig(),
         tmp_path / "described",
     )
-    first = module.compute_scene_features(chosen, dataset, config, str(directory))
+    first = module.compute_scene_features(chosen, dataset, config, str(directory)).read()
     parts = sorted(directory.glob("part-*.parquet"))
     assert len(parts) == len(chosen.shards()) > 1
     kept, times = parts[1:], [part.stat().st_mtime_ns for part in parts[1:]]
     parts[0].unlink()
-    again = module.compute_scene_features(chosen, dataset, config, str(directory))
+    again = module.compute_scene_features(chosen, dataset, config, str(directory)).read()
     assert [part.stat().st_mtime_ns for part in kept] == times
     assert all(
         np.array_equal(first[name], again[name], equal_nan=name in ("statistics", "relations")) for name in first

@@ -36,7 +36,7 @@ def test_train_dit_creates_inputs_of_smoke_preset(home):
 
 def test_train_dit_conditions_on_a_label_that_the_data_have(home):
     from jobs.implementation.checks import resolve_label_kind
-    from jobs.implementation.train_dit import warn_about_missing_labels
+    from jobs.implementation.train_dit import check_training_labels
     from jobs.train_dit import Config
 
     town = Dataset.open(str(home / "datasets/smoke"))
@@ -55,7 +55,7 @@ def test_train_dit_conditions_on_a_label_that_the_data_have(home):
             return pa.table({column: ["medium"] * 3 for column in columns})
 
     with pytest.raises(ValueError, match="all 3 training scenes have the label 'medium'"):
-        warn_about_missing_labels([Uniform()], "vegetation")
+        check_training_labels([Uniform()], "vegetation")
 
 
 def test_encode_latents_match_lvae_and_scene_order(home):
