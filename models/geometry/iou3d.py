@@ -183,6 +183,27 @@ def find_overlapping_bounds(a: Boxes, b: Boxes) -> tuple[np.ndarray, np.ndarray]
     return index_a, index_b
 
 
+def find_intersecting_pairs(a: Boxes, b: Boxes) -> np.ndarray:
+    """Test for each pair a[i], b[i] whether the boxes intersect or touch, by the separating axis theorem.
+
+    The test is exact up to rounding and much faster than the volume of the intersection. The possible separating axes
+    are the axes of both boxes and their cross products (Gottschalk et al., OBBTree, 1996).
+
+    Args:
+        a: n boxes.
+        b: n boxes.
+
+    Returns:
+        (n,) bool.
+    """
+    axes_a, axes_b = np.swapaxes(a.rotation, 1, 2), np.swapaxes(b.rotation, 1, 2)  # (n, 3, 3), one axis per row.
+    crossed = np.cross(axes_a[:, :, None], axes_b[:, None]).reshape(-1, 9, 3)
+    axes = np.concatenate([axes_a, axes_b, crossed], axis=1)  # (n, 15, 3)
+    gap_m = np.abs(axes @ (b.center_m - a.center_m)[..., None])[..., 0]
+    reach_a_m, reach_b_m = ((np.abs(axes @ box.rotation) @ (box.size_m / 2)[..., None])[..., 0] for box in (a, b))
+    return np.all(gap_m <= reach_a_m + reach_b_m, axis=1)
+
+
 def _compute_iou(intersection: np.ndarray, volume_a: np.ndarray, volume_b: np.ndarray) -> np.ndarray:
     union = volume_a + volume_b - intersection
     return np.divide(intersection, union, out=np.zeros_like(union), where=union > 0)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from skimage.measure import label as label_regions
 
-from models.geometry.iou3d import Boxes, compute_intersection_volume_m3, extract_boxes, find_overlapping_bounds
+from models.geometry.iou3d import Boxes, extract_boxes, find_intersecting_pairs, find_overlapping_bounds
 from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, ROAD_CLASSES, VEGETATION, Scene
 from pipelines.metrics.distributions import NO_GROUND, Histogram
 
@@ -175,10 +175,10 @@ def fuse_ground(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         scene: Scene.
 
     Returns:
-        Height (H, W) in metres, and class (H, W) as an index into GROUND_CLASSES; -1: no ground.
+        Height (H, W) in metres, and class (H, W) int8 as an index into GROUND_CLASSES; -1: no ground.
     """
     height_m, winner = scene.surface()
-    index = np.array([*(GROUND_CLASSES.index(name) for name in scene.ground_classes), -1])
+    index = np.array([*(GROUND_CLASSES.index(name) for name in scene.ground_classes), -1], np.int8)
     return height_m, index[winner]
 
 
@@ -322,7 +322,7 @@ def find_support(scene: Scene, gap_m: np.ndarray) -> np.ndarray:
     """Find what supports each object.
 
     An object stands on the ground if the gap under its lowest point is at most SUPPORT_M. Otherwise, a pole, wall or
-    building supports the object if the boxes of both, enlarged by half of SUPPORT_M on each side, overlap. Vegetation
+    building supports the object if the boxes of both, enlarged by half of SUPPORT_M on each side, intersect. Vegetation
     is only tested against the ground, because the data do not annotate trunks.
 
     Args:
@@ -341,7 +341,7 @@ def find_support(scene: Scene, gap_m: np.ndarray) -> np.ndarray:
         i, j = find_overlapping_bounds(grown.take(hanging), grown.take(supporters))
         other = hanging[i] != supporters[j]
         i, j = hanging[i[other]], supporters[j[other]]
-        support[i[compute_intersection_volume_m3(grown.take(i), grown.take(j)) > 0]] = 1
+        support[i[find_intersecting_pairs(grown.take(i), grown.take(j))]] = 1
     return support
 
 

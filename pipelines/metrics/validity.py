@@ -113,9 +113,11 @@ def find_faults(
     row, col = scene.grid.pixel(scene.center_m[:, 0], scene.center_m[:, 1])
     inside = scene.grid.contains(scene.center_m[:, 0], scene.center_m[:, 1])
     pixel = row.clip(0, scene.grid.rows - 1), col.clip(0, scene.grid.cols - 1)
-    height_m, ground_class = scene.ground_under()
-    known = ground_class >= 0
-    above_m = scene.bottom_m - (height_m - slab_offset_m)
+    if objects:
+        known, above_m = objects.class_below >= 0, objects.gap_m
+    else:
+        height_m, ground_class = scene.ground_under()
+        known, above_m = ground_class >= 0, scene.bottom_m - (height_m - slab_offset_m)
 
     standing, solid = np.isin(category, STANDING), np.isin(category, SOLID)
     vehicles, constructions = np.isin(category, VEHICLES), np.isin(category, CONSTRUCTIONS)

@@ -8,7 +8,13 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from scipy.spatial.transform import Rotation
 
 from models.geometry import iou3d
-from models.geometry.iou3d import Boxes, compute_iou3d_matrix, compute_iou3d_pairs, make_boxes
+from models.geometry.iou3d import (
+    Boxes,
+    compute_iou3d_matrix,
+    compute_iou3d_pairs,
+    find_intersecting_pairs,
+    make_boxes,
+)
 from models.scene import make_yaw_rotation
 
 TOLERANCE = 1e-4
@@ -213,3 +219,18 @@ def test_ball_points_are_uniform():
     assert (radius <= 0.5).mean() == pytest.approx(1 / 8, abs=2e-3)
     octant = (points > 0) @ [1, 2, 4]
     np.testing.assert_allclose(np.bincount(octant) / 4096, 1 / 8, atol=3e-3)
+
+
+def test_separating_axes_agree_with_manifold():
+    rng, n = np.random.default_rng(5), 2000
+    rotations = Rotation.random(2 * n, random_state=5).as_matrix()
+    a, b = (
+        make_boxes(rng.uniform(-1.5, 1.5, (n, 3)), part, rng.uniform(0.2, 2.5, (n, 3)))
+        for part in (rotations[:n], rotations[n:])
+    )
+    found, iou = find_intersecting_pairs(a, b), compute_manifold_iou(a, b)
+    assert 0.2 < found.mean() < 0.9 and not (iou[~found] > 1e-9).any()
+    assert (iou[found] > 0).mean() > 0.995  # the others touch almost without volume
+    cubes = np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.ones((2, 3))
+    moved = make_boxes(np.array([[0.99, 0, 0], [1.01, 0, 0]]), *cubes[1:])
+    assert find_intersecting_pairs(make_boxes(*cubes), moved).tolist() == [True, False]
