@@ -8,7 +8,8 @@
 The job counts class changes, height steps, cut objects and duplicate objects at each seam. Each score is the ratio
 of the count at the seam to the count at parallel lines 4 to 16 m away. A ratio of 1 means that the seam is invisible.
 For comparison, the job also scores lines across the street in real scenes. Lines along the street are not comparable,
-because the borders of a street are parallel to such lines.
+because the borders of a street are parallel to such lines. A control shows that the scores can fail: the halves of
+different real scenes, joined across the street.
 
 The job writes metrics.json, metrics.parquet, seams.parquet (one row per scene) and seams.html, and logs the scores to
 MLflow. A reliable result needs at least 200 seams.

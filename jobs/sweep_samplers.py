@@ -5,6 +5,8 @@
     jobs/sweep_samplers.py --samplers ddpm dpm++ --num-inference-steps 10 250 --num-scenes 64
     jobs/sweep_samplers.py --samplers dpm++ --num-inference-steps 20 --noise-scalings 1 1.005 1.01      for a new model
 
+The last two rows are other real scenes (the ceiling) and a damaged copy of them (the control), scored in the same way.
+
 The job writes the scenes (source=generated-<sampler>-<steps>), samplers.json, samplers.parquet, figures (SVG) and
 samplers.html. Run the same command again to resume after an interruption.
 """
@@ -24,6 +26,8 @@ class Config:
     """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
     real_split: str = "test"
     """Split of the real scenes."""
+    ceiling_split: str = ""
+    """Split of the other real scenes, the ceiling (default: test for the real split train, otherwise train)."""
     samplers: tuple[str, ...] = ("ddpm", "ddim", "dpm++")
     """Samplers to compare: ddpm, ddim, dpm++ or sde-dpm++."""
     num_inference_steps: tuple[int, ...] = (10, 20, 50, 100, 250)

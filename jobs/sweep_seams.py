@@ -5,9 +5,11 @@
     jobs/sweep_seams.py --max-scenes 50 --settings 250 10 10 0 1 50 1 1 1 0      two settings of five numbers
 
 A setting has five numbers: denoising steps, jump length, resamplings, weight of pseudoinverse guidance, and eta (share
-of DDPM's noise). The paper's setting is 250 10 10 0 1, which needs 2,410 network evaluations per block. The job writes
-the scenes (source=generated-<the five numbers>), sweep.json, sweep.parquet and sweep.html. Run the same command again
-to resume after an interruption.
+of DDPM's noise). The paper's setting is 250 10 10 0 1, which needs 2,410 network evaluations per block. The last two
+rows are lines across the street in real scenes (the ceiling) and joined halves of unrelated real scenes (the control).
+
+The job writes the scenes (source=generated-<the five numbers>), sweep.json, sweep.parquet and sweep.html. Run the same
+command again to resume after an interruption.
 """
 
 from __future__ import annotations
@@ -30,6 +32,14 @@ class Config(GenerationOptions):
     """Overlap of neighbouring blocks, as a share of the block size."""
     neighbour_latents: tuple[Literal["reencode", "copy", "paper"], ...] = ("reencode",)
     """How a block uses its neighbours (see outpaint_scenes.py); every setting is measured in each of these ways."""
+    real: str = ""
+    """Dataset directory of the real scenes (default: $PRITTI_HOME/datasets/town)."""
+    real_split: str = "test"
+    """Split of the real scenes."""
+    real_rows_m: tuple[float, ...] = (16.0, 32.0, 48.0)
+    """Lines across the street in real scenes, as distances from the far edge of a scene in metres."""
+    max_real_scenes: int | None = 240
+    """Maximum number of real scenes, selected evenly."""
     output: str = ""
     """Directory to write to (default: $PRITTI_HOME/evaluations/sweep-seams)."""
     batch_size: int = 4

@@ -17,6 +17,8 @@ from jobs.support.cli import home_path, make_absolute, resolve_path
 from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from jobs.support.value_names import REFERENCES
+from models.pretrained import INDEX_NAME
+from models.tensors import EXISTENCE_THRESHOLD
 from pipelines.evaluation.evaluate import (
     compare_datasets,
     convert_estimates,
@@ -110,7 +112,7 @@ def evaluate_generation(
     looks = FeatureConfig(
         config.supersample,
         config.inception and make_absolute(config.inception),
-        prepare_lite0(config),
+        prepare_lite0(config.lite0),
         vgg16=config.vgg16 and make_absolute(config.vgg16),
         blank=drops_blank,
     )
@@ -177,7 +179,7 @@ def evaluate_streamed(
     """
     inception = config.inception and make_absolute(config.inception)
     looks = FeatureConfig(
-        config.supersample, inception, "" if inception else prepare_lite0(config), random=not inception
+        config.supersample, inception, "" if inception else prepare_lite0(config.lite0), random=not inception
     )
     wanted = [(name, name, looks) for name in sides]
     if config.controls:
@@ -207,13 +209,16 @@ def evaluate_streamed(
     return scores
 
 
-def prepare_lite0(config: Config) -> str:
+def prepare_lite0(wanted: bool | None = None) -> str:
     """Return the file with the converted weights of EfficientNet-Lite0, or "" if its features are not used.
 
+    Args:
+        wanted: Whether to use the features. None: if the extra is installed.
+
     Raises:
-        ValueError: --lite0 is given, but the extra is not installed.
+        ValueError: The features are wanted, but the extra is not installed.
     """
-    wanted = find_spec(LITE0_PACKAGE) is not None if config.lite0 is None else config.lite0
+    wanted = find_spec(LITE0_PACKAGE) is not None if wanted is None else wanted
     return convert_lite0_weights(home_path("weights")) if wanted else ""
 
 
@@ -382,6 +387,20 @@ def describe_protocol(config: Config, sides: dict[str, SceneSet], looks: Feature
     return [*words, describe_weights(looks.inception)] if looks.inception else words
 
 
+def read_existence_threshold(lvae: str) -> float:
+    """Return the existence threshold of the pipeline that a layout VAE belongs to.
+
+    Args:
+        lvae: Directory of the layout VAE; the directory above it may be a pipeline.
+
+    Returns:
+        Threshold of the pipeline. If there is no pipeline, or if it stores none: the paper's threshold.
+    """
+    index = storage.join_uri(lvae.rstrip("/").rpartition("/")[0], INDEX_NAME)
+    stored = storage.read_json(index) if storage.exists(index) else {}
+    return stored.get("existence_threshold", EXISTENCE_THRESHOLD)
+
+
 def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Progress) -> dict:
     """Score reconstructions and write reconstruction.parquet and reconstruction.html.
 
@@ -397,6 +416,7 @@ def score_reconstruction(config: Config, dataset: Dataset, output: str, bar: Pro
         voxel_range_m=config.voxel_range_m,
         dataset=dataset,
         on_scene=lambda: bar.advance(shown),
+        label_threshold=read_existence_threshold(lvae),
     )
     storage.write_parquet(rebuilt.scenes, storage.join_uri(output, "reconstruction.parquet"))
     count = min(config.num_examples, len(rebuilt.places) // 2)

@@ -12,6 +12,7 @@ from jobs.support.ray_session import start_ray
 from jobs.support.scores import publish_scores
 from pipelines.evaluation.evaluate import convert_estimates
 from pipelines.evaluation.seams import (
+    COLUMNS,
     SeamLines,
     build_seams_table,
     join_scene_sets,
@@ -58,6 +59,9 @@ def evaluate_seams(config: Config) -> dict:
         for name, (selection, lines) in sides.items():
             task = bar.add_task(f"measure {name}", total=sum(len(rows) for _, rows in selection.shards()))
             measured[name] = measure_seams(selection, lines, config.num_actors, lambda task=task: bar.advance(task))
+        real, lines = sides["real"]
+        task = bar.add_task("measure unrelated halves", total=len(measured["real"].scene_ids))
+        measured["joined"] = measure_seams(real, lines, config.num_actors, lambda: bar.advance(task), is_joined=True)
     scores = join_scene_sets(measured)
     storage.write_parquet(build_seams_table(measured), storage.join_uri(output, "seams.parquet"))
     html = render_seams_html(convert_estimates(scores), *sides["generated"], SHOWN)
@@ -68,7 +72,7 @@ def evaluate_seams(config: Config) -> dict:
 
 def main(config: Config) -> None:
     scores = evaluate_seams(config)
-    lines = Table("seams / nearby lines", "generated", "real")
+    lines = Table("seams / nearby lines", *(COLUMNS[side] for side in scores["scenes"]))
     for row in select_shown_rows(scores):
         lines.add_row(*row)
     Console().print(lines)

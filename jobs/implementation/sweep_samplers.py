@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import pyarrow as pa
 from rich.progress import Progress
 
+from jobs.implementation.evaluate_scenes import count_scenes, prepare_lite0
 from jobs.support.cli import require_positive, resolve_path
 from jobs.support.model_directories import find_pipeline_directory, read_label_kind
 from jobs.support.ray_session import start_ray
@@ -26,6 +28,7 @@ from pipelines.evaluation.sampler_sweep import (
     render_sampler_html,
 )
 from pipelines.generation.sample import SampleRequest, sample_scenes
+from pipelines.metrics.controls import CONTROLS
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.chart import make_standalone_svg
 from pipelines.reporting.report import Picture
@@ -33,6 +36,8 @@ from pipelines.runtime import storage
 from pipelines.schema.dataset import Dataset
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import read_scenes
+
+CONTROL = "moved"  # Damage of the row that shows whether a score can fail.
 
 
 def sweep_samplers(config: Config) -> list[dict]:
@@ -56,17 +61,26 @@ def sweep_samplers(config: Config) -> list[dict]:
     dataset = Dataset.open(resolve_path(config.real, "datasets", "town"))
     output = resolve_path(config.output, "evaluations", "samplers")
     real = SceneSubset(dataset.root, dataset.source, config.real_split, config.num_scenes, "spread")
-    count = sum(len(rows) for _, rows in real.shards())
+    count = count_scenes(real)
+    others = replace(real, split=config.ceiling_split or ("train" if config.real_split == "test" else "test"))
+    if count_scenes(others) < count:
+        raise ValueError(
+            f"--ceiling-split {others.split} of {dataset.root} has {count_scenes(others)} scenes, but the ceiling needs"
+            f" {count}: give another split, or fewer --num-scenes"
+        )
+    others = replace(others, limit=count)
     labels = LABELS[read_label_kind(model)]
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:
+        looks = FeatureConfig(lite0=prepare_lite0())
 
-        def described(side: SceneSubset, name: str) -> dict:
+        def described(side: SceneSubset, name: str, control: str = "") -> dict:
             task = bar.add_task(f"describe {name}", total=count)
             directory = storage.join_uri(output, "described", name)
+            how = replace(looks, control=control)
             return compute_scene_features(
-                side, dataset, FeatureConfig(), directory, config.num_actors, lambda n: bar.advance(task, n)
+                side, dataset, how, directory, config.num_actors, lambda n: bar.advance(task, n)
             ).read()
 
         truth = described(real, "real")
@@ -94,8 +108,13 @@ def sweep_samplers(config: Config) -> list[dict]:
             rows.append(make_sampler_row(sampler, steps, used, seconds_per_scene, scores))
             scenes = read_scenes(output, request.source, limit=config.num_examples) if config.num_examples else ()
             pictures += [Picture(f"{request.run}, {s.frame}", render_bev(s, supersample=2)) for s in scenes]
+        for name, control in (("other real scenes (ceiling)", ""), (f"control: {CONTROLS[CONTROL]}", CONTROL)):
+            found = described(others, control or "ceiling", control)
+            scores = compare_datasets(truth, found, dataset.spec.ground_classes)
+            rows.append(make_sampler_row(name, None, None, None, scores))
     how = [
         f"Real: {count} scenes of {dataset.root}, split {config.real_split}, selected evenly. Model: {model}.",
+        f"Ceiling and control: {count_scenes(others)} scenes of split {others.split}, selected evenly.",
         f"Seed {config.seed}, guidance scale {config.guidance_scale:g}, labels in turn: {', '.join(labels)}.",
     ]
     write_report(output, rows, pictures, max(1, config.num_examples), how)

@@ -21,7 +21,7 @@ from pipelines.evaluation.seam_sweep import (
     make_seam_row,
     render_seam_sweep_html,
 )
-from pipelines.evaluation.seams import SeamLines, draw_lines, measure_seams
+from pipelines.evaluation.seams import COLUMNS, SeamLines, draw_lines, measure_seams
 from pipelines.generation.outpaint import OutpaintRequest, outpaint_scenes
 from pipelines.metrics.seams import estimate_seam_ratios
 from pipelines.reporting.report import Picture
@@ -43,6 +43,8 @@ def sweep_seams(config: Config) -> list[dict]:
     output = resolve_path(config.output, "evaluations", "sweep-seams")
     selection = select_scenes(config)
     count = sum(len(rows) for _, rows in selection.shards())
+    real = SceneSubset(resolve_path(config.real, "datasets", "town"), None, config.real_split, config.max_real_scenes)
+    real.shards()  # raise an error for missing scenes before hours of outpainting
     rows, pictures = [], []
     start_ray()
     with Progress() as bar:
@@ -68,6 +70,11 @@ def sweep_seams(config: Config) -> list[dict]:
             rows.append(make_seam_row(mode, request.repaint, seams, objects, estimate_seam_ratios(measured.records)))
             first = next(read_scenes(output, request.source))
             pictures.append(Picture(first.scene_id, draw_lines(first, SeamLines()), name))
+        for key, name in enumerate(("real", "joined")):
+            measured = measure_seams(real, SeamLines(config.real_rows_m), config.num_actors, is_joined=name == "joined")
+            objects = count_objects_per_ha(scene for shard, chosen in real.shards() for scene in shard.scenes(chosen))
+            ratios = estimate_seam_ratios(measured.records, key)
+            rows.append(make_seam_row(COLUMNS[name], None, int(measured.seams.sum()), objects, ratios))
     storage.write_json(rows, storage.join_uri(output, "sweep.json"))
     storage.write_parquet(pa.Table.from_pylist(rows), storage.join_uri(output, "sweep.parquet"))
     how = [f"{count} scenes of {selection.root}, overlap {config.overlap:g}. Model: {model}."]

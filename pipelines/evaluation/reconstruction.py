@@ -183,12 +183,14 @@ def make_scene_record(
     voxels: VoxelGrid,
     dataset: Dataset | None = None,
     deduplicate: bool = False,
+    label_threshold: float = EXISTENCE_THRESHOLD,
 ) -> SceneRecord:
     """Compare a scene with its reconstruction. The ground is compared at the resolutions of the scene and of the model.
 
     The scores cover all true primitives, including primitives without a slot. AP3D ranks all proposals. Pairs and
     voxels are computed from the decoded scene, which contains only proposals above the existence threshold. If
-    `deduplicate` is True, duplicates among these are removed for all scores, as in generation.
+    `deduplicate` is True, duplicates among these are removed for all scores, as in generation. Labels are judged from
+    the proposals above `label_threshold`.
     """
     decoded_m = spec.height_bounds_m.restore(layout.height[..., None])[..., 0].astype(np.float32)
     proposals = decode_layout(layout, spec, truth, threshold=-1.0)
@@ -213,17 +215,23 @@ def make_scene_record(
         outside=count_outside(truth, voxels),
         bounds=count_outside_bounds(truth, spec),
         memory=measure_memory_bytes(make_layout_batch([truth], spec), latent, true_voxels),
-        labels=judge_labels(rebuilt, dataset),
+        labels=judge_labels(proposals.select(proposals.existence > label_threshold), dataset),
     )
 
 
 def score_chunk(
-    row: dict, chunks: list[Chunk], spec: LayoutSpec, voxels: VoxelGrid, dataset: Dataset | None, deduplicate: bool
+    row: dict,
+    chunks: list[Chunk],
+    spec: LayoutSpec,
+    voxels: VoxelGrid,
+    dataset: Dataset | None,
+    deduplicate: bool,
+    label_threshold: float,
 ) -> list[dict]:
     """Compute one record per scene from an output row of a Reconstructor."""
     return [
         {"id": row["id"], "row": number, "scene_id": scene.scene_id}
-        | make_scene_record(scene, layout, latent, spec, voxels, dataset, deduplicate).to_row()
+        | make_scene_record(scene, layout, latent, spec, voxels, dataset, deduplicate, label_threshold).to_row()
         for number, scene, layout, latent in unstack_layouts(row, chunks)
     ]
 
@@ -276,6 +284,7 @@ def evaluate_reconstruction(
     voxel_range_m: tuple[float, float] = VOXEL_RANGE_M,
     dataset: Dataset | None = None,
     on_scene: Callable[[], None] | None = None,
+    label_threshold: float = EXISTENCE_THRESHOLD,
 ) -> Reconstruction:
     """Compute the reconstruction scores of an LVAE from the latent means of selected scenes (paper, Sec. 4.1).
 
@@ -287,6 +296,9 @@ def evaluate_reconstruction(
         voxel_range_m: Bottom and top of the voxel grid (m, scene frame).
         dataset: Dataset with the thresholds of density labels. None: label fidelity is not scored.
         on_scene: Called after each scene.
+        label_threshold: Minimum existence probability of the primitives that determine density labels. Generated
+            scenes are compared with these labels, so it should be the threshold of generation. All other scores use
+            the paper's threshold.
 
     Returns:
         Scores of the dataset and of each scene.
@@ -297,7 +309,14 @@ def evaluate_reconstruction(
     graph = flat_map_dataset(
         reconstruct_chunks(chunks, lvae, num_actors),
         score_chunk,
-        fn_kwargs={"chunks": chunks, "spec": spec, "voxels": voxels, "dataset": dataset, "deduplicate": deduplicate},
+        fn_kwargs={
+            "chunks": chunks,
+            "spec": spec,
+            "voxels": voxels,
+            "dataset": dataset,
+            "deduplicate": deduplicate,
+            "label_threshold": label_threshold,
+        },
         num_cpus=READER_CPUS,
     )
     rows = []
@@ -309,6 +328,7 @@ def evaluate_reconstruction(
     records = [SceneRecord.from_row(row) for row in rows]
     scores = compute_reconstruction_scores(records, spec, voxels)
     scores["memory_bytes"]["tables"] = measure_table_bytes(chunks)
+    scores["label_existence_threshold"] = label_threshold
     table = compute_scene_scores([row["scene_id"] for row in rows], records)
     # Empty scenes have NaN and are sorted to the end.
     order = np.argsort(-table["voxel_miou"].to_numpy(), kind="stable")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pipelines.metrics.intervals import Estimate
@@ -13,16 +13,19 @@ from pipelines.reporting.report import Charts, Picture, Pictures, Table, Text, r
 # Scores of `compare_datasets`. Each score has its keys, its display name and the better values: "low", "high" or "one"
 # (close to 1).
 MEASURES = {
+    "relation_frechet": (("relation_frechet",), "relation Fréchet distance", "low"),
+    "lite0_frechet": (("lite0_frechet",), "lite0 Fréchet distance", "low"),
     "layout_frechet": (("layout_frechet",), "layout Fréchet distance", "low"),
     "random_frechet": (("random_frechet",), "random-network Fréchet distance", "low"),
     "precision": (("random_precision_k3",), "random-network precision", "high"),
     "recall": (("random_recall_k3",), "random-network recall", "high"),
+    "coverage": (("random_coverage_k3",), "random-network coverage", "high"),
     "road_connectivity": (("validity", "road_connectivity", "generated"), "road connectivity", "high"),
     "overlapping": (("validity", "overlapping", "generated"), "overlapping objects", "low"),
     "sunken": (("validity", "sunken", "generated"), "sunken objects", "low"),
     "count_ratio": (("count_ratio",), "count ratio of the category whose ratio is farthest from 1", "one"),
 }
-CHARTED = ("layout_frechet", "random_frechet", "precision", "road_connectivity")
+CHARTED = ("relation_frechet", "lite0_frechet", "layout_frechet", "random_frechet", "recall", "road_connectivity")
 COMMON = 3.0  # Minimum number of objects per scene. The ratios of categories with fewer objects vary too much.
 
 
@@ -44,16 +47,19 @@ def compute_deviation(ratio: float) -> float:
 
 
 def make_sampler_row(
-    sampler: str, steps: int, noise_scaling: float, seconds_per_scene: float | None, scores: Mapping
+    sampler: str, steps: int | None, noise_scaling: float | None, seconds_per_scene: float | None, scores: Mapping
 ) -> dict:
-    """Make the row of one setting: measures with intervals, and seconds per scene and actor. None means unknown."""
+    """Make the row of one setting: measures with intervals, and seconds per scene and actor. None means unknown.
+
+    The rows of the ceiling and of a control have no steps (None); their `sampler` is a description of the scenes.
+    """
     row = {"sampler": sampler, "steps": steps, "noise_scaling": noise_scaling}
     row |= {"scenes": scores["scenes"]["generated"], "seconds_per_scene": seconds_per_scene}
     row["count_category"], ratio = compute_count_ratio(scores["statistics"]) or (None, None)
     for name, (place, *_) in MEASURES.items():
         found: Any = {**scores, "count_ratio": ratio}
         for part in place:
-            found = found[part]
+            found = found.get(part) if found else None
         value, low, high = found or (None, None, None)
         row |= {name: value, f"{name}_low": low, f"{name}_high": high}
     return row
@@ -79,13 +85,18 @@ def is_as_good_as(row: Mapping, reference: Mapping) -> bool:
 
 def name_settings(row: Mapping) -> str:
     """Return the name of the sampler; a noise scaling other than 1 is appended."""
-    return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] != 1 else "")
+    return row["sampler"] + (f" / {row['noise_scaling']:g}" if row["noise_scaling"] not in (None, 1) else "")
+
+
+def select_settings(rows: Iterable[Mapping]) -> list[Mapping]:
+    """Return the rows of samplers, without the ceiling and the control."""
+    return [row for row in rows if row["steps"] is not None]
 
 
 def find_reference_row(rows: Sequence[Mapping]) -> Mapping:
     """Return the row of the paper's sampler (ddpm) with the most steps. If there is no ddpm row, return the row with
     the most steps among all samplers."""
-    return max(rows, key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
+    return max(select_settings(rows), key=lambda row: (name_settings(row) == "ddpm", row["steps"]))
 
 
 def build_sampler_table(rows: Sequence[Mapping]) -> Table:
@@ -97,15 +108,17 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
         ]
         if row["count_category"]:
             scores[-1] = f"{scores[-1]} {row['count_category']}"
-        good = "–" if row is reference else "yes" if is_as_good_as(row, reference) else "no"
+        is_compared = row is not reference and row["steps"] is not None
+        good = "–" if not is_compared else "yes" if is_as_good_as(row, reference) else "no"
         seconds = "–" if row["seconds_per_scene"] is None else f"{row['seconds_per_scene']:.2f}"
-        cells.append((name_settings(row), row["steps"], seconds, *scores, good))
+        cells.append((name_settings(row), row["steps"] or "–", seconds, *scores, good))
     names = [words for _, words, _ in MEASURES.values()]
     alike = f"as good as {name_settings(reference)} with {reference['steps']} steps"
     note = (
         "A number after / is the noise scaling of a sampler. Brackets contain 95 % bootstrap intervals. Seconds are "
         "measured for one actor with loaded weights. The last column states whether each score is better than "
-        f"{name_settings(reference)} with {reference['steps']} steps or within its interval."
+        f"{name_settings(reference)} with {reference['steps']} steps or within its interval. The ceiling is the score "
+        "of the same number of other real scenes; the control damages these scenes."
     )
     return Table(
         "Scores by sampler and steps", ("sampler", "steps", "time per scene, s", *names, alike), cells, note=note
@@ -113,8 +126,8 @@ def build_sampler_table(rows: Sequence[Mapping]) -> Table:
 
 
 def draw_sampler_charts(rows: Sequence[Mapping]) -> list[Chart]:
-    """Make one chart per measure over the number of steps, with one series per sampler."""
-    charts = []
+    """Make one chart per measure over the number of steps, with one series per sampler; None values are left out."""
+    charts, rows = [], select_settings(rows)
     for name in CHARTED:
         series = {}
         for sampler in dict.fromkeys(map(name_settings, rows)):

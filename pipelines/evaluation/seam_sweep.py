@@ -24,17 +24,24 @@ def count_objects_per_ha(scenes: Iterable[Scene]) -> float:
 
 
 def make_seam_row(
-    mode: str, repaint: RePaintConfig, seams: int, objects_per_ha: float, ratios: Mapping[str, Estimate | None]
+    mode: str,
+    repaint: RePaintConfig | None,
+    seams: int,
+    objects_per_ha: float | None,
+    ratios: Mapping[str, Estimate | None],
 ) -> dict:
-    """Make the row of one setting: options, cost per block, and ratios with intervals. Unknown values are None."""
+    """Make the row of one setting: options, cost per block, and ratios with intervals. Unknown values are None.
+
+    Real scenes have no options (`repaint` is None); their `mode` is a description.
+    """
     row = {
         "neighbour_latents": mode,
-        "steps": repaint.num_inference_steps,
-        "jump_length": repaint.jump_length,
-        "resamplings": repaint.resamplings,
-        "known_guidance": repaint.pseudoinverse_guidance,
-        "eta": repaint.eta,
-        "evaluations": repaint.num_evaluations,
+        "steps": repaint and repaint.num_inference_steps,
+        "jump_length": repaint and repaint.jump_length,
+        "resamplings": repaint and repaint.resamplings,
+        "known_guidance": repaint and repaint.pseudoinverse_guidance,
+        "eta": repaint and repaint.eta,
+        "evaluations": repaint and repaint.num_evaluations,
         "objects_per_ha": objects_per_ha,
         "seams": seams,
     }
@@ -59,7 +66,7 @@ def build_seam_table(rows: Sequence[Mapping]) -> Table:
         "objects_per_ha",
         "seams",
     )
-    rounded = [{**row, "objects_per_ha": round(row["objects_per_ha"])} for row in rows]
+    rounded = [{**row, "objects_per_ha": row["objects_per_ha"] and round(row["objects_per_ha"])} for row in rows]
     cells = [(*(row[name] for name in names), *(shown(row, name) for name in MEASURES)) for row in rounded]
     columns = (
         "neighbour latents",

@@ -11,7 +11,14 @@ import ray.data
 
 from models.scene import Grid, Scene
 from pipelines.evaluation.features import READER_CPUS, load_scenes
-from pipelines.metrics.seams import FAR_M, MEASURES, NEAR_M, estimate_seam_ratios, measure_scene_seams
+from pipelines.metrics.seams import (
+    FAR_M,
+    MEASURES,
+    NEAR_M,
+    estimate_seam_ratios,
+    join_unrelated_scenes,
+    measure_scene_seams,
+)
 from pipelines.rendering.render import MARK_COLOR, render_bev
 from pipelines.reporting.evaluation_report import format_value
 from pipelines.reporting.report import Picture, Pictures, Table, Text, render_report_html
@@ -20,6 +27,7 @@ from pipelines.schema.scene_subset import SceneSubset, select_evenly
 from pipelines.schema.tables import Shard
 
 BLOCK_M = 64.0  # Side length of the middle block of an outpainted scene.
+COLUMNS = {"generated": "generated", "real": "real scenes (ceiling)", "joined": "unrelated real scenes (control)"}
 MEANINGS = {
     "class_changes": "share of pixel pairs across the line with different ground classes",
     "height_step": "mean height difference of the ground at the line",
@@ -76,19 +84,29 @@ class SeamMeasurement:
     seams: np.ndarray
 
 
-def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines) -> list[dict]:
+def measure_shard(row: dict, parts: list[tuple[Shard, list[int]]], lines: SeamLines, is_joined: bool) -> list[dict]:
     """Measure the seams in the selected scenes of one shard; return one row with a flat record per scene."""
     shard, rows = parts[row["id"]]
+    total, first = sum(len(r) for _, r in parts), sum(len(r) for _, r in parts[: row["id"]])
+    before = load_scenes(parts, np.arange(first - 1, first - 1 + len(rows)) % total) if is_joined else ()
     out = []
-    for scene in shard.scenes(rows):
-        across, along = lines.pixels(scene.grid)
+    for number, scene in enumerate(shard.scenes(rows)):
+        if is_joined:
+            across, along = [scene.grid.rows // 2], []
+            scene = join_unrelated_scenes(scene, before[number], across[0])
+        else:
+            across, along = lines.pixels(scene.grid)
         record = measure_scene_seams(scene, across, along).ravel()
         out.append({"scene_id": scene.scene_id, "seams": len(across) + len(along), "record": record})
     return out
 
 
 def measure_seams(
-    selection: SceneSubset, lines: SeamLines, num_tasks: int, on_scene: Callable[[], None] = lambda: None
+    selection: SceneSubset,
+    lines: SeamLines,
+    num_tasks: int,
+    on_scene: Callable[[], None] = lambda: None,
+    is_joined: bool = False,
 ) -> SeamMeasurement:
     """Measure the seams in a selection of scenes, with one task per shard.
 
@@ -97,15 +115,22 @@ def measure_seams(
         lines: Positions of the seams.
         num_tasks: Maximum number of concurrent tasks.
         on_scene: Called after each scene.
+        is_joined: Whether to measure the control instead of the scenes: the far half of each scene, joined in the
+            middle with the near half of the scene before it. `lines` is then ignored.
 
     Returns:
         Records of all scenes.
+
+    Raises:
+        ValueError: The control needs two scenes, but only one is selected.
     """
     parts = selection.shards()
+    if is_joined and sum(len(rows) for _, rows in parts) < 2:
+        raise ValueError(f"{selection.root}: one scene is selected; joined scenes need at least two")
     graph = flat_map_dataset(
         ray.data.range(len(parts), override_num_blocks=len(parts)),
         measure_shard,
-        fn_kwargs={"parts": parts, "lines": lines},
+        fn_kwargs={"parts": parts, "lines": lines, "is_joined": is_joined},
         num_cpus=READER_CPUS,
         compute=ray.data.TaskPoolStrategy(size=min(num_tasks, len(parts))),
     )
@@ -122,7 +147,7 @@ def measure_seams(
 
 
 def join_scene_sets(measured: Mapping[str, SeamMeasurement]) -> dict:
-    """Return the ratio per measure, the number of scenes and the number of seams, each for both sides."""
+    """Return the ratio per measure, the number of scenes and the number of seams, each for all sides."""
     ratios = {side: estimate_seam_ratios(found.records, key) for key, (side, found) in enumerate(measured.items())}
     return {
         "scenes": {side: len(found.scene_ids) for side, found in measured.items()},
@@ -145,9 +170,9 @@ def build_seams_table(measured: Mapping[str, SeamMeasurement]) -> pa.Table:
 
 
 def select_shown_rows(scores: Mapping) -> list[tuple[str, ...]]:
-    """Return, for each measure, its name and the formatted ratios of both sides."""
+    """Return, for each measure, its name and the formatted ratios of each side."""
     return [
-        (name.replace("_", " "), *(format_value(sides[side]) or "–" for side in ("generated", "real")))
+        (name.replace("_", " "), *(format_value(ratio) or "–" for ratio in sides.values()))
         for name, sides in scores["ratios"].items()
     ]
 
@@ -173,7 +198,7 @@ def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines,
     pictures = [Picture(scene.scene_id, draw_lines(scene, lines), "generated") for scene in scenes]
     table = Table(
         "Seam ratios",
-        ("measure", "generated", "real"),
+        ("measure", *(COLUMNS[side] for side in scores["scenes"])),
         select_shown_rows(scores),
         meanings=list(MEANINGS.values()),
         note="Each ratio is the rate across seams divided by the rate across nearby lines. A ratio of 1 means that "
@@ -182,7 +207,8 @@ def render_seams_html(scores: Mapping, selection: SceneSubset, lines: SeamLines,
     how = (
         f"The generated side has {scores['seams']['generated']} seams in {scores['scenes']['generated']} scenes. "
         f"The real side has {scores['seams']['real']} lines across the driving direction in "
-        f"{scores['scenes']['real']} scenes. Nearby lines are parallel to a seam, {NEAR_M:g} to {FAR_M:g} m away from "
+        f"{scores['scenes']['real']} scenes. The control joins halves of different real scenes. "
+        f"Nearby lines are parallel to a seam, {NEAR_M:g} to {FAR_M:g} m away from "
         f"it, and at least {NEAR_M:g} m away from all other seams."
     )
     pages = [table, Pictures("Generated scenes", pictures, columns=3), Text("Method", [how])]

@@ -14,11 +14,12 @@ stack of records can be resampled for confidence intervals.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from models.geometry.iou3d import compute_iou3d_matrix, extract_boxes
-from models.scene import Scene
+from models.scene import Scene, concatenate_primitives
 from pipelines.metrics.intervals import Estimate, compute_weights, make_estimate
 
 MEASURES = (
@@ -70,6 +71,32 @@ def measure_scene_seams(scene: Scene, rows: Sequence[int] = (), cols: Sequence[i
             total[:, 0] += every[line - 1]
             total[:, 1] += every[near - 1].mean(axis=0) if len(near) else 0
     return total
+
+
+def join_unrelated_scenes(far: Scene, near: Scene, row: int) -> Scene:
+    """Join the far part of one scene and the near part of another scene, as a control with a visible seam.
+
+    Args:
+        far: Scene that provides the ground of the pixel rows before `row`, and the objects with their centre there.
+        near: Scene that provides the rest. It has the same ground classes.
+        row: Pixel row; the seam lies before this row.
+
+    Returns:
+        Copy of `far` with the ground and the objects of both scenes.
+
+    Raises:
+        ValueError: The scenes have different grids.
+    """
+    if far.grid != near.grid:
+        raise ValueError(f"{far.scene_id} and {near.scene_id} have different grids: {far.grid} and {near.grid}")
+    line_m = far.grid.front_m - row * far.grid.resolution_m
+    parts = far.select(far.center_m[:, 0] >= line_m), near.select(near.center_m[:, 0] < line_m)
+    return replace(
+        far,
+        height_m=np.concatenate([far.height_m[..., :row, :], near.height_m[..., row:, :]], axis=-2),
+        occupied=np.concatenate([far.occupied[:, :row], near.occupied[:, row:]], axis=1),
+        **concatenate_primitives(parts),
+    )
 
 
 def list_parallel_lines(seams: Sequence[int], count: int, resolution_m: float) -> dict[int, np.ndarray]:

@@ -158,14 +158,15 @@ class ModelCard:
         yield from render_table(("score", "value", "other real scenes (ceiling)"), rows)
         neighbourhoods = build_neighbourhood_table(generation)
         yield from render_table(neighbourhoods.columns, [tuple(map(str, row)) for row in neighbourhoods.rows])
-        ceiling = self.scores["reconstruction"]["label_fidelity"]
+        reconstruction = self.scores["reconstruction"]
+        ceiling, threshold = reconstruction["label_fidelity"], reconstruction["label_existence_threshold"]
         rows = [
             (name.replace("_", " "), format_value(value), format_value(ceiling[name]))
             for name, value in generation["label_fidelity"].items()
             if value is not None
         ]
         yield from render_table(
-            ("density label as requested", "generated", "reconstructions, existence > 0.3 (ceiling)"), rows
+            ("density label as requested", "generated", f"reconstructions, existence > {threshold:g} (ceiling)"), rows
         )
         yield from self._controls()
 

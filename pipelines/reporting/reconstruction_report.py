@@ -224,8 +224,9 @@ def build_overall_table(scores: Mapping) -> Table:
             "label fidelity",
             scores["label_fidelity"]["joint_fidelity"],
             None,
-            "share of scenes whose reconstruction has both density labels of the true scene; generated "
-            "scenes can hardly reach a higher share",
+            "share of scenes whose reconstruction has both density labels of the true scene, with existence "
+            f"probabilities above {scores['label_existence_threshold']:g}; generated scenes can hardly reach a higher "
+            "share",
         ),
         (
             "size, MiB",

@@ -91,17 +91,22 @@ def test_sweep_samplers_scores_each_sampler_and_resumes(smoke, tmp_path):
         num_examples=2,
         output=str(tmp_path),
     )
-    rows = sweep_samplers(config)
+    *rows, ceiling, control = sweep_samplers(config)
     assert [(row["sampler"], row["steps"], row["scenes"]) for row in rows] == [("dpm++", 2, 6), ("dpm++", 4, 6)]
     assert all(row["layout_frechet_low"] <= row["layout_frechet"] and row["seconds_per_scene"] > 0 for row in rows)
     assert {scene.source for scene in read_scenes(str(tmp_path))} == {"generated-dpm++-2", "generated-dpm++-4"}
     assert (tmp_path / "samplers.html").read_text().count("<img") == 4
     assert "<svg" in (tmp_path / "samplers-layout_frechet.svg").read_text()
+    assert ceiling["relation_frechet"] < control["relation_frechet_low"]
+    assert ceiling["steps"] is control["steps"] is None
+    rows += [ceiling, control]
     assert sweep_samplers(config) == rows  # the second call samples no scenes
     found = duckdb.sql(f"select layout_frechet from '{tmp_path}/samplers.parquet'").fetchall()
     assert [value for (value,) in found] == [row["layout_frechet"] for row in rows]
     with pytest.raises(ValueError, match=r"--samplers euler: expected some of ddpm, ddim, dpm\+\+"):
         sweep_samplers(replace(config, samplers=("euler",)))
+    with pytest.raises(ValueError, match=r"--ceiling-split test .* has 16 scenes, but the ceiling needs 20"):
+        sweep_samplers(replace(config, real_split="train", num_scenes=20))
 
 
 def test_sample_glb_has_named_node_per_primitive(samples):
@@ -143,25 +148,30 @@ def test_outpaint_writes_scenes_that_evaluate_scores(smoke, samples, tmp_path):
     real = str(smoke / "datasets/smoke")
     seams_config = SeamsConfig(generated=str(tmp_path), real=real, output=str(tmp_path / "seams"), num_actors=1)
     seams = evaluate_seams(seams_config)
-    assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * seams["scenes"]["real"]}
+    count = seams["scenes"]["real"]
+    assert seams["seams"] == {"generated": 4 * seams["scenes"]["generated"], "real": 3 * count, "joined": count}
+    assert seams["ratios"]["height_step"]["joined"]["low"] > seams["ratios"]["height_step"]["real"]["high"]
     query = f"select metric, value from '{tmp_path}/seams/metrics.parquet'"
     assert dict(duckdb.sql(query).fetchall())["seams.generated"] == seams["seams"]["generated"] > 0
     assert (tmp_path / "seams/seams.html").read_text().count("<img") > 0
 
-    row, guided, *as_paper = sweep_seams(
+    row, guided, *as_paper, ceiling, control = sweep_seams(
         SweepConfig(
             model=model,
             input=str(samples),
             source="generated-samples",
             settings=((4, 2, 2, 0.0, 1.0), (4, 1, 1, 1.0, 0.0)),
             neighbour_latents=("reencode", "paper"),
+            real=real,
             output=str(tmp_path / "sweep"),
         )
     )
     assert [part["neighbour_latents"] for part in (row, guided, *as_paper)] == ["reencode"] * 2 + ["paper"] * 2
     assert row["seams"] == 4 and row["evaluations"] == 6 and "class_changes_high" in row
     assert guided["evaluations"] == 4 and guided["known_guidance"] == 1 and guided["objects_per_ha"] > 0
-    assert duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall() == [(6,), (4,)] * 2
+    assert control["height_step"] > ceiling["height_step_high"] and ceiling["seams"] == 3 * control["seams"]
+    found = duckdb.sql(f"select evaluations from '{tmp_path}/sweep/sweep.parquet'").fetchall()
+    assert found == [(6,), (4,)] * 2 + [(None,)] * 2
     assert (tmp_path / "sweep/sweep.html").read_text().count("<img") == 4
 
     scores = evaluate(

@@ -19,6 +19,7 @@ from pipelines.metrics.seams import (
     MEASURES,
     compute_footprint_ranges,
     estimate_seam_ratios,
+    join_unrelated_scenes,
     list_parallel_lines,
     measure_scene_seams,
 )
@@ -86,6 +87,23 @@ def test_seam_ratio_shows_change_of_scene():
     assert got["class_changes"].low > 3 and got["height_step"].low > 3
     got = compute_ratios(scenes, rows=[64])
     assert got["class_changes"].low < 1 < got["class_changes"].high
+
+
+def test_unrelated_halves_have_visible_seam():
+    scenes = [make_random_ground(seed) for seed in range(20)]
+    joined = [
+        join_unrelated_scenes(
+            scene, replace(other, height_m=np.where(other.occupied, other.height_m + 1, 0).astype(np.float32)), 128
+        )
+        for scene, other in zip(scenes, scenes[1:] + scenes[:1], strict=True)
+    ]
+    got = compute_ratios(joined, rows=[128])
+    assert got["class_changes"].low > 3 and got["height_step"].low > 3
+    far, near = (replace_objects_by_cars(scenes[0], [(10, 0), (x, 3)]) for x in (50, 51))
+    both = join_unrelated_scenes(far, near, 128)
+    assert both.center_m[:, 0].tolist() == [50, 10] and np.array_equal(both.occupied[:, :128], far.occupied[:, :128])
+    with pytest.raises(ValueError, match="have different grids"):
+        join_unrelated_scenes(far, far.crop(Grid(64.0, 32.0, 0.25, 128, 128)), 64)
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -74,9 +74,9 @@ def test_sampler_sweep_compares_with_ddpm_of_most_steps():
     more = [make_row("dpm++", 20, Estimate(2, 1, 3), cars) for cars in (18.0, 22.0, 5.0)]
     assert [is_as_good_as(row, paper) for row in more] == [True, True, False]
     assert [row[-1] for row in build_sampler_table(rows).rows] == ["no", "–", "yes"]
-    (layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
+    (_, _, layout, *_), page = draw_sampler_charts(rows), render_sampler_html(rows, [], 1, ["how"])
     assert layout.series == {"ddpm": ([10, 250], [9.0, 2.0]), "dpm++": ([20], [2.8])}
-    assert page.count("<svg") == 4 and "as good as ddpm with 250 steps" in page
+    assert page.count("<svg") == 6 and "as good as ddpm with 250 steps" in page
     scaled = make_row("ddpm", 500, Estimate(2.0, 1.5, 2.5), scaling=1.01)
     assert find_reference_row([*rows, scaled]) is paper  # the reference row has no noise scaling, as in the paper
     assert build_sampler_table([*rows, scaled]).rows[-1][0] == "ddpm / 1.01"
