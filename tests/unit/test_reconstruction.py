@@ -8,7 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 from helpers import random_scene
 
+from jobs.implementation.evaluate_scenes import read_existence_threshold
 from models.layout import Bounds, LayoutSpec
+from models.pretrained import find_pipeline_path
 from models.scene import CATEGORIES, VEGETATION, Scene
 from models.tensors import DecodedLayout, encode_layout
 from pipelines.evaluation.reconstruction import (
@@ -65,6 +67,21 @@ def test_reconstruction_removes_duplicates_as_generation_does():
         counts[deduplicate] = made.pairs.predictions.sum()
     assert solid.sum() > 5 and counts[False] == 2 * len(scene)
     assert counts[True] == 2 * len(scene) - solid.sum()  # tree crowns overlap in reality, so they are kept
+
+
+def test_labels_of_reconstruction_use_threshold_of_generation(monkeypatch, tmp_path):
+    """Half of the primitives have existence 0.4: they count for the scores, and not for labels above 0.5."""
+    scene, judged = random_scene(0, n=20), []
+    layout = encode_perfectly(scene, SPEC)
+    real = np.flatnonzero(layout.existence)
+    layout.existence[real[::2]] = 0.4
+    monkeypatch.setattr("pipelines.evaluation.reconstruction.judge_labels", lambda scene, _: judged.append(len(scene)))
+    for threshold in (0.3, 0.5):
+        made = make_scene_record(scene, layout, LATENT, SPEC, make_voxel_grid(SPEC), label_threshold=threshold)
+        assert made.pairs.predictions.sum() == len(scene)
+    assert judged == [20, 10]
+    assert read_existence_threshold(f"{find_pipeline_path('town')}/lvae") == 0.5
+    assert read_existence_threshold(str(tmp_path / "lvae")) == 0.3
 
 
 def test_reconstruction_of_perfect_decoder_scores_one():
