@@ -1,0 +1,84 @@
+"""Limits on what files of others may ask for, in one place, so that a small file cannot use up the memory.
+
+Readers call `require_within` before they allocate memory for a number that a file states. The environment variable
+PRITTI_MAX_<NAME> replaces a limit, for example PRITTI_MAX_RASTER_PIXELS=1000000000; workers of Ray on other nodes need
+it in their runtime environment. SECURITY.md lists the limits.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+PREFIX = "PRITTI_MAX_"
+
+
+class Limit(NamedTuple):
+    """A limit.
+
+    Attributes:
+        value: Largest accepted number.
+        meaning: What is counted, for error messages and SECURITY.md.
+    """
+
+    value: int
+    meaning: str
+
+
+LIMITS = {
+    "raster_pixels": Limit(2**26, "pixels of all ground classes of a scene"),
+    "scene_primitives": Limit(200_000, "primitives of a scene"),
+    "table_rows": Limit(2_000_000, "rows of a table file"),
+    "table_bytes": Limit(2**29, "bytes of the columns that are read from a table file, after decompression"),
+    "text_letters": Limit(1_000, "characters of an id, a label or a name"),
+    "polygon_points": Limit(10_000, "points of a polygon"),
+    "json_bytes": Limit(2**28, "bytes of a JSON or XML file"),
+    "glb_bytes": Limit(2**30, "bytes of a GLB file"),
+    "glb_nodes": Limit(1_000_000, "nodes of a GLB file"),
+    "glb_placements": Limit(200_000, "mesh primitives of a GLB file, counted once per node that places them"),
+    "glb_vertices": Limit(2**25, "vertices and triangle corners of a GLB file, counted once per placement"),
+    "array_bytes": Limit(2**31, "bytes of an array in an .npz file, after decompression"),
+    "model_parameters": Limit(2_000_000_000, "parameters of a network"),
+    "model_timesteps": Limit(100_000, "training timesteps of a noise schedule"),
+}
+
+
+def find_limit(name: str) -> int:
+    """Return a limit, or the value of its environment variable.
+
+    Args:
+        name: Key of LIMITS.
+
+    Returns:
+        Largest accepted number.
+
+    Raises:
+        ValueError: The environment variable is not a positive integer.
+    """
+    variable = PREFIX + name.upper()
+    text = os.environ.get(variable, "")
+    if not text:
+        return LIMITS[name].value
+    if not text.isdecimal() or int(text) < 1:
+        raise ValueError(f"{variable} is {text!r}, expected a positive integer")
+    return int(text)
+
+
+def require_within(name: str, number: float, place: str = "") -> None:
+    """Raise an error if a number exceeds a limit.
+
+    Args:
+        name: Key of LIMITS.
+        number: Number that a file states or that follows from it.
+        place: File, row or scene, for the message.
+
+    Raises:
+        ValueError: The number exceeds the limit. The message names the number, the limit and the environment variable
+            that raises it.
+    """
+    limit = find_limit(name)
+    if not number <= limit:
+        raise ValueError(
+            f"{place + ': ' if place else ''}{number:,} {LIMITS[name].meaning}; at most {limit:,} are accepted. If the"
+            f" file can be trusted, set {PREFIX}{name.upper()}={number:.0f} to raise the limit"
+        )
