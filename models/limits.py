@@ -13,6 +13,10 @@ from typing import NamedTuple
 PREFIX = "PRITTI_MAX_"
 
 
+class LimitError(ValueError):
+    """Raised if a number exceeds a limit."""
+
+
 class Limit(NamedTuple):
     """A limit.
 
@@ -73,12 +77,12 @@ def require_within(name: str, number: float, place: str = "") -> None:
         place: File, row or scene, for the message.
 
     Raises:
-        ValueError: The number exceeds the limit. The message names the number, the limit and the environment variable
+        LimitError: The number exceeds the limit. The message names the number, the limit and the environment variable
             that raises it.
     """
     limit = find_limit(name)
     if not number <= limit:
-        raise ValueError(
+        raise LimitError(
             f"{place + ': ' if place else ''}{number:,} {LIMITS[name].meaning}; at most {limit:,} are accepted. If the"
             f" file can be trusted, set {PREFIX}{name.upper()}={number:.0f} to raise the limit"
         )

@@ -23,6 +23,7 @@ from pipelines.reporting.gallery_page import render_gallery_html
 from pipelines.reporting.report import Picture
 from pipelines.reporting.scene_index import Catalogue
 from pipelines.runtime import storage
+from pipelines.schema.file_names import make_file_name
 
 
 def find_dataset_directory(config: DatasetOptions) -> str:
@@ -42,7 +43,7 @@ def draw_scenes(config: OneScene) -> list[str]:
     require_positive(config, "max_scenes")
     catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
     chosen = catalogue.find(config.ids) if config.ids else catalogue.draw(config.max_scenes, config.seed)
-    written = []
+    written, directory = [], make_output_path(config, "")
     with Progress() as bar:
         shown = bar.add_task("draw scenes", total=len(chosen))
         for shard, rows, _ in catalogue.chunks(chosen, 8):
@@ -51,7 +52,7 @@ def draw_scenes(config: OneScene) -> list[str]:
                     {"glb": export_glb(scene)} if config.glb else {}
                 )
                 for kind, content in files.items():
-                    written.append(storage.join_uri(make_output_path(config, ""), f"{scene.scene_id}.{kind}"))
+                    written.append(storage.join_uri(directory, f"{make_file_name(scene.scene_id)}.{kind}"))
                     storage.write_whole(written[-1], lambda stream, content=content: stream.write(content))
                 bar.advance(shown)
     return written

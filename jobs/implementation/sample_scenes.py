@@ -13,6 +13,7 @@ from models.labels import LABELS
 from pipelines.generation.sample import SampleRequest, sample_scenes
 from pipelines.io.mesh_export import export_glb
 from pipelines.runtime import storage
+from pipelines.schema.file_names import make_file_name
 from pipelines.schema.tables import read_scenes
 
 
@@ -42,7 +43,7 @@ def sample(config: Config) -> str:
         shown = bar.add_task("sample scenes", total=config.num_scenes)
         sample_scenes(request, config.num_actors, config.batch_size, lambda row: bar.advance(shown, row["scenes"]))
     for scene in read_scenes(output, f"generated-{config.run}", limit=config.num_glb) if config.num_glb else ():
-        path = storage.join_uri(output, "glb", config.run, f"{scene.scene_id}.glb")
+        path = storage.join_uri(output, "glb", config.run, f"{make_file_name(scene.scene_id)}.glb")
         storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
     return output
 

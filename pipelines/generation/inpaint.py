@@ -25,6 +25,7 @@ from pipelines.metrics.reconstruction import sum_pairs
 from pipelines.reporting.inpaint_report import InpaintExample, render_inpaint_html
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import map_actors
+from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard
 
@@ -233,7 +234,7 @@ class Inpainter:
             source, position = self.chosen[row["id"]]
             made, drifts = inpaint_one(self.pipeline, request, source.scenes([position])[0], row["id"])
             for scene in made:
-                path = storage.join_uri(request.output, "glb", request.run, f"{scene.scene_id}.glb")
+                path = storage.join_uri(request.output, "glb", request.run, f"{make_file_name(scene.scene_id)}.glb")
                 storage.write_whole(path, lambda stream, scene=scene: stream.write(export_glb(scene)))
             storage.write_json(drifts, record)
             shard.write(made)

@@ -11,6 +11,7 @@ from pipelines.io.opendrive import export_opendrive
 from pipelines.io.voxel_import import export_voxels_npz
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
+from pipelines.schema.file_names import make_file_name
 from pipelines.schema.scene_subset import SceneSubset
 from pipelines.schema.tables import Shard, make_rejects_table
 
@@ -30,7 +31,7 @@ def export_scenes(
     overwrite: bool = False,
     on_scene: Callable[[int], None] | None = None,
 ) -> tuple[dict[Format, int], dict[str, str]]:
-    """Export each scene to output/<format>/<scene_id>.<format>.
+    """Export each scene to output/<format>/<scene_id>.<format>; `make_file_name` replaces unsafe letters.
 
     A format may be unable to represent a scene; for example, OpenDRIVE needs roads. If a scene cannot be represented,
     the table `rejects` of the output lists the scene, and the export continues.
@@ -52,7 +53,7 @@ def export_scenes(
         written, rejects = [], []
         for scene in shard.scenes(rows):
             for kind in formats:
-                path = storage.join_uri(output, kind, f"{scene.scene_id}.{kind}")
+                path = storage.join_uri(output, kind, f"{make_file_name(scene.scene_id)}.{kind}")
                 try:
                     if overwrite or not storage.exists(path):
                         content = WRITERS[kind](scene)

@@ -18,6 +18,7 @@ from pipelines.rendering.pinhole import Lens, StreetCamera, StreetRenderer, Stre
 from pipelines.rendering.render import arrange_contact_sheet, encode_png
 from pipelines.runtime import storage
 from pipelines.runtime.ray_tasks import make_numbered_rows, map_rows
+from pipelines.schema.file_names import make_file_name
 from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.run_guard import find_changed_option
 from pipelines.schema.scene_subset import SceneSubset
@@ -32,7 +33,7 @@ ON_SHEET = 24
 class StreetRequest:
     """Options of street views.
 
-    The output directory is streets/<run>/<scene_id>/.
+    The output directory is streets/<run>/<scene_id>/; `make_file_name` replaces unsafe letters of the id.
 
     Attributes:
         output: Output directory.
@@ -63,7 +64,7 @@ class StreetRequest:
         Returns:
             Path or URI.
         """
-        return storage.join_uri(self.output, "streets", self.run, scene.scene_id)
+        return storage.join_uri(self.output, "streets", self.run, make_file_name(scene.scene_id))
 
 
 def place_cameras(way_m: np.ndarray, request: StreetRequest) -> list[StreetCamera]:

@@ -94,7 +94,7 @@ def read_script(name: str) -> str:
 
 
 def _render_page(title: str, subtitle: str, data: dict) -> str:
-    content = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")  # Escapes end tags.
+    content = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # No tag can begin or end.
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>
 <style>{STYLE}{GALLERY_STYLE}</style></head><body>

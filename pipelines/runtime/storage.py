@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, cast
+from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as compute
 import pyarrow.fs as pafs
 import pyarrow.parquet as pq
 
+from models.limits import LimitError, find_limit, require_within
+from models.strict_json import parse_json
+
+pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
+
 TEMPORARY = ".tmp-"
+ITEM_BYTES = 8  # Upper bound of the size of a number and of an index into a dictionary.
+TEXT_BYTES = 2**28  # Texts of a column that surely have fewer bytes are decoded directly.
 
 
 def resolve_uri(uri: str | os.PathLike) -> tuple[pafs.FileSystem, str]:
@@ -87,10 +95,10 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
 
 
 def write_parquet(table: pa.Table, uri: str) -> None:
-    """Write a table as a Parquet file, with zstd compression and dictionary-encoded string columns."""
-    # The type annotation of pyarrow allows only a bool, but the documentation allows names.
-    dictionaries = cast(Any, _list_dictionary_columns(table))
-    write_whole(uri, lambda stream: pq.write_table(table, stream, compression="zstd", use_dictionary=dictionaries))
+    """Write a table as a Parquet file, with zstd compression, dictionary-encoded string columns and page checksums."""
+    dictionaries = _list_dictionary_columns(table)
+    options: Any = {"compression": "zstd", "use_dictionary": dictionaries, "write_page_checksum": True}
+    write_whole(uri, lambda stream: pq.write_table(table, stream, **options))
 
 
 def _list_dictionary_columns(table: pa.Table) -> list[str]:
@@ -98,7 +106,7 @@ def _list_dictionary_columns(table: pa.Table) -> list[str]:
 
 
 def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema | None = None) -> pa.Table:
-    """Read a Parquet file.
+    """Read a Parquet file of any origin, and verify its page checksums if it has them.
 
     Args:
         uri: File.
@@ -109,36 +117,119 @@ def read_parquet(uri: str, columns: list[str] | None = None, schema: pa.Schema |
         Table.
 
     Raises:
-        ValueError: The file is missing, is truncated or has another schema. The message names the file.
+        ValueError: The file is missing, is damaged, has another schema or exceeds a limit (models/limits.py). The
+            message names the file.
     """
     fs, path = resolve_uri(uri)
-    # The type annotation of pyarrow allows only a string, but the documentation allows None.
-    no_partitioning = cast(Any, None)
     try:
-        table = pq.read_table(path, filesystem=fs, columns=columns, partitioning=no_partitioning)
-    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
+        with fs.open_input_file(path) as stream:
+            table = _read_checked(stream, columns, schema)
+    except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
+        if isinstance(error, RefusedError):
+            raise ValueError(f"{uri}: {error}") from error
         raise ValueError(
             f"{uri}: cannot be read as Parquet ({error}); delete the file and run the job that wrote it again"
         ) from error
-    if schema is not None:
-        wanted = schema.names if columns is None else columns
-        for name in wanted:
-            if name not in table.column_names or table.schema.field(name).type != schema.field(name).type:
-                raise ValueError(
-                    f"{uri}: column {name!r} is missing or not of type {schema.field(name).type}; another"
-                    " version wrote the file"
-                )
     return table
 
 
-def read_bytes(uri: str) -> bytes:
-    """Read a whole file. Raises ValueError with the name of the file if it cannot be read."""
+class RefusedError(ValueError):
+    """Raised if a readable file has another schema or exceeds a limit."""
+
+
+def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | None) -> pa.Table:
+    """Read columns from a stream after checks of types and sizes; the names of columns may not repeat."""
+    metadata = pq.read_metadata(stream)
+    found = metadata.schema.to_arrow_schema()
+    wanted = columns if columns is not None else schema.names if schema is not None else found.names
+    for name in wanted:
+        kind = found.field(name).type if len(found.get_all_field_indices(name)) == 1 else None
+        if kind is None or (schema is not None and kind != schema.field(name).type):
+            expected = "" if schema is None else f" or not of type {schema.field(name).type}"
+            raise RefusedError(f"column {name!r} is missing{expected}; another version wrote the file")
+    try:
+        texts = _check_sizes(metadata, found, wanted)
+        options: Any = {"read_dictionary": texts, "page_checksum_verification": True}
+        with pq.ParquetFile(stream, metadata=metadata, **options) as file:
+            table = file.read(columns=wanted).select(wanted)
+        if len(table) != metadata.num_rows:
+            raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {metadata.num_rows}")
+        return _decode_texts(table)
+    except LimitError as error:
+        raise RefusedError(str(error)) from error
+
+
+def _check_sizes(metadata: pq.FileMetaData, schema: pa.Schema, columns: Sequence[str]) -> list[str]:
+    """Check the rows and bytes that a file states, and return the columns to read as dictionaries.
+
+    A dictionary stores each text once, so few bytes can state many long texts. A column whose texts could exceed
+    TEXT_BYTES is decoded only after their total length is known (`_decode_texts`).
+    """
+    require_within("table_rows", metadata.num_rows)
+    kinds = {name: schema.field(name).type for name in columns}
+    total, texts = 0, dict.fromkeys((name for name, kind in kinds.items() if _is_text(kind)), 0)
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for chunk in map(group.column, range(group.num_columns)):
+            name, _, inner = chunk.path_in_schema.partition(".")
+            if (kind := kinds.get(name)) is None:
+                continue
+            size, count = chunk.total_uncompressed_size, chunk.num_values
+            # A text in a list can be repeated, so the bound of such a column is coarse.
+            total += size + count * (size if inner and _holds_texts(kind) else ITEM_BYTES)
+            if name in texts and any("DICTIONARY" in encoding for encoding in chunk.encodings):
+                texts[name] += size * count
+    require_within("table_bytes", total)
+    return [name for name, size in texts.items() if size > TEXT_BYTES]
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_binary(kind)
+
+
+def _holds_texts(kind: pa.DataType) -> bool:
+    inner = [kind.field(k).type for k in range(kind.num_fields)]
+    return any(_is_text(part) or _holds_texts(part) for part in inner)
+
+
+def _decode_texts(table: pa.Table) -> pa.Table:
+    """Replace dictionaries by texts, after a check of their total length."""
+    if not any(pa.types.is_dictionary(kind) for kind in table.schema.types):
+        return table
+    total, fields = 0, []
+    for field in table.schema:
+        if pa.types.is_dictionary(field.type):
+            for chunk in table[field.name].chunks:
+                lengths = pc.take(pc.binary_length(chunk.dictionary), chunk.indices)
+                total += pc.sum(pc.cast(lengths, pa.int64())).as_py() or 0
+            field = field.with_type(field.type.value_type)
+        fields.append(field)
+    require_within("table_bytes", total)
+    return table.cast(pa.schema(fields, table.schema.metadata))
+
+
+def read_bytes(uri: str, limit: str = "") -> bytes:
+    """Read a whole file.
+
+    Args:
+        uri: File.
+        limit: Limit of the number of bytes (a key of LIMITS in models/limits.py); "" means no limit.
+
+    Returns:
+        Content of the file.
+
+    Raises:
+        ValueError: The file cannot be read or exceeds the limit. The message names the file.
+    """
     fs, path = resolve_uri(uri)
     try:
         with fs.open_input_stream(path, compression=None) as stream:
-            return stream.read()
+            # The stated size of a file may be wrong, so the limit does not rely on it.
+            content = stream.read(find_limit(limit) + 1) if limit else stream.read()
     except OSError as error:
         raise ValueError(f"{uri}: cannot be read ({error})") from error
+    if limit:
+        require_within(limit, len(content), uri)
+    return content
 
 
 def measure_file_bytes(uri: str) -> int:
@@ -158,12 +249,16 @@ def write_json(value: Any, uri: str) -> None:
 
 
 def read_json(uri: str) -> Any:
-    """Read a JSON file. Raises ValueError with the name of the file if it is missing or is not JSON."""
-    fs, path = resolve_uri(uri)
+    """Read a JSON file.
+
+    Raises:
+        ValueError: The file is missing, is too large or is not JSON; NaN, Infinity and a repeated key are not JSON. The
+            message names the file.
+    """
+    content = read_bytes(uri, "json_bytes")
     try:
-        with fs.open_input_stream(path) as stream:
-            return json.loads(stream.read().decode())
-    except (OSError, ValueError) as error:
+        return parse_json(content)
+    except ValueError as error:
         raise ValueError(f"{uri}: cannot be read as JSON ({error})") from error
 
 

@@ -9,7 +9,9 @@ columns. docs/reference/tables.md documents the tables for users.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +21,7 @@ import pyarrow.compute as pc
 from models.geometry.cholesky import compute_cholesky_parameters
 from models.scene import CATEGORIES, ELLIPSOID, GROUND_CLASSES, VEGETATION, VEHICLES, Grid, Scene
 from pipelines.runtime import storage
+from pipelines.schema.validation import validate_shard, validate_table
 
 TABLES = ("scenes", "primitives", "rasters", "edits", "rejects")
 SCHEMA_VERSION = "1"  # Version of the column names and types. Descriptions may change within a version.
@@ -262,7 +265,12 @@ def list_ground_steps(height: bytes, occupied: bytes, shape: tuple[int, int, int
 
     Returns:
         Heights of the occupied pixels (m,) int16 in units of height_step_m, and occupied (G, H, W) bool.
+
+    Raises:
+        ValueError: The mask does not have one bit per class, row and column.
     """
+    if len(occupied) != -(-math.prod(shape) // 8):
+        raise ValueError(f"the mask has {len(occupied)} bytes, which does not fit the shape {shape}")
     mask = np.unpackbits(np.frombuffer(occupied, np.uint8), count=np.prod(shape)).view(bool).reshape(shape)
     return np.cumsum(np.frombuffer(height, "<i2"), dtype=np.int16), mask
 
@@ -382,7 +390,7 @@ def parse_scenes(
     """Yield the Scenes of one shard.
 
     Args:
-        scenes: Rows of the shard in the table `scenes`.
+        scenes: Rows of the shard in the table `scenes`. All three tables are valid (`Shard.read_tables`).
         primitives: Rows of the shard in the table `primitives`.
         rasters: Rows of the shard in the table `rasters`.
         source: Value of the source column.
@@ -391,18 +399,10 @@ def parse_scenes(
 
     Yields:
         Scene of each row.
-
-    Raises:
-        ValueError: The tables do not hold the same scenes in the same order, or a category is unknown.
     """
     fields = _read_primitive_fields(primitives)
     rows = list(range(len(scenes)) if rows is None else rows)
     for scene, raster in zip(scenes.take(rows).to_pylist(), rasters.take(rows).to_pylist(), strict=True):
-        if scene["scene_id"] != raster["scene_id"]:
-            raise ValueError(
-                f"the tables of the shard are not aligned: in one row, scenes holds {scene['scene_id']} but rasters "
-                f"holds {raster['scene_id']}"
-            )
         here = slice(scene["primitive_offset"], scene["primitive_offset"] + scene["num_primitives"])
         grid = Grid(raster["front_m"], raster["left_m"], raster["resolution_m"], raster["rows"], raster["cols"])
         classes = tuple(raster["ground_classes"])
@@ -517,7 +517,7 @@ class Shard:
         return storage.join_uri(self.root, table, f"source={self.source}", f"split={self.split}", name)
 
     def read(self, table: str, columns: list[str] | None = None) -> pa.Table:
-        """Read the shard's rows of a table.
+        """Read the shard's rows of a table, and validate each column.
 
         Args:
             table: Name of the table, such as scenes.
@@ -525,9 +525,47 @@ class Shard:
 
         Returns:
             The rows.
+
+        Raises:
+            ValueError: The file is missing or damaged, or a value is invalid. The message names the file, the row and
+                the column.
         """
-        schema = {"scenes": SCENES, "primitives": PRIMITIVES, "rasters": RASTERS, "edits": EDITS}.get(table)
-        return storage.read_parquet(self.path(table), columns, schema)
+        schema = {
+            "scenes": SCENES,
+            "primitives": PRIMITIVES,
+            "rasters": RASTERS,
+            "edits": EDITS,
+            "rejects": REJECTS,
+        }.get(table)
+        content = storage.read_parquet(self.path(table), columns, schema)
+        with self._naming(table):
+            validate_table(table, content)
+        return content
+
+    def read_tables(self) -> tuple[pa.Table, pa.Table, pa.Table]:
+        """Read the tables scenes, primitives and rasters, and validate that they belong together.
+
+        Returns:
+            The three tables.
+
+        Raises:
+            ValueError: A file is missing or damaged, or a value is invalid. The message names the file, the row and the
+                column.
+        """
+        tables = self.read("scenes"), self.read("primitives"), self.read("rasters")
+        with self._naming("scenes"):
+            validate_shard(*tables)
+        return tables
+
+    @contextmanager
+    def _naming(self, table: str) -> Iterator[None]:
+        """Put the name of a table's file in front of an error."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(
+                f"{self.path(table)}: {error}; restore the shard or run the job that wrote it again"
+            ) from error
 
     def scenes(self, rows: Sequence[int] | None = None) -> list[Scene]:
         """Read Scenes of the shard.
@@ -539,13 +577,10 @@ class Shard:
             The Scenes.
 
         Raises:
-            ValueError: A file is missing, truncated or misaligned; the message names the file.
+            ValueError: A file is missing or damaged, or a value is invalid. The message names the file, the row and the
+                column.
         """
-        scenes, primitives, rasters = (self.read(table) for table in ("scenes", "primitives", "rasters"))
-        try:
-            return list(parse_scenes(scenes, primitives, rasters, self.source, self.split, rows))
-        except ValueError as error:
-            raise ValueError(f"{self.path('scenes')}: {error}") from error
+        return list(parse_scenes(*self.read_tables(), self.source, self.split, rows))
 
     def write(self, scenes: Sequence[Scene]) -> None:
         """Write the tables scenes, primitives and rasters of the shard.
@@ -578,10 +613,16 @@ def find_shards(root: str, table: str = "scenes", source: str | None = None, spl
     """
     shards = []
     for path in storage.list_files(storage.join_uri(root, table), ".parquet"):
-        *_, source_part, split_part, name = path.split("/")
+        source_part, split_part, name = f"//{path}".rsplit("/", 3)[1:]
         found = (source_part.removeprefix("source="), split_part.removeprefix("split="))
         if (source or found[0], split or found[1]) == found:
-            shards.append(Shard(str(root), *found, int(name.removeprefix("part-").removesuffix(".parquet"))))
+            number = name.removeprefix("part-").removesuffix(".parquet")
+            if not (source_part.startswith("source=") and split_part.startswith("split=") and number.isdecimal()):
+                raise ValueError(
+                    f"{path}: expected the name {table}/source=.../split=.../part-<number>.parquet; move other files"
+                    " out of the dataset directory"
+                )
+            shards.append(Shard(str(root), *found, int(number)))
     if not shards:
         place, wanted = (
             storage.join_uri(root, table),

@@ -29,6 +29,7 @@ from models.layout import LayoutSpec
 from models.scene import Grid
 from models.tensors import encode_height, encode_layout, encode_primitives, resample_ground
 from pipelines.schema.tables import Shard, find_category_indices, list_ground_steps, parse_scenes, read_fixed_lists
+from pipelines.schema.validation import validate_shard
 
 WINDOW_SHARDS = 4
 SAMPLES_PER_TASK = 256
@@ -160,7 +161,7 @@ class LayoutReader:
         if augment:
             if places is None:
                 raise ValueError("augmentation needs the position of each sample in the stream")
-            scenes = parse_scenes(*_read_scene_tables(shard), shard.source, shard.split, rows.tolist())
+            scenes = parse_scenes(*_read_tables(shard), shard.source, shard.split, rows.tolist())
             layouts = (encode_layout(augment(s, int(k)), self.spec) for s, k in zip(scenes, places, strict=True))
         else:
             stored = _read_stored_layouts(shard)
@@ -175,8 +176,8 @@ class LayoutReader:
 
 
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
-def _read_scene_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
-    return tuple(shard.read(table) for table in ("scenes", "primitives", "rasters"))
+def _read_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
+    return shard.read_tables()
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,12 +231,12 @@ def _scale_steps(spec: LayoutSpec, step_m: float) -> np.ndarray:
 @lru_cache(maxsize=2 * WINDOW_SHARDS)
 def _read_stored_layouts(shard: Shard) -> StoredLayouts:
     scenes = shard.read("scenes", ["scene_id", "primitive_offset", "num_primitives"])
-    primitives = shard.read("primitives", ["category", "x_m", "y_m", "z_m", "cholesky"]).combine_chunks()
+    primitives = shard.read("primitives", ["scene_id", "category", "x_m", "y_m", "z_m", "cholesky"]).combine_chunks()
     rasters = shard.read("rasters")
-    if scenes["scene_id"] != rasters["scene_id"]:
-        raise ValueError(
-            f"{shard.path('rasters')} is not aligned with {shard.path('scenes')}; run the preprocessing again"
-        )
+    try:
+        validate_shard(scenes, primitives, rasters)
+    except ValueError as error:
+        raise ValueError(f"{shard.path('scenes')}: {error}; run the preprocessing again") from error
     return StoredLayouts(
         first=scenes["primitive_offset"].to_numpy(),
         count=scenes["num_primitives"].to_numpy(),

@@ -1,0 +1,294 @@
+"""Validate the tables of a shard: each table on its own, and the tables against each other.
+
+Readers validate before they build scenes, so a damaged or hostile file cannot produce wrong scenes or use up the
+memory. A table is valid in full, or an error names the row, the column and the value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as compute
+
+from models.limits import find_limit, require_within
+from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES
+
+pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
+
+FAR_M = 1e6  # Largest accepted coordinate of a primitive and largest accepted size (m).
+ORTHONORMAL = 1e-3  # Largest accepted entry of R R^T - I.
+DENSITIES = ("low", "medium", "high")
+KINDS = ("cuboid", "ellipsoid")
+
+
+def _refuse(table: pa.Table, name: str, bad: Any, expected: str) -> None:
+    """Raise an error for the first row for which `bad` (n,) is True, if there is one."""
+    if bad.any():
+        row = int(np.argmax(bad))
+        value = repr(table[name][row].as_py())
+        shown = value if len(value) <= 80 else f"{value[:77]}..."
+        raise ValueError(f"row {row}, column {name!r}: {shown}, expected {expected}")
+
+
+def _require_present(table: pa.Table, name: str) -> None:
+    if table[name].null_count:
+        _refuse(table, name, table[name].is_null().to_numpy(), "a value")
+
+
+def _require_numbers(
+    table: pa.Table, name: str, low: float, high: float, expected: str, is_optional: bool = False
+) -> None:
+    """Require finite numbers in [low, high]; an optional column may be null."""
+    column = table[name]
+    if not is_optional:
+        _require_present(table, name)
+    elif column.null_count:
+        column = column.fill_null(low if np.isfinite(low) else 0)
+    values = column.to_numpy()
+    if len(values) == 0:
+        return
+    least, most = float(values.min()), float(values.max())  # NaN if any value is NaN.
+    if not (low <= least <= most <= high and math.isfinite(least) and math.isfinite(most)):
+        with np.errstate(invalid="ignore"):
+            _refuse(table, name, ~((values >= low) & (values <= high) & np.isfinite(values)), expected)
+
+
+def _require_texts(table: pa.Table, name: str) -> None:
+    _require_present(table, name)
+    letters = pc.utf8_length(table[name]).to_numpy()
+    limit = find_limit("text_letters")
+    if len(letters) and letters.max() > limit:
+        require_within("text_letters", int(letters.max()), f"row {int(letters.argmax())}, column {name!r}")
+
+
+def _require_choice(table: pa.Table, name: str, choices: Sequence[str], is_optional: bool = False) -> None:
+    values = table[name]
+    known = pc.is_in(values, pa.array([*choices, None] if is_optional else choices, pa.string()))
+    if not pc.all(known, min_count=0).as_py():
+        _refuse(table, name, ~known.to_numpy(), f"one of {', '.join(choices)}")
+
+
+def _read_lists(table: pa.Table, name: str, width: int) -> np.ndarray:
+    """Return a column of fixed-size lists as (n, width). Raises ValueError for a null list or a null entry."""
+    _require_present(table, name)
+    column = table[name].combine_chunks()
+    if isinstance(column, pa.ChunkedArray):
+        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], table.schema.field(name).type)
+    flat = column.flatten()
+    if flat.null_count:
+        bad = np.isnan(flat.to_numpy(zero_copy_only=False).reshape(-1, width)).any(axis=1)
+        _refuse(table, name, bad, f"{width} numbers")
+    return flat.to_numpy().reshape(-1, width)
+
+
+def _validate_scene_ids(table: pa.Table, name: str) -> None:
+    _require_texts(table, name)
+    _refuse(table, name, pc.equal(table[name], "").to_numpy(), "an id")
+    if len(pc.unique(table[name])) != len(table):
+        names, seen = table[name].to_pylist(), set()
+        _refuse(table, name, np.array([n in seen or seen.add(n) is not None for n in names]), "an id of only one row")
+
+
+def _validate_poses(table: pa.Table, name: str) -> None:
+    column = table[name]
+    if column.null_count == len(column):
+        return
+    length = pc.fill_null(pc.list_value_length(column), 12).to_numpy()
+    _refuse(table, name, length != 12, "12 numbers or null")
+    flat = pc.list_flatten(column)
+    values = flat.to_numpy(zero_copy_only=False).reshape(-1, 12)
+    if flat.null_count or not np.isfinite(values).all():
+        bad = np.zeros(len(table), bool)
+        bad[column.is_valid().to_numpy()] = ~np.isfinite(values.astype(float)).all(axis=1)
+        _refuse(table, name, bad, "12 finite numbers or null")
+
+
+def _validate_rotations(table: pa.Table, name: str) -> None:
+    entry = np.ascontiguousarray(_read_lists(table, name, 9).T)  # Long rows are several times faster than 3 x 3 blocks.
+    x, y, z = (entry[[k, k + 3, k + 6]] for k in range(3))
+    bad = np.zeros(len(table), bool)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for a, b, wanted in ((x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (x, z, 0), (y, z, 0)):
+            bad |= ~(np.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted) <= ORTHONORMAL)
+        across = [x[k - 2] * y[k - 1] - x[k - 1] * y[k - 2] for k in range(3)]
+        bad |= ~(across[0] * z[0] + across[1] * z[1] + across[2] * z[2] > 0)
+    _refuse(table, name, bad, "an orthonormal, right-handed matrix")
+
+
+def _validate_choleskys(table: pa.Table, name: str) -> None:
+    values = _read_lists(table, name, 6)
+    if not np.isfinite(values).all():
+        _refuse(table, name, ~np.isfinite(values).all(axis=1), "6 finite numbers")
+
+
+def _validate_tensors(table: pa.Table, name: str) -> None:
+    _require_present(table, name)
+    for row, values in enumerate(table[name].combine_chunks().to_numpy_ndarray() if len(table) else ()):
+        if not np.isfinite(values).all():
+            raise ValueError(f"row {row}, column {name!r}: NaN or infinite values")
+
+
+def _validate_classes(table: pa.Table, name: str) -> None:
+    _require_present(table, name)
+    for row, classes in enumerate(table[name].to_pylist()):
+        if not classes or len(set(classes)) != len(classes) or not set(classes) <= set(GROUND_CLASSES):
+            names = ", ".join(GROUND_CLASSES)
+            _refuse(table, name, np.arange(len(table)) == row, f"different names out of {names}")
+
+
+def _make_number_rule(low: float, high: float, expected: str, is_optional: bool = False) -> Callable:
+    return lambda table, name: _require_numbers(table, name, low, high, expected, is_optional)
+
+
+_FINITE = _make_number_rule(-np.inf, np.inf, "a finite number")
+_COUNT = _make_number_rule(0, np.inf, "a number of at least 0")
+_AREA = _make_number_rule(0, np.inf, "a finite number of at least 0, or null", is_optional=True)
+_NEAR = _make_number_rule(-FAR_M, FAR_M, f"a coordinate within {FAR_M:,.0f} m")
+_SIZE = _make_number_rule(float(np.finfo(np.float32).tiny), FAR_M, f"a positive size of at most {FAR_M:,.0f} m")
+_ANGLE = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi]")
+_HEADING = _make_number_rule(-3.1416, 3.1416, "an angle in [-pi, pi], or null", is_optional=True)
+_POSITIVE = _make_number_rule(float(np.finfo(np.float64).tiny), FAR_M, "a positive number")
+_LABEL = lambda table, name: _require_choice(table, name, DENSITIES, is_optional=True)  # noqa: E731
+
+# For each table, the rule of each column.
+RULES: Mapping[str, Mapping[str, Callable[[pa.Table, str], None]]] = {
+    "scenes": {
+        "scene_id": _validate_scene_ids,
+        "sequence": _require_texts,
+        "frame": _require_present,
+        **dict.fromkeys(("x_m", "y_m", "z_m", "yaw_rad"), _FINITE),
+        "world_from_imu": _validate_poses,
+        **dict.fromkeys(("vegetation_density", "vehicle_density"), _LABEL),
+        **dict.fromkeys(("vegetation_volume_m3", "vehicle_volume_m3"), _COUNT),
+        **dict.fromkeys(("num_primitives", *(f"num_{name}" for name in CATEGORIES), "primitive_offset"), _COUNT),
+        **dict.fromkeys([f"{name}_area_m2" for name in GROUND_CLASSES], _AREA),
+    },
+    "primitives": {
+        "scene_id": _require_present,
+        "category": lambda table, name: _require_choice(table, name, CATEGORIES),
+        "label": _require_texts,
+        "kind": lambda table, name: _require_choice(table, name, KINDS),
+        "instance_id": _require_present,
+        **dict.fromkeys(("x_m", "y_m", "z_m"), _NEAR),
+        **dict.fromkeys(("length_m", "width_m", "height_m"), _SIZE),
+        "yaw_rad": _ANGLE,
+        "heading_rad": _HEADING,
+        "rotation": _validate_rotations,
+        "cholesky": _validate_choleskys,
+        "existence": _make_number_rule(0, 1, "a probability in [0, 1]"),
+    },
+    "rasters": {
+        "scene_id": _require_present,
+        **dict.fromkeys(("height", "occupied"), _require_present),
+        **dict.fromkeys(("resolution_m", "height_step_m"), _POSITIVE),
+        **dict.fromkeys(("rows", "cols"), _make_number_rule(1, np.inf, "a number of at least 1")),
+        **dict.fromkeys(("front_m", "left_m"), _NEAR),
+        "ground_classes": _validate_classes,
+    },
+    "latents": {"scene_id": _require_present, "mean": _validate_tensors, "logvar": _validate_tensors},
+}
+
+
+def validate_table(kind: str, table: pa.Table) -> None:
+    """Validate the columns of a table that are present.
+
+    Args:
+        kind: Name of the table: scenes, primitives, rasters or latents; other tables have no rules.
+        table: Rows of one file; the columns have the types of the schema.
+
+    Raises:
+        ValueError: A value is missing, not finite, out of its range or beyond a limit. The message names the row and
+            the column.
+    """
+    rules = RULES.get(kind, {})
+    for name in table.column_names:
+        if name in rules:
+            rules[name](table, name)
+    if kind == "scenes" and "num_primitives" in table.column_names and len(table):
+        most = table["num_primitives"].to_numpy()
+        require_within("scene_primitives", int(most.max()), f"row {int(most.argmax())}, column 'num_primitives'")
+    if kind == "rasters" and {"height", "occupied", "rows", "cols", "ground_classes"} <= set(table.column_names):
+        _validate_rasters(table)
+
+
+def _validate_rasters(table: pa.Table) -> None:
+    """Compare the sizes of the masks and of the heights with the grid. No mask is unpacked."""
+    pixels = table["rows"].to_numpy().astype(np.int64) * table["cols"].to_numpy()
+    pixels = pixels * pc.list_value_length(table["ground_classes"]).to_numpy()
+    if len(pixels):
+        require_within("raster_pixels", int(pixels.max()), f"row {int(pixels.argmax())}, columns 'rows' and 'cols'")
+    bits = pc.binary_length(table["occupied"]).to_numpy()
+    _refuse_length(table, "occupied", bits, -(-pixels // 8), "one bit for each class, row and column")
+    occupied = np.empty(len(table), np.int64)
+    for row, blob in enumerate(table["occupied"]):
+        mask = np.frombuffer(blob.as_buffer(), np.uint8)
+        words = mask[: len(mask) // 8 * 8].view(np.uint64)
+        occupied[row] = np.bitwise_count(words).sum(dtype=np.int64) + np.bitwise_count(mask[len(words) * 8 :]).sum()
+        if pixels[row] % 8 and mask[-1] & ((1 << (8 - pixels[row] % 8)) - 1):
+            raise ValueError(f"row {row}, column 'occupied': the bits after the last pixel are set")
+    heights = pc.binary_length(table["height"]).to_numpy()
+    _refuse_length(table, "height", heights, 2 * occupied, "two bytes for each set bit of `occupied`")
+
+
+def _refuse_length(table: pa.Table, name: str, got: np.ndarray, wanted: np.ndarray, meaning: str) -> None:
+    if (bad := got != wanted).any():
+        row = int(np.argmax(bad))
+        raise ValueError(f"row {row}, column {name!r}: {got[row]:,} bytes, expected {wanted[row]:,} ({meaning})")
+
+
+def validate_shard(scenes: pa.Table, primitives: pa.Table, rasters: pa.Table | None = None) -> None:
+    """Validate that the tables of a shard hold the same scenes, and each primitive in its scene.
+
+    Args:
+        scenes: Valid rows with the columns scene_id, num_primitives and primitive_offset.
+        primitives: Valid rows of the table `primitives`.
+        rasters: Valid rows of the table `rasters`. None: not compared.
+
+    Raises:
+        ValueError: The tables are not aligned. The message names the table, the row and the column.
+    """
+    if rasters is not None:
+        same = len(scenes) == len(rasters) and pc.equal(scenes["scene_id"], rasters["scene_id"]).to_numpy()
+        if not np.all(same):
+            row = int(np.argmin(same)) if len(scenes) == len(rasters) else min(len(scenes), len(rasters))
+            names = [t["scene_id"][row].as_py() if row < len(t) else "no row" for t in (scenes, rasters)]
+            raise ValueError(
+                f"the tables of the shard are not aligned: in row {row}, scenes holds {names[0]} but rasters holds"
+                f" {names[1]}"
+            )
+    counts, offsets = (scenes[name].to_numpy().astype(np.int64) for name in ("num_primitives", "primitive_offset"))
+    ends = np.cumsum(counts)
+    if (bad := offsets != ends - counts).any():
+        row = int(np.argmax(bad))
+        raise ValueError(
+            f"scenes, row {row}, column 'primitive_offset': {offsets[row]}, expected {ends[row] - counts[row]}, the"
+            " number of primitives of the scenes before it"
+        )
+    if (total := int(ends[-1]) if len(ends) else 0) != len(primitives):
+        raise ValueError(f"primitives has {len(primitives)} rows, but the scenes of the shard have {total} primitives")
+    owner = np.repeat(np.arange(len(scenes)), counts)
+    if "scene_id" in primitives.column_names:
+        same = pc.equal(primitives["scene_id"], scenes["scene_id"].take(pa.array(owner)))
+        if not pc.all(same, min_count=0).as_py():
+            row = int(np.argmin(same.to_numpy()))
+            raise ValueError(
+                f"primitives, row {row}, column 'scene_id': {primitives['scene_id'][row].as_py()!r}, but this row"
+                f" belongs to scene {scenes['scene_id'][int(owner[row])].as_py()!r}"
+            )
+    named = [name for name in CATEGORIES if f"num_{name}" in scenes.column_names]
+    if named and "category" in primitives.column_names:
+        category = pc.index_in(primitives["category"], pa.array(CATEGORIES)).to_numpy()
+        found = np.bincount(owner * len(CATEGORIES) + category, minlength=len(scenes) * len(CATEGORIES))
+        for name in named:
+            stated = scenes[f"num_{name}"].to_numpy()
+            counted = found.reshape(-1, len(CATEGORIES))[:, CATEGORY_INDEX[name]]
+            if (bad := stated != counted).any():
+                row = int(np.argmax(bad))
+                raise ValueError(
+                    f"scenes, row {row}, column 'num_{name}': {stated[row]}, but the primitives table holds"
+                    f" {counted[row]} of this category"
+                )
