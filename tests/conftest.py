@@ -42,7 +42,6 @@ from helpers import (
     REJECT_REASON,
     SHARD_SIZES,
     TOWN_SLOTS,
-    find_free_port,
     random_scene,
     small_spec,
     studio_scene,
@@ -349,16 +348,13 @@ def studio_files(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def studio_url(studio_files, cluster) -> Iterator[str]:
-    """URL of a studio on Ray Serve."""
-    from ray import serve as ray_serve
-
+    """URL of a studio whose model runs in a Ray actor."""
     from jobs.implementation.serve_studio import serve_studio
     from jobs.serve_studio import Config
 
-    yield serve_studio(
-        Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=find_free_port(), num_threads=1)
-    )
-    ray_serve.shutdown()
+    studio = serve_studio(Config(str(studio_files / "model"), (str(studio_files / "tables"),), port=0, num_threads=1))
+    yield studio.address
+    studio.stop()
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Helpers for several test modules: scenes, a tiny pipeline, processes and an HTML parser."""
 
 import os
-import socket
 import subprocess
 import sys
 from contextlib import suppress
@@ -247,10 +246,3 @@ def studio_scene(number: int) -> Scene:
         "category": np.full(3, CATEGORY_INDEX["vehicle_small"], np.int8),
     }
     return replace(scene, scene_id=f"given-{number}", occupied=occupied, label=UNSET, **boxes)
-
-
-def find_free_port() -> int:
-    """Return a free TCP port of this host."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]

@@ -34,9 +34,15 @@ RAY_ENVIRONMENT = {
 }
 
 
+# With the value 0, Ray uses 127.0.0.1 as the address of this node, so all processes of a Ray that a job starts listen on
+# the loopback interface. On macOS and Windows this is the default. It must not be set on a cluster.
+LOOPBACK_ENVIRONMENT = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+
+
 def set_ray_environment() -> None:
-    """Set the variables of RAY_ENVIRONMENT that the user has not set."""
-    for name, value in RAY_ENVIRONMENT.items():
+    """Set the variables that Ray reads at its import, except those that the user has set."""
+    own = {} if os.environ.get("RAY_ADDRESS") else LOOPBACK_ENVIRONMENT
+    for name, value in (RAY_ENVIRONMENT | own).items():
         os.environ.setdefault(name, value)
 
 

@@ -93,7 +93,7 @@ JOB_OPTIONS = {
         "sampling-steps": "num-inference-steps",
     },
     "sample_scenes": {"glb": "num-glb", "steps": "num-inference-steps"},
-    "serve_studio": {"names": "host-names", "tables": "datasets", "threads": "num-threads"},
+    "serve_studio": {"names": "host-names", "tables": "datasets", "threads": "num-threads", "token": "token-file"},
     "sweep_references": {"apart-m": "min-distances-m", "sizes": "reference-sizes"},
     "sweep_samplers": {"pictures": "num-examples", "steps": "num-inference-steps"},
     "sweep_seams": {"mode": "neighbour-latents"},

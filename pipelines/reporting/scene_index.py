@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +28,7 @@ class Catalogue:
         shards: Shards of the scenes.
         shard: (n,) index of the shard of each scene.
         row: (n,) row of each scene within the shard.
+        damaged: Reason for each shard that was left out, by the path of its scenes table.
     """
 
     root: str
@@ -35,39 +36,51 @@ class Catalogue:
     shards: tuple[Shard, ...]
     shard: np.ndarray
     row: np.ndarray
+    damaged: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, root: str, source: str | None = None, split: str | None = None) -> Catalogue:
+    def read(
+        cls, root: str, source: str | None = None, split: str | None = None, skip_damaged: bool = False
+    ) -> Catalogue:
         """Read the scenes tables of a dataset directory.
 
         Args:
             root: Dataset directory.
             source: Source to read. None: all sources are read.
             split: Split to read. None: all splits are read.
+            skip_damaged: Whether to leave out shards whose scenes table is damaged, instead of raising an error.
 
         Returns:
             Catalogue of all scenes.
 
         Raises:
-            ValueError: The directory has no scene of this source and split.
+            ValueError: The directory has no scene of this source and split, or a scenes table is damaged.
         """
-        shards = find_shards(root, "scenes", source, split)
         columns = [name for name in SCENES.names if name != "world_from_imu"]
-        tables = []
-        for shard in shards:
-            table = shard.read("scenes", columns)
+        shards, tables, damaged = [], [], {}
+        for shard in find_shards(root, "scenes", source, split):
+            try:
+                table = shard.read("scenes", columns)
+            except ValueError as error:
+                if not skip_damaged:
+                    raise
+                damaged[shard.path("scenes")] = str(error)
+                continue
+            shards.append(shard)
             for name in ("source", "split"):
                 table = table.append_column(name, pa.array([getattr(shard, name)] * len(table), pa.string()))
             tables.append(table)
         lengths = [len(table) for table in tables]
         if sum(lengths) == 0:
-            raise ValueError(f"{root}: the scenes tables are empty; run the job that wrote them again")
+            reasons = f" ({next(iter(damaged.values()))})" if damaged else ""
+            raise ValueError(f"{root}: the scenes tables have no readable row{reasons}; run their job again")
         return cls(
             root=root,
             scenes=pa.concat_tables(tables),
             shards=tuple(shards),
             shard=np.repeat(np.arange(len(shards)), lengths),
             row=np.concatenate([np.arange(n) for n in lengths]),
+            damaged=damaged,
         )
 
     def __len__(self) -> int:

@@ -1,1 +1,1 @@
-"""The studio: sessions, HTTP interface and Ray Serve deployment."""
+"""The studio: sessions, tasks, access control and HTTP interface."""

@@ -1,88 +1,93 @@
-"""HTTP interface of the studio: the page, the operations of a session, downloads and access control."""
+"""HTTP interface of the studio: the page, the operations of a session and downloads."""
 
 from __future__ import annotations
 
-import hmac
-import json
-import secrets
+import asyncio
 from collections.abc import Callable
 from importlib.resources import files
-from typing import Literal
-from urllib.parse import urlsplit
+from typing import Annotated, Protocol, runtime_checkable
 
-from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
+from fastapi import APIRouter, FastAPI, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel
 
-from pipelines.editing.edit import serialize_edits
-from pipelines.io.mesh_export import export_glb
-from pipelines.io.opendrive import export_opendrive
-from pipelines.studio.requests import EditsRequest, ExtendRequest, GenerateRequest, InpaintRegionRequest, OpenRequest
-from pipelines.studio.session import Session, Studio, StudioBusyError
+from pipelines.studio.access import HEADERS, Gate
+from pipelines.studio.requests import (
+    EditsRequest,
+    ExtendRequest,
+    GenerateRequest,
+    InpaintRegionRequest,
+    ListRequest,
+    OpenRequest,
+)
+from pipelines.studio.session import DOWNLOADS, Answer, make_json_answer
 
-MAX_BODY_BYTES = 256 * 1024  # Maximum size of a request (bytes).
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PAGE_FILES = {
     "/": ("studio.html", "text/html"),
     "/studio.js": ("studio.js", "text/javascript"),
     "/viewer.js": ("viewer.js", "text/javascript"),
 }
+ANSWER_S = 60.0  # Maximum time until a request is answered (s).
 
 
-def build_studio_app(studio: Callable[[], Studio], token: str = "", hosts: tuple[str, ...] = LOOPBACK) -> FastAPI:
+@runtime_checkable
+class Backend(Protocol):
+    """Answers the requests of visitors."""
+
+    async def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
+        """Carry out one request (`Studio.answer`)."""
+        ...
+
+
+def build_studio_app(backend: Backend, gate: Gate) -> FastAPI:
     """Build the HTTP interface.
 
     Args:
-        studio: Function that returns the studio; all requests share it.
-        token: Token that each request must contain; the first request sends it as ?token=. "" means that no token is
-            required.
-        hosts: Host names that requests may use. Requests with other host names are refused. Without this check, a page
-            of another origin could reach the studio through the host name of that origin.
+        backend: Object that answers the requests; all visitors share it.
+        gate: Access control.
 
     Returns:
         FastAPI application.
     """
     app = FastAPI(title="PrITTI studio", docs_url=None, redoc_url=None, openapi_url=None)
-    add_access_control(app, token, hosts)
-    app.include_router(make_page_router(studio))
-    app.include_router(make_session_router(studio))
-    return app
-
-
-def refuse(request: Request, token: str, hosts: tuple[str, ...]) -> Response | None:
-    """Return an error response if the request is not allowed, otherwise None."""
-    host = urlsplit(f"//{request.headers.get('host', '')}").hostname
-    if hosts and host not in hosts:
-        return Response("unknown host", 421)
-    # Pages of other origins cannot set a custom header.
-    if request.method not in ("GET", "HEAD") and request.headers.get("x-studio") != "1":
-        return Response("the request does not come from the page of the studio", 403)
-    chunked = "chunked" in request.headers.get("transfer-encoding", "")
-    if chunked or int(request.headers.get("content-length") or 0) > MAX_BODY_BYTES:
-        return Response("the request is too large", 413)
-    if token:
-        sent = request.query_params.get("token") or request.cookies.get("studio_token") or ""
-        if not hmac.compare_digest(sent.encode(), token.encode()):
-            return Response("a token is needed; open the address that jobs/serve_studio.py printed", 401)
-    return None
-
-
-def add_access_control(app: FastAPI, token: str, hosts: tuple[str, ...]) -> None:
-    """Refuse requests from other origins, and set a cookie for each visitor."""
 
     @app.middleware("http")
     async def guard(request: Request, call_next):
-        refusal = refuse(request, token, hosts)
-        if refusal:
-            return refusal
-        response = await call_next(request)
-        response.headers["Content-Security-Policy"] = (
-            "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'"
-        )
-        response.headers["X-Content-Type-Options"] = "nosniff"
-        if token:
-            response.set_cookie("studio_token", token, httponly=True, samesite="strict")
-        if "studio" not in request.cookies:
-            response.set_cookie("studio", secrets.token_urlsafe(16), httponly=True, samesite="strict")
+        response = gate.refuse(request) or gate.exchange_token(request)
+        if response is None:
+            visitor = request.state.visitor = gate.read_visitor(request)
+            path = request.url.path
+            if visitor or (not gate.token and path in PAGE_FILES):
+                response = await call_next(request)
+                if not visitor and path == "/":
+                    gate.issue_cookie(response)
+            else:
+                fix = "open the address that jobs/serve_studio.py printed" if gate.token else "reload the page"
+                response = to_response(make_json_answer({"detail": f"your session has expired; {fix}"}, 401))
+        response.headers.update(HEADERS)
         return response
+
+    @app.exception_handler(RequestValidationError)
+    async def explain(_: Request, error: RequestValidationError) -> Response:
+        # The default answer repeats the values of the request, which can be NaN or large.
+        shown = [
+            {"loc": [str(part)[:80] for part in one["loc"]], "msg": one["msg"][:300]} for one in error.errors()[:10]
+        ]
+        return to_response(make_json_answer({"detail": shown}, 422))
+
+    app.include_router(make_page_router())
+    app.include_router(make_session_router(backend))
+    return app
+
+
+def to_response(answer: Answer) -> Response:
+    """Convert an answer to an HTTP response."""
+    headers = {}
+    if answer.file_name:
+        headers["Content-Disposition"] = f'attachment; filename="{answer.file_name}"'
+    if answer.retry_after_s:
+        headers["Retry-After"] = str(answer.retry_after_s)
+    return Response(answer.content, answer.status, headers, answer.media_type)
 
 
 def serve_file(name: str, media_type: str) -> Callable[[], Response]:
@@ -95,104 +100,61 @@ def serve_file(name: str, media_type: str) -> Callable[[], Response]:
     return respond
 
 
-def make_page_router(studio: Callable[[], Studio]) -> APIRouter:
-    """Return the routes for the page, its scripts, the labels and the list of scenes."""
+def make_page_router() -> APIRouter:
+    """Return the routes for the page and its scripts."""
     router = APIRouter()
     for path, (name, media_type) in PAGE_FILES.items():
         router.get(path)(serve_file(name, media_type))
-
-    @router.get("/api/about")
-    def about() -> dict:
-        return {"labels": studio().labels, "resolution_m": studio().pipeline.spec.grid.resolution_m}
-
-    @router.get("/api/scenes")
-    def scenes(start: int = 0, text: str = "") -> dict:
-        return studio().list_scenes(max(0, start), text[:100])
-
     return router
 
 
-def make_session_router(studio: Callable[[], Studio]) -> APIRouter:
-    """Return the routes for the session of a visitor; each operation returns the new state of the session."""
+def make_session_router(backend: Backend) -> APIRouter:
+    """Return the routes for the operations of a visitor; operations that change the scene return its new state."""
     router = APIRouter()
 
-    def open_session(request: Request) -> Session:
-        visitor = request.cookies.get("studio")
-        if not visitor or len(visitor) > 64:
-            raise HTTPException(400, "the request has no cookie; open the page of the studio first")
-        return studio().open_session(visitor)
-
-    def apply(request: Request, operation: Callable[[Session], None], busy_status: int = 409) -> dict:
-        session = open_session(request)
+    async def ask(request: Request, operation: str, wanted: BaseModel | None = None) -> Response:
         try:
-            operation(session)
-        except StudioBusyError as error:
-            raise HTTPException(busy_status, str(error)) from error
-        except ValueError as error:
-            raise HTTPException(400, str(error)) from error
-        return session.state()
+            answer = await asyncio.wait_for(backend.answer(operation, request.state.visitor, wanted), ANSWER_S)
+        except TimeoutError:
+            answer = make_json_answer({"detail": "the studio is overloaded; try again"}, 429, 10)
+        return to_response(answer)
 
-    @router.get("/api/state")
-    def state(request: Request) -> dict:
-        return open_session(request).state()
+    def get(operation: str, path: str) -> None:
+        async def respond(request: Request) -> Response:
+            return await ask(request, operation)
 
-    @router.get("/api/work")
-    def work(request: Request) -> dict:
-        task = open_session(request).task
-        return task.state() if task else {}
+        router.get(path)(respond)
 
-    @router.post("/api/cancel")
-    def cancel(request: Request) -> dict:
-        session = open_session(request)
-        if session.task:
-            session.task.cancelled = True
-        return session.state()
+    def post(operation: str, kind: type[BaseModel]) -> None:
+        async def respond(request: Request, wanted) -> Response:
+            return await ask(request, operation, wanted)
 
-    @router.post("/api/open")
-    def open_scene(request: Request, wanted: OpenRequest) -> dict:
-        return apply(request, lambda session: studio().open_scene(session.require_idle(), wanted.scene_id))
+        respond.__annotations__ = {"request": Request, "wanted": kind, "return": Response}
+        router.post(f"/api/{operation}")(respond)
 
-    @router.post("/api/edit")
-    def edit(request: Request, wanted: EditsRequest) -> dict:
-        return apply(request, lambda session: studio().edit(session.require_idle(), wanted))
+    def post_without_values(operation: str) -> None:
+        async def respond(request: Request) -> Response:
+            return await ask(request, operation)
 
-    @router.post("/api/undo")
-    def undo(request: Request) -> dict:
-        return apply(request, lambda session: session.require_idle().undo())
+        router.post(f"/api/{operation}")(respond)
 
-    @router.post("/api/redo")
-    def redo(request: Request) -> dict:
-        return apply(request, lambda session: session.require_idle().redo())
+    for operation in ("about", "state", "work"):
+        get(operation, f"/api/{operation}")
+    for kind in DOWNLOADS:
+        get(kind, f"/scene.{kind}")
+    for operation in ("cancel", "undo", "redo"):
+        post_without_values(operation)
+    for operation, kind in {
+        "open": OpenRequest,
+        "edit": EditsRequest,
+        "generate": GenerateRequest,
+        "inpaint": InpaintRegionRequest,
+        "extend": ExtendRequest,
+    }.items():
+        post(operation, kind)
 
-    @router.post("/api/generate")
-    def generate(request: Request, wanted: GenerateRequest) -> dict:
-        return apply(request, lambda session: studio().generate(session, wanted), busy_status=429)
-
-    @router.post("/api/inpaint")
-    def inpaint(request: Request, wanted: InpaintRegionRequest) -> dict:
-        return apply(request, lambda session: studio().inpaint(session, wanted), busy_status=429)
-
-    @router.post("/api/extend")
-    def extend(request: Request, wanted: ExtendRequest) -> dict:
-        return apply(request, lambda session: studio().extend(session, wanted), busy_status=429)
-
-    @router.get("/scene.{kind}")
-    def download(request: Request, kind: Literal["glb", "xodr", "json"]) -> Response:
-        session = open_session(request)
-        try:
-            scene = session.require_scene()
-            content = {
-                "glb": lambda: export_glb(scene),
-                "xodr": lambda: export_opendrive(scene),
-                "json": lambda: json.dumps(serialize_edits(session.edits), indent=1).encode(),
-            }[kind]()
-        except ValueError as error:
-            raise HTTPException(400, str(error)) from error
-        name = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene.scene_id)
-        return Response(
-            content,
-            media_type="application/octet-stream",
-            headers={"Content-Disposition": f'attachment; filename="{name}.{kind}"'},
-        )
+    @router.get("/api/scenes")
+    async def scenes(request: Request, wanted: Annotated[ListRequest, Query()]) -> Response:
+        return await ask(request, "scenes", wanted)
 
     return router

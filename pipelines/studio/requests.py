@@ -12,13 +12,18 @@ from models.sampling.repaint import RePaintConfig
 
 
 class StudioRequest(BaseModel):
-    """Base class of all requests; unknown fields raise an error."""
+    """Base class of all requests; unknown fields, NaN and infinite numbers raise an error."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class ListRequest(StudioRequest):
+    start: int = Field(0, ge=0, le=10**9)
+    text: str = Field("", max_length=100)
 
 
 class OpenRequest(StudioRequest):
-    scene_id: str = Field(max_length=200)
+    scene_id: str = Field(max_length=1000)
 
 
 GUIDED = RePaintConfig.guided()  # The defaults of --guided; only the number of steps is smaller in the studio.

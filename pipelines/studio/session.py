@@ -1,174 +1,189 @@
-"""Sessions of the studio, without HTTP.
-
-A visitor generates, edits, inpaints and extends one scene, and can undo each step. Long operations run in threads. Only
-one long operation runs at a time, regardless of the number of visitors. Long operations report their progress and can
-be cancelled.
-"""
+"""The studio without HTTP: it generates, edits, inpaints and extends the scene of each visitor."""
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
+import asyncio
+import json
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
+
+import pyarrow as pa
+from pydantic import BaseModel
 
 from models.composition.extend import inpaint_blocks, split_region
 from models.composition.inpaint import select_polygon
 from models.labels import LABELS, require_labels
-from models.pipeline import PrITTIPipeline
-from models.scene import Scene
-from pipelines.editing.edit import parse_edits, replay_edits, serialize_edits
+from models.scene import Grid, Scene
+from pipelines.editing.edit import Duplicate, parse_edits, replay_edits, serialize_edits
 from pipelines.generation.sample import find_scene_label, load_pipeline, resample_to_model_resolution
+from pipelines.io.mesh_export import export_glb
+from pipelines.io.opendrive import export_opendrive
 from pipelines.io.web_export import export_web_scene
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.scene_index import Catalogue
+from pipelines.schema.file_names import make_file_name
+from pipelines.schema.tables import Shard, parse_scenes
+from pipelines.studio.limits import StudioError, StudioLimits
 from pipelines.studio.requests import (
     EditsRequest,
     ExtendRequest,
     GenerateRequest,
     InpaintRegionRequest,
+    ListRequest,
+    OpenRequest,
     SamplingRequest,
 )
+from pipelines.studio.sessions import Session, SessionStore
+from pipelines.studio.tasks import BackgroundTask, TaskQueue
 
-MAX_SESSIONS, MAX_HISTORY, MAX_WAITING = 16, 50, 4
 MAX_SIDE_M = 512.0  # Maximum side length of an extended scene (m).
 THUMBNAIL_PX, SCENES_PER_PAGE = 128, 24
+JSON_TYPE, FILE_TYPE = "application/json", "application/octet-stream"
+DOWNLOADS = ("glb", "xodr", "json")
+logger = logging.getLogger(__name__)
 
 
-class Cancelled(Exception):
-    """Raised when the visitor cancels a task."""
-
-
-class StudioBusyError(RuntimeError):
-    """Raised if a task of the visitor is already running, or if too many tasks are waiting."""
-
-
-@dataclass
-class BackgroundTask:
-    """A sampling run in a thread and its progress.
+class Answer(NamedTuple):
+    """Response to a request.
 
     Attributes:
-        name: Name of the operation.
-        total: Total number of network evaluations of the operation.
-        done: Number of finished network evaluations.
-        error: Error message; "" means no error.
-        cancelled: Whether the visitor has cancelled the task.
-        finished: Whether the thread has ended.
+        content: Body.
+        media_type: Media type of the body.
+        status: HTTP status.
+        file_name: Name under which a browser stores the body; "" means that the body is not a download.
+        retry_after_s: Seconds after which the visitor should try again; 0 means no advice.
     """
 
-    name: str
-    total: int
-    done: int = 0
-    error: str = ""
-    cancelled: bool = False
-    finished: bool = False
-
-    def step(self, pipeline: PrITTIPipeline, number: int, timestep: int, values: dict) -> dict:
-        """Count one step of the sampler, which calls this function after each step."""
-        if self.cancelled:
-            raise Cancelled
-        self.done += 1
-        return values
-
-    def state(self) -> dict:
-        """Return the state of the task as plain values."""
-        names = ("name", "total", "done", "error", "cancelled", "finished")
-        return {name: getattr(self, name) for name in names}
+    content: bytes
+    media_type: str = JSON_TYPE
+    status: int = 200
+    file_name: str = ""
+    retry_after_s: int = 0
 
 
-@dataclass
-class Session:
-    """The scene of a visitor, with earlier states and undone states.
-
-    Attributes:
-        scene: Current scene.
-        past: Earlier states, each as (name of the next operation, scene, edits).
-        future: Undone states.
-        edits: Edits since the scene was opened or generated.
-        task: Last task.
-    """
-
-    scene: Scene | None = None
-    past: list[tuple[str, Scene | None, list]] = field(default_factory=list)
-    future: list[tuple[str, Scene | None, list]] = field(default_factory=list)
-    edits: list = field(default_factory=list)
-    task: BackgroundTask | None = None
-
-    def put(self, name: str, scene: Scene, edits: list) -> None:
-        """Store the state that results from an operation called `name`."""
-        self.past = [*self.past, (name, self.scene, self.edits)][-MAX_HISTORY:]
-        self.scene, self.edits, self.future = scene, edits, []
-
-    def undo(self) -> None:
-        """Restore the state before the last operation."""
-        if self.past:
-            name, scene, edits = self.past.pop()
-            self.future.append((name, self.scene, self.edits))
-            self.scene, self.edits = scene, edits
-
-    def redo(self) -> None:
-        """Restore the last undone state."""
-        if self.future:
-            name, scene, edits = self.future.pop()
-            self.past.append((name, self.scene, self.edits))
-            self.scene, self.edits = scene, edits
-
-    def require_scene(self) -> Scene:
-        """Return the current scene. Raises ValueError if no scene is open."""
-        if self.scene is None:
-            raise ValueError("no scene is open; open or generate one first")
-        return self.scene
-
-    def require_idle(self) -> Session:
-        """Return the session. Raises StudioBusyError if a task of the visitor is running."""
-        if self.task and not self.task.finished:
-            raise StudioBusyError(f"{self.task.name} is still running; wait for it or cancel it")
-        return self
-
-    def state(self) -> dict:
-        """Return the values that the page shows."""
-        return {
-            "scene": None
-            if self.scene is None
-            else export_web_scene(self.scene) | {"label": self.scene.vegetation_density},
-            "undo": self.past[-1][0] if self.past else None,
-            "redo": self.future[-1][0] if self.future else None,
-            "edits": serialize_edits(self.edits),
-            "work": self.task.state() if self.task else None,
-        }
+def make_json_answer(value: object, status: int = 200, retry_after_s: int = 0) -> Answer:
+    """Return an answer with JSON."""
+    return Answer(json.dumps(value, separators=(",", ":")).encode(), status=status, retry_after_s=retry_after_s)
 
 
 class Studio:
     """The model, the sessions of all visitors, and the datasets from which scenes can be opened."""
 
-    def __init__(self, model: str, datasets: list[str]) -> None:
+    def __init__(self, model: str, datasets: list[str], limits: StudioLimits | None = None) -> None:
         """Load the model and read the datasets.
 
+        Args:
+            model: Pipeline directory.
+            datasets: Dataset directories. Damaged shards are left out, and the log names them.
+            limits: Limits of memory and computing time (default: StudioLimits()).
+
         Raises:
-            ValueError: A directory contains no model, or a dataset contains no scenes.
+            ValueError: A directory contains no model, or a dataset contains no readable scenes.
         """
+        self.limits = limits or StudioLimits()
         self.pipeline = load_pipeline(model)
         self.default_scheduler = self.pipeline.scheduler_config
-        self.catalogues = [Catalogue.read(root) for root in datasets]
-        self.sessions: OrderedDict[str, Session] = OrderedDict()
-        self.sampling, self.num_waiting, self.lock = threading.Lock(), 0, threading.Lock()
+        self.catalogues = [Catalogue.read(root, skip_damaged=True) for root in datasets]
+        for path, reason in (item for one in self.catalogues for item in one.damaged.items()):
+            logger.warning("studio: %s is left out (%s)", path, reason)
+        self.listed = [
+            (row["scene_id"].lower(), catalogue, index, row)
+            for catalogue in self.catalogues
+            for index, row in enumerate(
+                catalogue.scenes.select(["scene_id", "vegetation_density", "num_primitives"]).to_pylist()
+            )
+        ]
+        self.sessions, self.tasks = SessionStore(self.limits), TaskQueue(self.limits)
 
-    def open_session(self, visitor: str) -> Session:
-        """Return the session of a visitor.
+    def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
+        """Carry out one request of a visitor.
 
-        If there are more than MAX_SESSIONS sessions, the least recently used idle session is deleted.
+        Args:
+            operation: Name of the operation: about, scenes, state, work, cancel, open, edit, undo, redo, generate,
+                inpaint, extend, or one of DOWNLOADS.
+            visitor: Id of the visitor.
+            request: Values of the request, for the operations that have values.
+
+        Returns:
+            The response. An error that the visitor can correct is a response, too.
         """
-        with self.lock:
-            session = self.sessions.pop(visitor, None) or Session()
-            self.sessions[visitor] = session
-            while len(self.sessions) > MAX_SESSIONS:
-                idle = next(
-                    (name for name, other in self.sessions.items() if not other.task or other.task.finished), None
-                )
-                self.sessions.pop(idle or next(iter(self.sessions)))
-            return session
+        try:
+            return self._answer(operation, visitor, request)
+        except StudioError as error:
+            return make_json_answer({"detail": str(error)}, error.status, error.retry_after_s)
+        except Exception:
+            logger.exception("studio: %s failed", operation)
+            return make_json_answer({"detail": f"{operation} failed; the log of the studio has the reason"}, 500)
+
+    def _answer(self, operation: str, visitor: str, request: BaseModel | None) -> Answer:
+        if operation == "about":
+            return make_json_answer({"labels": self.labels, "resolution_m": self.pipeline.spec.grid.resolution_m})
+        if isinstance(request, ListRequest):
+            return make_json_answer(self.list_scenes(request))
+        session = self.sessions.open(visitor)
+        if operation == "work":
+            return make_json_answer(self.tasks.describe(session.task) if session.task else {})
+        if operation in DOWNLOADS:
+            return self.export(session, operation)
+        if operation == "cancel":
+            if session.task:
+                self.tasks.cancel(session.task)
+        elif operation in ("undo", "redo"):
+            getattr(session.require_idle(), operation)()
+        elif operation != "state":
+            self._change(session, visitor, request)
+            self.sessions.trim()
+        return self.describe(session)
+
+    def _change(self, session: Session, visitor: str, request: BaseModel | None) -> None:
+        """Apply a request that changes the scene, or start its task."""
+        with session.lock:
+            session.require_idle(429 if isinstance(request, SamplingRequest) else 409)
+            if isinstance(request, OpenRequest):
+                self.open_scene(session, request.scene_id)
+            elif isinstance(request, EditsRequest):
+                self.edit(session, request)
+            elif isinstance(request, GenerateRequest):
+                self.generate(session, visitor, request)
+            elif isinstance(request, InpaintRegionRequest):
+                self.inpaint(session, visitor, request)
+            elif isinstance(request, ExtendRequest):
+                self.extend(session, visitor, request)
+            else:
+                raise StudioError(f"unknown request {type(request).__name__}", 404)
+
+    def describe(self, session: Session) -> Answer:
+        """Return the values that the page shows."""
+        with session.lock:
+            scene, edits = session.state
+            if session.shown is None and scene is not None:
+                shown = export_web_scene(scene) | {"label": scene.vegetation_density}
+                session.shown = json.dumps(shown, separators=(",", ":")).encode()
+            values = {
+                "undo": session.past[-1][0] if session.past else None,
+                "redo": session.future[-1][0] if session.future else None,
+                "edits": serialize_edits(edits),
+                "work": self.tasks.describe(session.task) if session.task else None,
+            }
+            content = json.dumps(values, separators=(",", ":")).encode()
+            return Answer(b'{"scene":' + (session.shown or b"null") + b"," + content[1:])
+
+    def export(self, session: Session, kind: str) -> Answer:
+        """Return the scene as a file."""
+        scene, edits = session.state
+        scene = session.require_scene()
+        try:
+            content = {
+                "glb": lambda: export_glb(scene),
+                "xodr": lambda: export_opendrive(scene),
+                "json": lambda: json.dumps(serialize_edits(edits), indent=1).encode(),
+            }[kind]()
+        except ValueError as error:
+            raise StudioError(str(error)) from error
+        return Answer(content, FILE_TYPE, file_name=f"{make_file_name(scene.scene_id)}.{kind}")
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -182,45 +197,54 @@ class Studio:
         label of the model.
         """
         kind = self.pipeline.dit.config.label
-        if request.label:
-            require_labels(kind, [request.label])
-            return request.label
+        try:
+            if request.label:
+                require_labels(kind, [request.label])
+                return request.label
+        except ValueError as error:
+            raise StudioError(str(error)) from error
         try:
             return find_scene_label(scene, kind) if scene is not None else self.labels[0]
         except ValueError:
             return self.labels[0]
 
-    def start_task(self, session: Session, name: str, total: int, make: Callable[[BackgroundTask], Scene]) -> None:
-        """Run `make` in a thread and put the resulting scene into the session.
+    def require_area(self, grid: Grid) -> None:
+        """Raise StudioError if a scene is too large for the studio."""
+        sides_m = grid.rows * grid.resolution_m, grid.cols * grid.resolution_m
+        if max(sides_m) > MAX_SIDE_M or sides_m[0] * sides_m[1] > self.limits.max_area_m2:
+            raise StudioError(
+                f"a scene of {sides_m[0]:.0f} m x {sides_m[1]:.0f} m is too large for the studio, which accepts"
+                f" {self.limits.max_area_m2:,.0f} m² and {MAX_SIDE_M:.0f} m; use jobs/outpaint_scenes.py"
+            )
+
+    def require_size(self, scene: Scene, more: int = 0) -> Scene:
+        """Return the scene. Raises StudioError if it has too many primitives or too large an area."""
+        self.require_area(scene.grid)
+        if (count := len(scene) + more) > self.limits.max_primitives:
+            raise StudioError(
+                f"the scene would have {count:,} primitives, and the studio accepts {self.limits.max_primitives:,}"
+            )
+        return scene
+
+    def start_task(
+        self, session: Session, visitor: str, name: str, total: int, make: Callable[[BackgroundTask], Scene]
+    ) -> None:
+        """Run `make` as a task and put the resulting scene into the session.
 
         Raises:
-            StudioBusyError: A task of the visitor is already running, or too many tasks are waiting.
+            StudioError: The queue does not accept the task.
         """
-        with self.lock:
-            session.require_idle()
-            if self.num_waiting >= MAX_WAITING:
-                raise StudioBusyError("too many tasks are waiting; try again in a minute")
-            self.num_waiting += 1
-            task = session.task = BackgroundTask(name, total)
 
-        def run() -> None:
-            try:
-                with self.sampling:
-                    if task.cancelled:
-                        raise Cancelled
-                    session.put(name, make(task), [])
-            except Cancelled:
-                pass
-            except Exception as error:
-                task.error = str(error)
-            finally:
-                with self.lock:
-                    self.num_waiting -= 1
-                task.finished = True
+        def run(task: BackgroundTask) -> None:
+            scene = self.require_size(make(task))
+            session.put(name, scene, (), self.limits.session_bytes)
+            self.sessions.trim()
 
-        threading.Thread(target=run, daemon=True).start()
+        task = BackgroundTask(visitor, name, total, run)
+        self.tasks.put(task)
+        session.task = task
 
-    def generate(self, session: Session, request: GenerateRequest) -> None:
+    def generate(self, session: Session, visitor: str, request: GenerateRequest) -> None:
         """Start the generation of a scene."""
         label = self.choose_label(request, None)
 
@@ -237,14 +261,17 @@ class Studio:
             finally:
                 self.pipeline.scheduler = self.default_scheduler
 
-        self.start_task(session, f"generate {label}, seed {request.seed}", request.steps, make)
+        self.start_task(session, visitor, f"generate {label}, seed {request.seed}", request.steps, make)
 
-    def inpaint(self, session: Session, request: InpaintRegionRequest) -> None:
-        """Start the regeneration of a region. Raises ValueError if the region contains no pixel of the scene."""
+    def inpaint(self, session: Session, visitor: str, request: InpaintRegionRequest) -> None:
+        """Start the regeneration of a region. Raises StudioError if the region contains no pixel of the scene."""
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
-        region = select_polygon(scene.grid, request.polygon_m)
+        try:
+            region = select_polygon(scene.grid, request.polygon_m)
+        except ValueError as error:
+            raise StudioError(str(error)) from error
         if not region.any():
-            raise ValueError("the region contains no pixel of the scene; draw a larger region inside the scene")
+            raise StudioError("the region contains no pixel of the scene; draw a larger region inside the scene")
         label, repaint = self.choose_label(request, scene), request.repaint()
         blocks = len(split_region(self.pipeline, scene, region))
 
@@ -262,17 +289,18 @@ class Studio:
                 canvas = step.canvases[0]
             return canvas
 
-        self.start_task(session, f"inpaint {request.contents}", blocks * repaint.num_evaluations, make)
+        self.start_task(session, visitor, f"inpaint {request.contents}", blocks * repaint.num_evaluations, make)
 
-    def extend(self, session: Session, request: ExtendRequest) -> None:
-        """Start the extension of the scene on one side. Raises ValueError if the scene already has the maximum size."""
+    def extend(self, session: Session, visitor: str, request: ExtendRequest) -> None:
+        """Start the extension of the scene on one side. Raises StudioError if the result would be too large."""
         small = self.pipeline.spec.grid
         scene = resample_to_model_resolution(session.require_scene(), self.pipeline.spec)
-        rows, cols = scene.grid.rows, scene.grid.cols
-        if max(rows, cols) * small.resolution_m >= MAX_SIDE_M:
-            raise ValueError(f"the scene is already {MAX_SIDE_M:.0f} m long; use jobs/outpaint_scenes.py")
-        across = cols if request.side in ("ahead", "behind") else rows
-        blocks = -(-(across - small.rows) // (small.rows // 2)) + 1
+        step = small.rows // 2
+        is_along = request.side in ("ahead", "behind")
+        rows, cols = scene.grid.rows + step * is_along, scene.grid.cols + step * (not is_along)
+        self.require_area(Grid(0.0, 0.0, scene.grid.resolution_m, rows, cols))
+        across = cols if is_along else rows
+        blocks = -(-(across - small.rows) // step) + 1
         label, repaint = self.choose_label(request, scene), request.repaint()
 
         def make(task: BackgroundTask) -> Scene:
@@ -280,45 +308,84 @@ class Studio:
                 scene, label, request.seed, repaint=repaint, callback_on_step_end=task.step, side=request.side
             )
 
-        self.start_task(session, f"extend {request.side}", blocks * repaint.num_evaluations, make)
+        self.start_task(session, visitor, f"extend {request.side}", blocks * repaint.num_evaluations, make)
 
     def edit(self, session: Session, request: EditsRequest) -> None:
-        """Apply edits to the scene. Raises ValueError if an edit is invalid or uses SQL."""
-        edits = parse_edits(request.edits)
-        if any(edit.select.where for edit in edits):
-            raise ValueError(
-                "the studio accepts no SQL; select by number, category or polygon, or use jobs/edit_scenes.py"
+        """Apply edits to the scene. Raises StudioError if an edit is invalid, uses SQL or exceeds a limit."""
+        scene, before = session.require_scene(), session.state.edits
+        if len(before) + len(request.edits) > self.limits.max_edits:
+            raise StudioError(
+                f"the scene has {len(before):,} edits, and the studio accepts {self.limits.max_edits:,}; download the"
+                " scene, or open it again"
             )
-        for edit in edits:
-            edit.check()
-        scene, _ = replay_edits(session.require_scene(), edits)
-        session.put(", ".join(edit.name for edit in edits), scene, [*session.edits, *edits])
+        try:
+            edits = parse_edits(request.edits)
+            if any(edit.select.where for edit in edits):
+                raise StudioError(
+                    "the studio accepts no SQL; select by number, category or polygon, or use jobs/edit_scenes.py"
+                )
+            for edit in edits:
+                edit.check()
+            for edit in edits:
+                if isinstance(edit, Duplicate):
+                    self.require_size(scene, int(edit.select.select_primitives(scene).sum()))
+                scene, _ = replay_edits(scene, [edit])
+        except StudioError:
+            raise
+        except ValueError as error:
+            raise StudioError(str(error)) from error
+        names = ", ".join(dict.fromkeys(edit.name for edit in edits))
+        session.put(names, scene, (*before, *edits), self.limits.session_bytes)
 
     def open_scene(self, session: Session, scene_id: str) -> None:
-        """Open a scene of a dataset. Raises ValueError if there is no such scene."""
-        for catalogue in self.catalogues:
-            if scene_id in catalogue.scenes["scene_id"].to_pylist():
-                session.put(f"open {scene_id}", read_scene(catalogue, catalogue.find([scene_id])[0]), [])
-                return
-        raise ValueError(f"no scene {scene_id!r} in the datasets")
+        """Open a scene of a dataset. Raises StudioError if there is no such scene or if its tables are damaged."""
+        place = next(((c, k) for _, c, k, row in self.listed if row["scene_id"] == scene_id), None)
+        if place is None:
+            raise StudioError(f"no scene {scene_id!r} in the datasets")
+        try:
+            scene = read_scene(*place)
+        except ValueError as error:
+            logger.warning("studio: scene %r cannot be read: %s", scene_id, error)
+            raise StudioError("the tables of this scene are damaged; the log of the studio names the file") from error
+        session.put(f"open {scene_id}", self.require_size(scene), (), self.limits.session_bytes)
 
-    def list_scenes(self, start: int, text: str) -> dict:
+    def list_scenes(self, request: ListRequest) -> dict:
         """Return one page of the scenes whose id contains `text`: ids, labels and thumbnails."""
-        found = []
-        for catalogue in self.catalogues:
-            rows = catalogue.scenes.select(["scene_id", "vegetation_density", "num_primitives"]).to_pylist()
-            found += [(catalogue, k, row) for k, row in enumerate(rows) if text.lower() in row["scene_id"].lower()]
-        page = found[start : start + SCENES_PER_PAGE]
-        scenes = [row | {"picture": draw_thumbnail(catalogue, k)} for catalogue, k, row in page]
-        return {"total": len(found), "start": start, "scenes": scenes}
+        text = request.text.lower()
+        found = [(catalogue, index, row) for name, catalogue, index, row in self.listed if text in name]
+        page = found[request.start : request.start + SCENES_PER_PAGE]
+        scenes = [row | {"picture": draw_thumbnail(catalogue, index)} for catalogue, index, row in page]
+        return {"total": len(found), "start": request.start, "scenes": scenes}
 
 
 def read_scene(catalogue: Catalogue, index: int) -> Scene:
     """Read one scene of a catalogue."""
-    return catalogue.shards[catalogue.shard[index]].scenes([int(catalogue.row[index])])[0]
+    shard = catalogue.shards[catalogue.shard[index]]
+    return next(parse_scenes(*read_tables(shard), shard.source, shard.split, [int(catalogue.row[index])]))
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=32)
+def read_tables(shard: Shard) -> tuple[pa.Table, pa.Table, pa.Table]:
+    """Read the tables of a shard; the last shards stay in memory, because visitors often open scenes of one shard."""
+    return shard.read_tables()
+
+
+@lru_cache(maxsize=4096)
 def draw_thumbnail(catalogue: Catalogue, index: int) -> str:
-    """Return a thumbnail of a scene as a data URI."""
-    return encode_data_uri(render_bev(read_scene(catalogue, index), THUMBNAIL_PX))
+    """Return a thumbnail of a scene as a data URI; "" if the scene cannot be read."""
+    try:
+        return encode_data_uri(render_bev(read_scene(catalogue, index), THUMBNAIL_PX))
+    except ValueError as error:
+        logger.warning("studio: no thumbnail: %s", error)
+        return ""
+
+
+class LocalBackend:
+    """Answers requests in threads of this process, for tests without Ray."""
+
+    def __init__(self, studio: Studio) -> None:
+        self.studio = studio
+
+    async def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
+        """Carry out one request (`Studio.answer`)."""
+        return await asyncio.to_thread(self.studio.answer, operation, visitor, request)

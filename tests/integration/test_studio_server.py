@@ -1,4 +1,4 @@
-"""Tests of the HTTP interface of the studio on Ray Serve, with a model that has random weights."""
+"""Tests of the HTTP interface of the studio in a Ray actor, with a model that has random weights."""
 
 import socket
 import time
@@ -85,7 +85,7 @@ def test_studio_reports_progress_and_cancels(studio_url):
         ("edit", {"edits": [{"edit": "remove", "select": {"primitives": [99]}}]}, 400, "has 3 primitives"),
         ("inpaint", {"polygon_m": [[900, 0], [901, 0], [900, 1]]}, 400, "contains no pixel"),
         ("extend", {"side": "up"}, 422, "ahead"),
-        ("edit", {"edits": [{"edit": "remove", "x": "y" * 300_000}]}, 413, "too large"),
+        ("edit", {"edits": [{"edit": "remove", "x": "y" * 300_000}]}, 413, "larger than 262,144 bytes"),
     ],
 )
 def test_studio_rejects_invalid_requests(studio_url, path, body, status, message):
@@ -101,7 +101,7 @@ def test_studio_rejects_foreign_pages_and_hosts(studio_url):
         session.post(f"{studio_url}api/undo", json={}).status_code == 403
     )  # a page of another origin cannot set this header
     assert requests.get(studio_url, headers={"host": "rebound.example"}).status_code == 421
-    assert requests.get(f"{studio_url}api/state").status_code == 400  # the request has no cookie
+    assert requests.get(f"{studio_url}api/state").status_code == 401  # the request has no cookie
     policy = session.get(studio_url).headers["content-security-policy"]
     assert "default-src 'self'" in policy
 

@@ -70,21 +70,3 @@ def test_inpaint_regenerates_only_region_of_large_scene(contents):
     assert np.array_equal(
         one.height_m, pipeline.inpaint([scene], [region], ["low"], contents, repaint=quick)[0].height_m
     )
-
-
-def test_studio_requires_its_token(studio_files):
-    """The test uses the interface of the studio without Ray and accepts any host name."""
-    from starlette.testclient import TestClient
-
-    from pipelines.studio.api import build_studio_app
-    from pipelines.studio.session import Studio
-
-    studio = Studio(str(studio_files / "model"), [])
-    client = TestClient(build_studio_app(lambda: studio, "secret", ()), base_url="http://studio.example")
-    assert client.get("/").status_code == 401 and client.get("/?token=wrong").status_code == 401
-    assert client.get("/?token=secret").status_code == 200
-    assert client.get("/api/about").json()["labels"] == [
-        "low",
-        "medium",
-        "high",
-    ]  # the session cookie contains the token

@@ -1,0 +1,77 @@
+"""Run the studio in a Ray actor: one process holds the model and the sessions of all visitors.
+
+The actor has no name and listens on no port of its own. Ray Serve is not used: each of its replicas listens on all
+network interfaces, and its proxy answers some addresses without access control.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ray
+import ray.exceptions
+from pydantic import BaseModel
+
+from pipelines.studio.limits import StudioLimits
+from pipelines.studio.session import Answer, Studio, make_json_answer
+
+THREADS = 16  # Number of requests that the actor works on at the same time.
+MAX_PENDING = 256  # Maximum number of requests that the actor has not answered; further requests are refused.
+
+
+class StudioActor:
+    """Actor that answers the requests of all visitors."""
+
+    def __init__(self, model: str, datasets: list[str], limits: StudioLimits, threads: int | None) -> None:
+        import torch
+
+        if threads:
+            torch.set_num_threads(threads)
+        self.studio = Studio(model, datasets, limits)
+
+    def answer(self, operation: str, visitor: str, request: BaseModel | None) -> Answer:
+        """Carry out one request (`Studio.answer`)."""
+        return self.studio.answer(operation, visitor, request)
+
+    def ready(self) -> bool:
+        """Return True when the model is loaded."""
+        return True
+
+
+class ActorBackend:
+    """Sends requests to a studio in an actor, which restarts if its process dies."""
+
+    def __init__(self, model: str, datasets: list[str], limits: StudioLimits, threads: int | None = None) -> None:
+        """Start the actor and wait until it has loaded the model.
+
+        Args:
+            model: Pipeline directory.
+            datasets: Dataset directories.
+            limits: Limits of memory and computing time.
+            threads: Number of CPU threads for the network. None: all cores.
+
+        Raises:
+            ValueError: A directory contains no model, or a dataset contains no readable scenes.
+        """
+        actor: Any = ray.remote(StudioActor).options(
+            num_cpus=0,
+            num_gpus=1 if ray.cluster_resources().get("GPU") else 0,
+            max_concurrency=THREADS,
+            max_restarts=-1,
+            max_pending_calls=MAX_PENDING,
+        )
+        self.actor = actor.remote(model, datasets, limits, threads)
+        ray.get(self.actor.ready.remote())
+
+    async def answer(self, operation: str, visitor: str, request: BaseModel | None = None) -> Answer:
+        """Carry out one request (`Studio.answer`). If the actor is overloaded or restarts, the answer says so."""
+        try:
+            return await self.actor.answer.remote(operation, visitor, request)
+        except ray.exceptions.PendingCallsLimitExceeded:
+            return make_json_answer({"detail": "the studio is overloaded; try again"}, 429, 5)
+        except ray.exceptions.RayActorError:
+            return make_json_answer({"detail": "the studio restarts; your scene is lost, reload the page"}, 503, 20)
+
+    def stop(self) -> None:
+        """Stop the actor."""
+        ray.kill(self.actor)
