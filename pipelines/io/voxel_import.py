@@ -15,7 +15,6 @@ continue to the right. Levels continue upwards.
 from __future__ import annotations
 
 import io
-import zipfile
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +22,7 @@ import numpy as np
 from models.scene import Scene
 from pipelines.geometry.voxels import NUM_CLASSES, VoxelGrid, voxelize
 from pipelines.runtime import storage
+from pipelines.runtime.npz import ArrayHeader, open_npz
 from pipelines.schema.axis_convention import Axes, compute_scene_from_axes
 from pipelines.schema.palette import CLASS_COLORS, EMPTY
 
@@ -30,7 +30,8 @@ VOXEL_AXES: Axes = ("x-", "y-", "z+")
 ARRAY = "voxels"
 FULL = VoxelGrid().shape
 SHAPES = (FULL, (256, 256, 16), (128, 128, 16), (64, 64, 8), (32, 32, 4))
-MAX_BYTES = 8 * int(np.prod(FULL)) + 4096  # Size in bytes of the largest array: 64-bit numbers and a header.
+MAX_BYTES = 8 * int(np.prod(FULL))  # Size in bytes of the largest array, which holds 64-bit numbers.
+SHOWN = 5  # Maximum number of names in an error message.
 
 
 def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
@@ -48,11 +49,11 @@ def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
     """
     shown = " or ".join(" x ".join(map(str, shape)) for shape in SHAPES)
     try:
-        voxels = convert_axes(_read_only_array(storage.read_bytes(uri)), axes)
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError, NotImplementedError) as error:
+        voxels = convert_axes(_read_only_array(uri), axes)
+    except ValueError as error:
         named = str(error).removeprefix(f"{uri}: ")
         raise ValueError(f"{uri}: {named}; expected one scene of {shown} integers as {ARRAY!r} in an .npz") from error
-    if voxels.shape not in SHAPES or voxels.dtype.kind not in "iu":
+    if voxels.shape not in SHAPES:
         found = " x ".join(map(str, voxels.shape))
         raise ValueError(f"{uri}: holds {found} of {voxels.dtype}; expected {shown} integers in axes {' '.join(axes)}")
     if voxels.min() < 0 or voxels.max() >= NUM_CLASSES:
@@ -67,16 +68,18 @@ def read_voxels(uri: str, axes: Axes = VOXEL_AXES) -> np.ndarray:
     return voxels
 
 
-def _read_only_array(content: bytes) -> np.ndarray:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
-    name = ARRAY if ARRAY in sizes else next(iter(sizes), "")
-    if name != ARRAY and len(sizes) != 1:
-        raise ValueError(f"holds {', '.join(sizes) or 'nothing'}")
-    if sizes[name] > MAX_BYTES:
-        raise ValueError(f"{name!r} has {sizes[name]} bytes, which is too large for one scene")
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return arrays[name]
+def _read_only_array(uri: str) -> np.ndarray:
+    with open_npz(uri) as archive:
+        name = ARRAY if ARRAY in archive.names else next(iter(archive.names), "")
+        if name != ARRAY and len(archive.names) != 1:
+            raise ValueError(f"holds {', '.join(archive.names[:SHOWN]) or 'nothing'}")
+        return archive.read(name, _check_header)
+
+
+def _check_header(header: ArrayHeader) -> None:
+    if header.dtype.kind not in "iu" or header.nbytes > MAX_BYTES:
+        found = " x ".join(map(str, header.shape))
+        raise ValueError(f"holds {found[:80]} of {header.dtype}, {header.nbytes:,} bytes")
 
 
 def convert_axes(voxels: np.ndarray, axes: Axes) -> np.ndarray:

@@ -8,22 +8,22 @@ written in batches. Only one batch is in memory at a time.
 
 from __future__ import annotations
 
-import math
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from itertools import chain
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
+from models.limits import require_within
 from pipelines.metrics.frechet import StoredGaussian
 from pipelines.metrics.inception import FEATURES, SPATIAL_FEATURES
-from pipelines.runtime.storage import resolve_uri, write_whole
+from pipelines.runtime.npz import ArrayHeader, NpzArchive, open_npz
+from pipelines.runtime.storage import write_whole
 
 PICTURES = "arr_0"
+ASYMMETRY = 1e-3  # Largest accepted asymmetry of a covariance, relative to its largest entry.
+LARGEST = 1e30  # Largest accepted number in moments; products of such numbers are finite.
 
 
 class ReferenceMoments(NamedTuple):
@@ -42,47 +42,6 @@ class ReferenceMoments(NamedTuple):
 # -------------------------------------------------------------------------------------------------------- reading
 
 
-@contextmanager
-def _open_npz(path: str) -> Iterator[zipfile.ZipFile]:
-    """Open an archive. If opening or a later read fails, raise a ValueError that names the path."""
-    fs, inside = resolve_uri(path)
-    try:
-        with fs.open_input_file(inside) as file, zipfile.ZipFile(file) as archive:
-            yield archive
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: no such file") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, pa.ArrowInvalid) as error:
-        raise ValueError(f"{path}: damaged or not an .npz archive ({error}); copy or write the file again") from error
-
-
-@contextmanager
-def _read_array(archive: zipfile.ZipFile, name: str, path: str) -> Iterator[tuple[zipfile.ZipExtFile, tuple, np.dtype]]:
-    """Open a C-ordered array, and yield three values: the open stream at the first number, the shape and the type.
-
-    Raises:
-        ValueError: The array is missing, is pickled, is in Fortran order or has the wrong size.
-    """
-    if f"{name}.npy" not in archive.namelist():
-        raise ValueError(f"{path}: no array {name!r}, only {sorted(archive.namelist())}")
-    with archive.open(f"{name}.npy") as stream:
-        try:
-            version = np.lib.format.read_magic(stream)
-            readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            shape, fortran, dtype = readers[version](stream)
-        except (ValueError, KeyError) as error:
-            raise ValueError(f"{path}: {name} is not a plain numpy array ({error})") from error
-        if dtype.hasobject:
-            raise ValueError(
-                f"{path}: {name} holds pickled objects; they are not read, so save the array as plain numbers"
-            )
-        if fortran and len(shape) > 1:
-            raise ValueError(f"{path}: {name} is in Fortran order; save numpy.ascontiguousarray(array)")
-        needed, held = math.prod(shape) * dtype.itemsize, archive.getinfo(f"{name}.npy").file_size - stream.tell()
-        if held != needed:
-            raise ValueError(f"{path}: {name} of shape {shape} needs {needed} bytes, has {held}; write the file again")
-        yield cast(zipfile.ZipExtFile, stream), shape, dtype
-
-
 def read_picture_shape(path: str) -> tuple[int, int, int, int]:
     """Return the shape of the pictures in an ADM .npz without reading the pictures.
 
@@ -95,12 +54,17 @@ def read_picture_shape(path: str) -> tuple[int, int, int, int]:
     Raises:
         ValueError: The file is missing, is damaged or has another type. The message names the file.
     """
-    with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (_, shape, dtype):
-        if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3:
-            raise ValueError(
-                f"{path}: {PICTURES} is {dtype} {shape}; pictures are uint8 (N, height, width, 3), values 0 to 255"
-            )
-    return shape
+    with open_npz(path) as archive:
+        shape, dtype, is_fortran = archive.describe(PICTURES)
+    if dtype != np.uint8 or len(shape) != 4 or shape[3] != 3 or 0 in shape[1:]:
+        raise ValueError(
+            f"{path}: {PICTURES} is {dtype} {shape}; pictures are uint8 (N, height, width, 3), values 0 to 255"
+        )
+    if is_fortran:
+        raise ValueError(f"{path}: {PICTURES} is in Fortran order; save numpy.ascontiguousarray(array)")
+    count, height, width, channels = shape
+    require_within("array_bytes", height * width * channels, f"{path}: a picture of {height} x {width}")
+    return count, height, width, channels
 
 
 def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
@@ -119,18 +83,15 @@ def iterate_pictures(path: str, batch: int) -> Iterator[np.ndarray]:
     """
     if batch < 1:
         raise ValueError(f"a batch must hold at least 1 picture, got {batch}")
-    return _iterate_batches(path, read_picture_shape(path), batch)
+    count, height, width, channels = read_picture_shape(path)
+    batch_bytes = min(batch, count) * height * width * channels
+    require_within("array_bytes", batch_bytes, f"{path}: {min(batch, count)} pictures of {height} x {width}")
+    return _iterate_batches(path, batch)
 
 
-def _iterate_batches(path: str, shape: tuple[int, int, int, int], batch: int) -> Iterator[np.ndarray]:
-    with _open_npz(path) as archive, _read_array(archive, PICTURES, path) as (stream, _, _):
-        for start in range(0, shape[0], batch):
-            pictures = np.empty((min(batch, shape[0] - start), *shape[1:]), np.uint8)
-            if (read := stream.readinto(pictures.data)) != pictures.nbytes:
-                raise ValueError(
-                    f"{path}: picture {start + read // pictures[0].nbytes} is cut off; write the file again"
-                )
-            yield pictures
+def _iterate_batches(path: str, batch: int) -> Iterator[np.ndarray]:
+    with open_npz(path) as archive:
+        yield from archive.iterate(PICTURES, batch)
 
 
 def read_reference_moments(path: str) -> ReferenceMoments | None:
@@ -145,33 +106,43 @@ def read_reference_moments(path: str) -> ReferenceMoments | None:
     Raises:
         ValueError: The moments are incomplete, have unexpected sizes or are not finite. The message names the file.
     """
-    with _open_npz(path) as archive:
-        held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if f"{name}.npy" in archive.namelist()}
+    with open_npz(path) as archive:
+        held = {name for name in ("mu", "sigma", "mu_s", "sigma_s") if name in archive.names}
         if not held:
             return None
         if held not in ({"mu", "sigma"}, {"mu", "sigma", "mu_s", "sigma_s"}):
             raise ValueError(
                 f"{path}: holds {sorted(held)} only; a mean (mu) and its covariance (sigma) are needed together"
             )
-        pool3 = StoredGaussian(
-            _read_numbers(archive, "mu", (FEATURES,), path), _read_numbers(archive, "sigma", (FEATURES,) * 2, path)
-        )
-        if "mu_s" not in held:
-            return ReferenceMoments(pool3, None)
-        size = SPATIAL_FEATURES
-        spatial = StoredGaussian(
-            _read_numbers(archive, "mu_s", (size,), path), _read_numbers(archive, "sigma_s", (size, size), path)
-        )
+        pool3 = _read_moments(archive, "mu", "sigma", FEATURES)
+        spatial = _read_moments(archive, "mu_s", "sigma_s", SPATIAL_FEATURES) if "mu_s" in held else None
     return ReferenceMoments(pool3, spatial)
 
 
-def _read_numbers(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], path: str) -> np.ndarray:
-    with _read_array(archive, name, path) as (stream, found, dtype):
-        if found != shape or dtype.kind != "f":
-            raise ValueError(f"{path}: {name} has type {dtype} and shape {found}, expected floats of shape {shape}")
-        numbers = np.frombuffer(stream.read(), dtype).reshape(shape).astype(np.float64)
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
+def _read_moments(archive: NpzArchive, mean_name: str, covariance_name: str, size: int) -> StoredGaussian:
+    mean = _read_numbers(archive, mean_name, (size,))
+    covariance = _read_numbers(archive, covariance_name, (size, size))
+    largest = np.abs(covariance).max()
+    if (covariance.diagonal() < 0).any() or not np.abs(covariance - covariance.T).max() <= ASYMMETRY * largest:
+        raise ValueError(
+            f"{archive.uri}: {covariance_name} is no covariance matrix, because it is not symmetric or has a negative"
+            " variance; write the file again"
+        )
+    return StoredGaussian(mean, covariance)
+
+
+def _read_numbers(archive: NpzArchive, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def check(header: ArrayHeader) -> None:
+        if header.shape != shape or header.dtype.kind != "f":
+            raise ValueError(
+                f"{archive.uri}: {name} has type {header.dtype} and shape {header.shape}, expected floats of shape"
+                f" {shape}"
+            )
+
+    with np.errstate(over="ignore"):  # Numbers of more than 64 bits become infinite.
+        numbers = archive.read(name, check).astype(np.float64)
+    if not (np.abs(numbers) <= LARGEST).all():
+        raise ValueError(f"{archive.uri}: {name} holds NaN, infinite numbers or numbers beyond {LARGEST:.0e}")
     return numbers
 
 

@@ -69,7 +69,7 @@ def test_npz_reader_rejects_files_without_images(tmp_path):
     path.write_bytes(b"not an archive")
     assert_refused(path, "damaged or not an .npz archive")
     np.savez(path, images=make_pictures())
-    assert_refused(path, r"no array 'arr_0', only \['images.npy'\]")
+    assert_refused(path, r"no array 'arr_0', only 'images'")
     np.savez(path, make_pictures().astype(np.float32))
     assert_refused(path, "arr_0 is float32")
     np.savez(path, make_pictures().transpose(0, 3, 1, 2).copy())
@@ -104,14 +104,14 @@ def test_npz_reader_names_truncated_and_damaged_files(tmp_path):
 
     at = whole.index(make_pictures().tobytes()) + 300
     path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])  # one wrong bit in the fourth image
-    with pytest.raises(ValueError, match=r"x\.npz: damaged .*CRC"):
+    with pytest.raises(ValueError, match=r"x\.npz: array 'arr_0' is damaged .*CRC"):
         list(iterate_pictures(str(path), 2))
 
     with zipfile.ZipFile(path, "w") as archive, archive.open("arr_0.npy", "w") as stream:  # the writer stopped early
         header = {"descr": "|u1", "fortran_order": False, "shape": (7, 5, 6, 3)}
         np.lib.format.write_array_header_1_0(stream, header)
         stream.write(make_pictures()[:6].tobytes())
-    assert_refused(path, r"arr_0 of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
+    assert_refused(path, r"array 'arr_0' of shape \(7, 5, 6, 3\) needs 630 bytes, has 540")
 
 
 def test_npz_writer_rejects_bad_images_and_leaves_no_file(tmp_path):
