@@ -55,11 +55,13 @@ coverage: .venv/ready
 	@test -f .coverage || { echo "run make test first; it measures the coverage"; exit 1; }
 	$(BIN)/coverage report
 
-# CI needs a browser, as skipped browser tests fail there. Elsewhere this does nothing.
+# CI needs a browser, as skipped browser tests fail there, and nginx for a test of infra/nginx.conf. Elsewhere this does
+# nothing.
 browser:
 	@if [ "$$CI" = true ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && \
-	    ! { command -v chromium && command -v chromedriver; } >/dev/null; then \
-	  apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -q -y chromium chromium-driver; \
+	    ! { command -v chromium && command -v chromedriver && command -v nginx; } >/dev/null; then \
+	  apt-get update -q && \
+	  DEBIAN_FRONTEND=noninteractive apt-get install -q -y chromium chromium-driver nginx-light; \
 	fi
 
 .venv/ready: pyproject.toml infra/constraints.txt

@@ -171,8 +171,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "The pages are generated from the docstrings. `models` needs no Ray.",
         {page: ", ".join(f"`{path.stem}`" for path in list_modules(packages)) for page, packages in API.items()},
     )
-    for name in ("CONTRIBUTING", "CHANGELOG"):  # files of the repository root; links to docs/ are relative to it
-        pages[f"{name.lower()}.md"] = (ROOT / f"{name}.md").read_text().replace("](docs/", "](")
+    # Links in files of the repository root are relative to it.
+    for name in ("CONTRIBUTING", "CHANGELOG", "SECURITY"):
+        text = (ROOT / f"{name}.md").read_text().replace("](docs/", "](")
+        pages[f"{name.lower()}.md"] = text.replace("](CHANGELOG.md", "](changelog.md")
     pages |= execute_tutorials()
     for uri, content in pages.items():
         files.append(File.generated(config, uri, content=content))
