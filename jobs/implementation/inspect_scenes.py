@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 from rich.progress import Progress
 
@@ -38,11 +40,34 @@ def make_output_path(config: OneScene | Sheet | Report | Gallery, name: str) -> 
     return home_path("inspect", find_dataset_directory(config).rstrip("/").rsplit("/", 1)[-1], name).rstrip("/")
 
 
+def read_catalogue(config: OneScene | Sheet | Gallery) -> Catalogue:
+    """Read the scenes tables of --dataset. Damaged shards are left out with a warning."""
+    catalogue = Catalogue.read(
+        find_dataset_directory(config), config.source or None, config.split or None, skip_damaged=True
+    )
+    warn_of_damage(catalogue.damaged)
+    return catalogue
+
+
+def drop_damaged(catalogue: Catalogue, chosen: np.ndarray) -> np.ndarray:
+    """Return the indices of scenes whose tables are valid. The others are left out with a warning."""
+    kept, damaged = catalogue.drop_damaged(chosen)
+    warn_of_damage(damaged)
+    return kept
+
+
+def warn_of_damage(reasons: dict[str, str]) -> None:
+    """Print the reason for each shard that is left out."""
+    for reason in reasons.values():
+        print(f"left out: {reason}", file=sys.stderr)
+
+
 def draw_scenes(config: OneScene) -> list[str]:
     """Write PNG and GLB files and return their paths."""
     require_positive(config, "max_scenes")
-    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
+    catalogue = read_catalogue(config)
     chosen = catalogue.find(config.ids) if config.ids else catalogue.draw(config.max_scenes, config.seed)
+    chosen = drop_damaged(catalogue, chosen)
     written, directory = [], make_output_path(config, "")
     with Progress() as bar:
         shown = bar.add_task("draw scenes", total=len(chosen))
@@ -69,8 +94,8 @@ def draw_pictures(catalogue: Catalogue, chosen: np.ndarray, views: tuple) -> lis
 def draw_sheet(config: Sheet) -> str:
     """Write the sheet and return its path."""
     require_positive(config, "max_scenes", "size_px")
-    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
-    chosen = catalogue.choose(config.max_scenes, config.sort, config.pick, config.seed)
+    catalogue = read_catalogue(config)
+    chosen = drop_damaged(catalogue, catalogue.choose(config.max_scenes, config.sort, config.pick, config.seed))
     pictures = [picture for (picture,) in draw_pictures(catalogue, chosen, (View(config.view, config.size_px),))]
     title = make_sheet_title(catalogue, len(chosen), config.sort, config.pick)
     sheet = draw_scene_sheet(pictures, make_captions(catalogue, chosen, config.sort), title, config.num_columns or None)
@@ -107,8 +132,8 @@ def write_dataset_report(config: Report) -> str:
 def write_gallery(config: Gallery) -> str:
     """Write the page and return its path."""
     require_positive(config, "max_scenes")
-    catalogue = Catalogue.read(find_dataset_directory(config), config.source or None, config.split or None)
-    chosen = catalogue.choose(config.max_scenes, "drive")
+    catalogue = read_catalogue(config)
+    chosen = drop_damaged(catalogue, catalogue.choose(config.max_scenes, "drive"))
     start_ray()
     with Progress() as bar:
         shown = bar.add_task("pack scenes", total=len(chosen))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import signal
 import socket
 import threading
 import time
@@ -165,8 +166,10 @@ def wait_until(condition, seconds: float) -> None:
 def main(config: Config) -> None:
     studio = serve_studio(config)
     print(f"studio: {studio.address}", flush=True)
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())  # A service manager stops the studio with SIGTERM.
     try:
-        while studio.thread.is_alive():
-            studio.thread.join(1)
+        while studio.thread.is_alive() and not ended.wait(0.5):
+            pass
     finally:
         studio.stop()

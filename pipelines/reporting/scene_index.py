@@ -164,6 +164,29 @@ class Catalogue:
             return self.spread(order, count)
         return order[:count] if pick == "lowest" else order[::-1][:count]
 
+    def drop_damaged(self, indices: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
+        """Drop scenes of shards whose primitives or rasters are damaged.
+
+        Args:
+            indices: Indices of scenes.
+
+        Returns:
+            Indices of the other scenes, and the reason for each damaged shard, by the path of its scenes table.
+
+        Raises:
+            ValueError: All of these shards are damaged.
+        """
+        reasons = {}
+        for number in np.unique(self.shard[indices]).tolist():
+            try:
+                self.shards[number].read_tables()
+            except ValueError as error:
+                reasons[number] = str(error)
+        kept = indices[~np.isin(self.shard[indices], list(reasons))]
+        if len(indices) and not len(kept):
+            raise ValueError(next(iter(reasons.values())))
+        return kept, {self.shards[number].path("scenes"): reason for number, reason in reasons.items()}
+
     def chunks(self, indices: np.ndarray, size: int) -> Iterator[tuple[Shard, list[int], list[int]]]:
         """Yield chunks of at most `size` scenes of one shard: (shard, rows in the shard, positions in `indices`)."""
         for shard in np.unique(self.shard[indices]):
