@@ -34,8 +34,8 @@ RAY_ENVIRONMENT = {
 }
 
 
-# With the value 0, Ray uses 127.0.0.1 as the address of this node, so all processes of a Ray that a job starts listen on
-# the loopback interface. On macOS and Windows this is the default. It must not be set on a cluster.
+# With the value 0, Ray uses 127.0.0.1 as the address of this node, so a Ray that a job starts listens on the loopback
+# interface only. On macOS and Windows this is the default. It must not be set on a cluster.
 LOOPBACK_ENVIRONMENT = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
