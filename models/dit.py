@@ -18,11 +18,36 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, Real
 from torch import Tensor, nn
 
-from models.base import ConfiguredModel, apply_in_float32, register_to_config
+from models.base import ConfiguredModel, apply_in_float32, register_computed_buffers, register_to_config
+from models.labels import LABELS
+from models.layout import LayoutSpec
+from models.limits import require_within
+from models.options import FINITE, LARGE, Choice, Integer, Number, Rule, Sequential, check_entries
 from models.sampling.diffusion import PAPER_SCHEDULE, Denoiser, Diffusion
 
 FREQUENCIES = 256
 Prediction = Literal["epsilon", "v_prediction"]
+
+MAX_CHANNELS, MAX_LABELS = 4096, 10_000
+# Rules of the entries of a stored config. `layout` and `schedule` are objects with rules of their own.
+RULES: dict[str, Rule] = {
+    "channels": Integer(1, MAX_CHANNELS),
+    "size": Integer(1, 4096),
+    "patch": Integer(1, 256),
+    "width": Integer(4, 2**16),
+    "depth": Integer(1, 1000),
+    "heads": Integer(1, 1024),
+    "label": Choice(tuple(LABELS)),
+    "num_labels": Integer(1, MAX_LABELS),
+    "shift": Sequential(FINITE, 1, MAX_CHANNELS),
+    "scale": Sequential(Number(1e-6, LARGE), 1, MAX_CHANNELS),
+    "prediction": Choice(get_args(Prediction)),
+}
+SCHEDULE_RULES: dict[str, Rule] = {
+    "num_timesteps": Integer(1, 2**31),
+    "beta_start": Number(1e-9, 0.9999),
+    "beta_end": Number(1e-9, 0.9999),
+}
 
 
 def embed_timesteps(timestep: Real[Tensor, " batch"]) -> Float[Tensor, "batch 256"]:
@@ -161,27 +186,67 @@ class DiT(ConfiguredModel):
         self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
         self.modulation = nn.Linear(width, 2 * width)
         self.patch_out = nn.Linear(width, patch * patch * channels)
-        self.register_buffer("positions", make_sincos_positions(size // patch, width), persistent=False)
-        alpha_bar = torch.from_numpy(schedule.alpha_bar)
-        shares = torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float()
-        self.register_buffer("noise_shares", shares, persistent=False)  # Weights of the latent and of v in the noise.
+        self._rows, self._schedule = size // patch, schedule
+        register_computed_buffers(self)
         self.init_weights()
+
+    def compute_buffers(self) -> dict[str, Tensor]:
+        """Return the position embeddings, and per timestep the weights of the latent and of v in the noise."""
+        require_within("model_buffers", self._rows**2 * self.patch_out.in_features, "positions of the patches")
+        require_within("model_timesteps", self._schedule.num_timesteps)
+        alpha_bar = torch.from_numpy(self._schedule.alpha_bar)
+        return {
+            "positions": make_sincos_positions(self._rows, self.patch_out.in_features),
+            "noise_shares": torch.stack([(1 - alpha_bar).sqrt(), alpha_bar.sqrt()], dim=1).float(),
+        }
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Convert prediction names in a config written by a version before 0.2, and the noise schedule to a Diffusion.
+        """Convert prediction names in a config written by a version before 0.2.
 
         Args:
             config: Entries of a stored config.
 
         Returns:
-            Keyword arguments of the constructor.
+            Entries with the names of this version.
         """
         renamed = {"noise": "epsilon", "velocity": "v_prediction"}
-        prediction = config.get("prediction", "epsilon")
-        schedule = config.get("schedule", PAPER_SCHEDULE)
-        schedule = schedule if isinstance(schedule, Diffusion) else Diffusion(**schedule)
-        return config | {"prediction": renamed.get(prediction, prediction), "schedule": schedule}
+        return config | {name: renamed[config[name]] for name in ("prediction",) if str(config.get(name)) in renamed}
+
+    @classmethod
+    def parse_config(cls, config: dict[str, Any]) -> dict[str, Any]:
+        """Check all entries, and convert the noise schedule to a Diffusion.
+
+        Args:
+            config: Value of every constructor argument.
+
+        Returns:
+            Keyword arguments of the constructor.
+
+        Raises:
+            ValueError: An entry has an invalid value, or exceeds the limit of training timesteps.
+        """
+        # A model may have no layout and no statistics of its latents.
+        absent = [name for name in ("layout", "shift", "scale") if config[name] is None]
+        check_entries({name: value for name, value in config.items() if name not in absent}, RULES, others=True)
+        for name in ("shift", "scale"):
+            if name not in absent and len(config[name]) != config["channels"]:
+                raise ValueError(f"{name} has {len(config[name])} entries for {config['channels']} channels")
+        if config["num_labels"] != len(LABELS[config["label"]]):
+            raise ValueError(
+                f"num_labels is {config['num_labels']}, expected {len(LABELS[config['label']])}, the number of"
+                f" {config['label']} labels"
+            )
+        if "layout" not in absent:
+            LayoutSpec.from_dict(config["layout"])
+        schedule = config["schedule"]
+        if not isinstance(schedule, Diffusion):
+            check_entries(schedule, SCHEDULE_RULES, "schedule")
+            require_within("model_timesteps", schedule.get("num_timesteps", 1), "schedule.num_timesteps")
+            schedule = Diffusion(**schedule)
+        if schedule.beta_start > schedule.beta_end:
+            raise ValueError(f"schedule.beta_start is {schedule.beta_start}, above beta_end {schedule.beta_end}")
+        return config | {"schedule": schedule}
 
     def init_weights(self) -> None:
         """Initialise the weights as in DiT: zeros for the output and every residual branch, Xavier elsewhere."""

@@ -9,15 +9,34 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from models.limits import require_within
+from models.options import FINITE, LARGE, Choice, Integer, Number, Rule, Sequential, Text, check_entries, show_value
 from models.scene import CATEGORIES, GROUND_CLASSES, KITTI_GROUND_CLASSES, Grid
 
 FEATURES = 9  # 3 centre coordinates, 6 Cholesky parameters (paper, Sec. 3.1)
 
 # Number of slots per category, N = 514 in total (paper, supplement Tab. "object categories").
 PAPER_SLOTS = (178, 159, 2, 18, 6, 5, 16, 77, 19, 17, 17)
+
+# Rules of the entries of a stored LayoutSpec, and number of entries of each bounds.
+RULES: dict[str, Rule] = {
+    "categories": Sequential(Choice(CATEGORIES), 1, len(CATEGORIES)),
+    "slots": Sequential(Integer(0, 2**31), 1, len(CATEGORIES)),
+    "ground_classes": Sequential(Choice(GROUND_CLASSES), 1, len(GROUND_CLASSES)),
+    "surface": Text(),
+}
+GRID_RULES: dict[str, Rule] = {
+    "front_m": FINITE,
+    "left_m": FINITE,
+    "resolution_m": Number(1e-4, LARGE),
+    "rows": Integer(1, 2**16),
+    "cols": Integer(1, 2**16),
+}
+NUM_BOUNDS = {"center_bounds_m": 3, "cholesky_bounds": 6, "height_bounds_m": 1}
 
 
 @dataclass(frozen=True)
@@ -141,7 +160,7 @@ class LayoutSpec:
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod
-    def from_dict(cls, values: dict) -> LayoutSpec:
+    def from_dict(cls, values: Any) -> LayoutSpec:
         """Build a spec from the output of `to_dict`.
 
         Args:
@@ -154,20 +173,33 @@ class LayoutSpec:
             ValueError: A field is missing or invalid.
         """
         try:
-            bounds = {
-                name: Bounds(tuple(values[name]["low"]), tuple(values[name]["high"]))
-                for name in ("center_bounds_m", "cholesky_bounds", "height_bounds_m")
-            }
-            return cls(
-                categories=tuple(values["categories"]),
-                slots=tuple(int(n) for n in values["slots"]),
-                ground_classes=tuple(values["ground_classes"]),
-                grid=Grid(**values["grid"]),
-                surface=values["surface"],
-                **bounds,
-            )
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"not a LayoutSpec: {error!r} in {sorted(values) if values else values}") from error
+            return cls._parse(values)
+        except ValueError as error:
+            raise ValueError(f"not a LayoutSpec: {error}") from error
+
+    @classmethod
+    def _parse(cls, values: Any) -> LayoutSpec:
+        check_entries(values, RULES, "layout", required=(*RULES, "grid", *NUM_BOUNDS), others=True)
+        if unknown := sorted(set(values) - {*RULES, "grid", *NUM_BOUNDS}, key=str):
+            raise ValueError(f"layout.{show_value(unknown[0])} is unknown")
+        check_entries(values["grid"], GRID_RULES, "layout.grid")
+        for name, count in NUM_BOUNDS.items():
+            rules: dict[str, Rule] = {side: Sequential(FINITE, count, count) for side in ("low", "high")}
+            check_entries(values[name], rules, f"layout.{name}", required=tuple(rules))
+        for name in ("categories", "ground_classes"):
+            if len(set(values[name])) != len(values[name]):
+                raise ValueError(f"layout.{name} is {show_value(values[name])}, expected different names")
+        grid, slots = Grid(**values["grid"]), tuple(values["slots"])
+        require_within("scene_primitives", sum(slots), "layout.slots")
+        require_within("raster_pixels", grid.rows * grid.cols * len(values["ground_classes"]), "layout.grid")
+        return cls(
+            categories=tuple(values["categories"]),
+            slots=slots,
+            ground_classes=tuple(values["ground_classes"]),
+            grid=grid,
+            surface=values["surface"],
+            **{name: Bounds(tuple(values[name]["low"]), tuple(values[name]["high"])) for name in NUM_BOUNDS},
+        )
 
     def fingerprint(self) -> str:
         """Return the first twelve hexadecimal digits of the SHA-256 digest of the spec."""

@@ -43,6 +43,7 @@ LIMITS = {
     "glb_vertices": Limit(2**25, "vertices and triangle corners of a GLB file, counted once per placement"),
     "array_bytes": Limit(2**31, "bytes of an array in an .npz file, after decompression"),
     "model_parameters": Limit(2_000_000_000, "parameters of a network"),
+    "model_buffers": Limit(2**24, "entries of the buffers of a network, such as position embeddings"),
     "model_timesteps": Limit(100_000, "training timesteps of a noise schedule"),
 }
 

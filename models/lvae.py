@@ -16,7 +16,7 @@ from models.base import ConfiguredModel, register_to_config
 from models.batch import LayoutBatch
 from models.layout import FEATURES, LayoutSpec
 from models.vae.cell_decoder import CellDecoder
-from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, parse_options
+from models.vae.config import Branches, GroundConfig, LayoutVAEConfig, ObjectConfig, nest_flat_options, parse_options
 from models.vae.ground import GroundDecoder, GroundEncoder, init_from_data
 from models.vae.matching import MatchWeights
 from models.vae.objects import ObjectDecoder, ObjectEncoder
@@ -115,14 +115,30 @@ class LayoutVAE(ConfiguredModel):
 
     @classmethod
     def upgrade_config(cls, config: dict[str, Any]) -> dict[str, Any]:
-        """Convert the options of the branches to dataclasses.
+        """Nest the options of a flat config, which versions before 0.2 wrote.
 
         Args:
-            config: Current config, or a flat config written by a version before 0.2.
+            config: Current or flat config.
+
+        Returns:
+            Entries with the names of this version.
+        """
+        return nest_flat_options(config)
+
+    @classmethod
+    def parse_config(cls, config: dict[str, Any]) -> dict[str, Any]:
+        """Check all entries, and convert the options of the branches to dataclasses.
+
+        Args:
+            config: Value of every constructor argument.
 
         Returns:
             Keyword arguments of the constructor.
+
+        Raises:
+            ValueError: An entry has an invalid value.
         """
+        LayoutSpec.from_dict(config["layout"])
         return parse_options(config)
 
     @torch.no_grad()

@@ -25,6 +25,7 @@ from models.dit import DiT
 from models.labels import find_label_index, split_label
 from models.layout import LayoutSpec
 from models.lvae import LayoutVAE
+from models.options import Number, Rule, Sequential, Text, check_entries, show_value
 from models.pretrained import INDEX_NAME, find_pipeline_path
 from models.sampling.diffusion import (
     GENERATE,
@@ -48,6 +49,11 @@ from models.tensors import EXISTENCE_THRESHOLD, decode_layout, make_empty_scene,
 
 COMPONENTS = {"lvae": LayoutVAE, "dit": DiT}
 SCHEDULER_CONFIG = "scheduler/scheduler_config.json"
+INDEX_RULES: dict[str, Rule] = {
+    **dict.fromkeys((*COMPONENTS, "scheduler"), Sequential(Text(), 2, 2)),
+    "noise_scaling": Number(0.9, 1.1),
+    "existence_threshold": Number(0, 1),
+}
 
 
 def draw_seeds(
@@ -108,8 +114,8 @@ class PrITTIPipeline:
         existence_threshold: Only primitives with a higher existence probability are kept; the paper uses 0.3.
 
     Raises:
-        ValueError: The LayoutSpec of the DiT differs from that of `lvae`, or the noise schedule of the scheduler from
-            that of the DiT.
+        ValueError: The LayoutSpec or the shape of the latents of the DiT differs from that of `lvae`, or the noise
+            schedule of the scheduler from that of the DiT.
     """
 
     def __init__(
@@ -128,6 +134,8 @@ class PrITTIPipeline:
         self._progress_bar: dict[str, Any] = {}
         if dit.config.layout is not None:
             self.spec.require(LayoutSpec.from_dict(dit.config.layout), "the DiT")
+        if (shape := (dit.config.channels, dit.config.size, dit.config.size)) != lvae.latent_shape:
+            raise ValueError(f"the DiT generates latents of the shape {shape}, but the layout VAE {lvae.latent_shape}")
 
     @classmethod
     def from_pretrained(cls, directory: str | os.PathLike, torch_dtype: torch.dtype | None = None) -> PrITTIPipeline:
@@ -145,22 +153,28 @@ class PrITTIPipeline:
             ValueError: The directory does not contain a complete pipeline, or a file is damaged.
         """
         path = Path(find_pipeline_path(directory))
-        index = read_config(path / INDEX_NAME)
+        index = read_config(path / INDEX_NAME, cls.__name__)
         for name, kind in COMPONENTS.items():
-            if index.get(name) != [kind.__module__, kind.__name__]:
-                raise ValueError(
-                    f"{path / INDEX_NAME}: {name} is {index.get(name)}, expected {[kind.__module__, kind.__name__]}"
-                )
-        scheduler = index.get("scheduler")
-        if not isinstance(scheduler, list) or len(scheduler) != 2 or not isinstance(scheduler[1], str):
-            raise ValueError(f"{path / INDEX_NAME}: scheduler is {scheduler}, expected a class of diffusers")
-        options = {name: index[name] for name in ("noise_scaling", "existence_threshold") if name in index}
-        return cls(
-            LayoutVAE.from_pretrained(path / "lvae", torch_dtype),
-            DiT.from_pretrained(path / "dit", torch_dtype),
-            SchedulerConfig(scheduler[1], read_config(path / SCHEDULER_CONFIG)),
-            **options,
-        )
+            if index.get(name) != (expected := [kind.__module__, kind.__name__]):
+                raise ValueError(f"{path / INDEX_NAME}: {name} is {show_value(index.get(name))}, expected {expected}")
+        try:
+            check_entries(index, INDEX_RULES, required=("scheduler",))
+        except ValueError as error:
+            raise ValueError(f"{path / INDEX_NAME}: {error}") from error
+        library, class_name = index["scheduler"]
+        if library != "diffusers":
+            raise ValueError(f"{path / INDEX_NAME}: scheduler is {index['scheduler']}, expected a class of diffusers")
+        options = read_config(path / SCHEDULER_CONFIG, class_name)
+        try:
+            scheduler = SchedulerConfig.parse(class_name, options)
+        except ValueError as error:
+            raise ValueError(f"{path / SCHEDULER_CONFIG}: {error}") from error
+        components = {name: kind.from_pretrained(path / name, torch_dtype) for name, kind in COMPONENTS.items()}
+        thresholds = {name: index[name] for name in ("noise_scaling", "existence_threshold") if name in index}
+        try:
+            return cls(**components, scheduler=scheduler, **thresholds)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
     def save_pretrained(self, directory: str | os.PathLike) -> None:
         """Write model_index.json and one directory per component.

@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable
 
 from jobs.support.cli import home_path, make_absolute
-from models.labels import require_labels
+from models.labels import LABELS, require_labels
+from models.options import Choice, check_entries
 from models.pretrained import INDEX_NAME, find_pipeline_path
 from pipelines.runtime import storage
 
@@ -21,16 +22,24 @@ def require_model_labels(model: str, labels: Iterable[str]) -> None:
 
 
 def read_label_kind(model: str) -> str:
-    """Return the kind of label that the pipeline in a directory is conditioned on."""
-    return storage.read_json(storage.join_uri(model, "dit/config.json"))["label"]
+    """Return the kind of label that the pipeline in a directory is conditioned on.
+
+    Raises:
+        ValueError: The config of the DiT is missing or damaged, or its label is unknown.
+    """
+    path = storage.join_uri(model, "dit/config.json")
+    try:
+        check_entries(storage.read_json(path), {"label": Choice(tuple(LABELS))}, required=("label",), others=True)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return storage.read_json(path)["label"]
 
 
 def find_pipeline_directory(model: str) -> str:
     """Return the directory of the pipeline that --model names; a pipeline in MLflow is downloaded first.
 
     If --model is empty, there are three defaults in this order: $PRITTI_HOME/models/pritti-town, the only pipeline
-    under
-    $PRITTI_HOME/models, and the released weights.
+    under $PRITTI_HOME/models, and the released weights.
 
     Args:
         model: Value of --model: a directory, a name, models:/NAME/VERSION, the id of an MLflow run, or empty.

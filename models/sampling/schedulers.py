@@ -5,9 +5,11 @@ The sampler of the paper, DDPM, is implemented by `diffusion.sample` and does no
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, cast
 
+from models.options import LARGE, Choice, Flag, Integer, Number, Rule, check_entries, check_entry, show_value
 from models.sampling.diffusion import PAPER_SCHEDULE, Diffusion
 
 # Options of the class `DDPMScheduler` of the library `diffusers` without those of the noise schedule.
@@ -34,6 +36,42 @@ SAMPLERS: dict[str, tuple[str, dict[str, Any]]] = {
     "dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "dpmsolver++"}),
     "sde-dpm++": ("DPMSolverMultistepScheduler", {"use_lu_lambdas": True, "algorithm_type": "sde-dpmsolver++"}),
 }
+
+
+# Schedulers of diffusers that a stored pipeline may name: integer timesteps, and no noise that they draw themselves.
+SCHEDULERS = (
+    "DDPMScheduler",
+    "DDIMScheduler",
+    "DPMSolverMultistepScheduler",
+    "DPMSolverSinglestepScheduler",
+    "DEISMultistepScheduler",
+    "UniPCMultistepScheduler",
+    "PNDMScheduler",
+)
+# Rules of stored options. `require_schedule` compares the options of the noise schedule with those of the DiT. Other
+# options must be plain values; diffusers ignores unknown names.
+RULES: dict[str, Rule] = {
+    "num_train_timesteps": Integer(1, 2**31),
+    "beta_start": Number(0, 1),
+    "beta_end": Number(0, 1),
+    "prediction_type": Choice(("epsilon",)),
+    "timestep_spacing": Choice(("leading", "linspace", "trailing")),
+    "steps_offset": Integer(0, 1),
+    "solver_order": Integer(1, 3),
+    **dict.fromkeys(
+        ("clip_sample", "thresholding", "rescale_betas_zero_snr", "use_lu_lambdas", "use_karras_sigmas"), Flag()
+    ),
+}
+PLAIN_TEXT = re.compile(r"[A-Za-z0-9_.+-]{1,100}")
+
+
+def _is_plain(value: object) -> bool:
+    """Return whether an option of a scheduler is null, a flag, a finite number, a name, or a short list of these."""
+    if isinstance(value, list):
+        return len(value) <= 100 and all(not isinstance(entry, list) and _is_plain(entry) for entry in value)
+    if type(value) in (int, float):
+        return bool(-LARGE <= cast(float, value) <= LARGE)
+    return value is None or type(value) is bool or (isinstance(value, str) and bool(PLAIN_TEXT.fullmatch(value)))
 
 
 def list_schedule_options(diffusion: Diffusion) -> dict[str, Any]:
@@ -78,6 +116,27 @@ class SchedulerConfig:
         """
         return cls("DDPMScheduler", DDPM_CONFIG | list_schedule_options(diffusion or PAPER_SCHEDULE))
 
+    @classmethod
+    def parse(cls, class_name: object, config: dict[str, Any]) -> SchedulerConfig:
+        """Check a stored scheduler.
+
+        Args:
+            class_name: Name of the class in model_index.json.
+            config: Options of the class.
+
+        Returns:
+            The config.
+
+        Raises:
+            ValueError: The class is unknown, or an option has an invalid value.
+        """
+        check_entry("the class of the scheduler", class_name, Choice(SCHEDULERS))
+        check_entries(config, RULES, others=True)
+        for name, value in config.items():
+            if name not in RULES and not _is_plain(value):
+                raise ValueError(f"{show_value(name)} is {show_value(value)}, expected a plain value")
+        return cls(str(class_name), config)
+
     def require_schedule(self, diffusion: Diffusion) -> None:
         """Raise an error if the scheduler has another noise schedule.
 
@@ -114,7 +173,7 @@ class SchedulerConfig:
         """Import diffusers and build the scheduler (a SchedulerMixin).
 
         Raises:
-            ValueError: diffusers has no scheduler with this name.
+            ValueError: diffusers has no scheduler with this name, or does not accept the options.
         """
         import diffusers  # DDPM does not need this import, which takes seconds.
         from diffusers.schedulers.scheduling_utils import SchedulerMixin
@@ -122,4 +181,7 @@ class SchedulerConfig:
         kind: Any = getattr(diffusers, self.class_name, None)
         if not (isinstance(kind, type) and issubclass(kind, SchedulerMixin)):
             raise ValueError(f"diffusers has no scheduler {self.class_name!r}")
-        return cast(Any, kind).from_config(self.config)
+        try:
+            return cast(Any, kind).from_config(self.config)
+        except Exception as error:  # The type of the error depends on the scheduler.
+            raise ValueError(f"{self.class_name}: diffusers does not accept the options ({error})") from error

@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.base import apply_in_float32
+from models.base import apply_in_float32, register_computed_buffers
 from models.layout import FEATURES
+from models.limits import require_within
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
@@ -53,10 +54,15 @@ class CellDecoder(nn.Module):
             nn.Linear(hidden, hidden),
         )
         self.head = nn.Linear(hidden, sum(self.per_cell) * (1 + FEATURES))
-        # Normalised (x, y) of the cell centres in row-major order. Row 0 is farthest ahead; column 0 is leftmost.
-        middle = 1 - (torch.arange(latent_size, dtype=torch.float32) + 0.5) / latent_size
-        self.register_buffer("middle", torch.cartesian_prod(middle, middle)[:, None], persistent=False)
+        self.latent_size = latent_size
+        register_computed_buffers(self)
         self.reach = (1 + 2 * REACH_CELLS) / latent_size
+
+    def compute_buffers(self) -> dict[str, Tensor]:
+        """Return normalised (x, y) of the cell centres in row-major order. Row 0 is farthest ahead."""
+        require_within("model_buffers", 2 * self.latent_size**2, "centres of the cells")
+        middle = 1 - (torch.arange(self.latent_size, dtype=torch.float32) + 0.5) / self.latent_size
+        return {"middle": torch.cartesian_prod(middle, middle)[:, None]}
 
     def forward(
         self, latent: Float[Tensor, "batch c h w"]

@@ -4,9 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+from models.options import Choice, Flag, Integer, Rule, Sequential, check_entries, show_value
 
 Branches = Literal["both", "ground", "objects"]
+DECODERS = ("detr", "cells")
+
+# Rules of the entries of a stored config.
+WIDTH = Integer(1, 2**16)
+RULES: dict[str, Rule] = {
+    "latent_channels": Integer(1, 4096),
+    "shortcut": Flag(),
+    "split_latent": Flag(),
+    "branches": Choice(get_args(Branches)),
+}
+GROUND_RULES: dict[str, Rule] = {
+    "channels": Sequential(WIDTH, 1, 12),
+    "norm_groups": WIDTH,
+    "pixel_unshuffle": Integer(1, 256),
+    "attention": Flag(),
+}
+OBJECT_RULES: dict[str, Rule] = {
+    "width": WIDTH,
+    "layers": Integer(1, 1000),
+    "heads": Integer(1, 1024),
+    "hidden": WIDTH,
+    "head_hidden": WIDTH,
+    "decoder": Choice(DECODERS),
+    "min_proposals_per_cell": Integer(0, 1000),
+}
 
 
 @dataclass(frozen=True)
@@ -97,38 +124,52 @@ def nest_flat_options(config: dict[str, Any]) -> dict[str, Any]:
 
     Returns:
         Options of `LayoutVAE`; the options of each branch are one dictionary.
+
+    Raises:
+        ValueError: The config holds both flat and nested options of a branch.
     """
-    nested: dict[str, Any] = {}
+    nested = {name: value for name, value in config.items() if name not in _FLAT_NAMES}
     for name, value in config.items():
         if name in _FLAT_NAMES:
             branch, renamed = _FLAT_NAMES[name]
+            if branch in config:
+                raise ValueError(f"{branch} and {name} exclude each other: {name} is an option of earlier versions")
             nested.setdefault(branch, {})[renamed] = value
-        else:
-            nested[name] = value
     return nested
 
 
 def parse_options(config: dict[str, Any]) -> dict[str, Any]:
-    """Convert a stored config, nested or flat, to keyword arguments of `LayoutVAE`.
+    """Check the options of `LayoutVAE`, and convert those of the branches to dataclasses.
 
     Args:
-        config: Stored config.
+        config: Options; those of a branch are a dictionary or a dataclass. The layout is not checked.
 
     Returns:
         Keyword arguments, with one dataclass of options per branch.
 
     Raises:
-        ValueError: An option of a branch is unknown.
+        ValueError: An option is unknown or has an invalid value.
     """
-    options = nest_flat_options(config)
+    check_entries(config, RULES, others=True)
     kinds: dict[str, Any] = {"ground": GroundConfig, "objects": ObjectConfig}
-    for name, kind in kinds.items():
-        if isinstance(entries := options.get(name), Mapping):
-            try:
-                options[name] = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})
-            except TypeError as error:
-                raise ValueError(f"LayoutVAE: cannot convert {name} to {kind.__name__}: {error}") from error
-    return options
+    parsed = {}
+    for name, rules in (("ground", GROUND_RULES), ("objects", OBJECT_RULES)):
+        parsed[name] = config.get(name, kinds[name]())
+        if not isinstance(parsed[name], kinds[name]):
+            check_entries(parsed[name], rules, name)
+            entries = {k: tuple(v) if isinstance(v, list) else v for k, v in parsed[name].items()}
+            parsed[name] = kinds[name](**entries)
+    ground, objects = parsed["ground"], parsed["objects"]
+    if any(count % ground.norm_groups for count in ground.channels):
+        raise ValueError(
+            f"ground.channels is {show_value(ground.channels)}, expected multiples of norm_groups {ground.norm_groups}"
+        )
+    step = 4 if objects.decoder == "detr" else 1  # The position embeddings of DETR have sine and cosine of two axes.
+    if objects.width % objects.heads or objects.width % step:
+        raise ValueError(
+            f"objects.width is {objects.width}, expected a multiple of heads {objects.heads} and of {step}"
+        )
+    return config | parsed
 
 
 def override_options(options: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:

@@ -15,8 +15,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from models.base import apply_in_float32
+from models.base import apply_in_float32, register_computed_buffers
 from models.layout import FEATURES
+from models.limits import require_within
 from models.vae.config import ObjectConfig
 from models.vae.matching import MatchWeights
 
@@ -165,8 +166,8 @@ class ObjectEncoder(nn.Module):
     ) -> None:
         super().__init__()
         width, heads, hidden = config.width, config.heads, config.hidden
-        slot_category = torch.tensor([category for category, count in enumerate(slots) for _ in range(count)])
-        self.register_buffer("slot_category", slot_category, persistent=False)
+        self.slots = tuple(slots)
+        register_computed_buffers(self)
         self.category = nn.Embedding(len(slots), CATEGORY_EMBEDDING)
         self.project_in = nn.Linear(FEATURES + CATEGORY_EMBEDDING + 1, width)
         self.layers = nn.ModuleList(EncoderLayer(width, heads, hidden) for _ in range(config.layers))
@@ -181,6 +182,12 @@ class ObjectEncoder(nn.Module):
                 nn.SiLU(),
                 nn.Linear(width, latent_channels),
             )
+
+    def compute_buffers(self) -> dict[str, Tensor]:
+        """Return the category of each slot."""
+        require_within("model_buffers", sum(self.slots), "slots")
+        categories = [category for category, count in enumerate(self.slots) for _ in range(count)]
+        return {"slot_category": torch.tensor(categories, dtype=torch.long)}
 
     def forward(
         self, features: Float[Tensor, "batch n features"], real: Bool[Tensor, "batch n"]
@@ -301,7 +308,13 @@ class ObjectDecoder(nn.Module):
         self.queries = nn.Parameter(torch.randn(sum(slots), width))
         self.layers = nn.ModuleList(DecoderLayer(width, heads, hidden) for _ in range(config.layers))
         self.heads = nn.ModuleList(OutputHeads(width, config.head_hidden) for _ in slots)
-        self.register_buffer("positions", make_sine_positions(latent_size, latent_size, width), persistent=False)
+        self.latent_size = latent_size
+        register_computed_buffers(self)
+
+    def compute_buffers(self) -> dict[str, Tensor]:
+        """Return the position embeddings of the latent cells."""
+        require_within("model_buffers", self.latent_size**2 * self.queries.shape[1], "positions of the cells")
+        return {"positions": make_sine_positions(self.latent_size, self.latent_size, self.queries.shape[1])}
 
     def forward(
         self, latent: Float[Tensor, "batch c h w"]
