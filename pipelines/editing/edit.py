@@ -615,8 +615,8 @@ def parse_edits(content: object) -> list[Edit]:
     edits = []
     for step, entry in enumerate(content):
         kind, rest = entry.get("edit"), {name: value for name, value in entry.items() if name != "edit"}
-        if kind not in EDITS:
-            raise ValueError(f"edit {step}: 'edit' is {json.dumps(kind)}, expected one of: {', '.join(EDITS)}")
+        if not isinstance(kind, str) or kind not in EDITS:
+            raise ValueError(f"edit {step}: 'edit' is {json.dumps(kind)[:80]}, expected one of: {', '.join(EDITS)}")
         try:
             edits.append(TypeAdapter(EDITS[kind]).validate_json(json.dumps(rest), strict=True))
         except ValidationError as error:

@@ -332,6 +332,7 @@ def test_edit_list_replays_exactly_after_round_trip(scene):
         ({}, "JSON list of objects"),
         ([{"select": {}}], "edit 0: 'edit' is null, expected one of: remove"),
         ([{"edit": "explode"}], "edit 0: 'edit' is \"explode\""),
+        ([{"edit": ["remove"]}], "edit 0: 'edit' is \\[\"remove\"\\]"),
         (
             [{"edit": "remove", "select": {"where": "true"}}, {"edit": "rotate", "by_deg": "much"}],
             r"edit 1 \(rotate\): by_deg",

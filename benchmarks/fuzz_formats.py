@@ -1,0 +1,867 @@
+"""Formats for benchmarks/fuzz.py: how to make a valid file, damage it, read it, and check an accepted result.
+
+A format reads files with the readers of this project. `check` compares an accepted result with the invariants that
+SECURITY.md promises, and with what an independent reader (DuckDB, trimesh, numpy, ElementTree, safetensors) gets from
+the same file.
+"""
+
+from __future__ import annotations
+
+import base64
+import copy
+import io
+import json
+import random
+import re
+import struct
+import warnings
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import pyarrow.parquet as pq
+import safetensors.numpy
+import torch
+import trimesh
+
+from models.dit import DiT
+from models.layout import LayoutSpec
+from models.lvae import LayoutVAE
+from models.pipeline import PrITTIPipeline
+from models.presets import LVAE_PRESETS
+from models.scene import CATEGORIES, Grid, Scene
+from pipelines.editing.edit import parse_edits
+from pipelines.io.gltf_reader import read_glb
+from pipelines.io.mesh_export import export_glb
+from pipelines.io.mesh_import import import_glb
+from pipelines.io.voxel_import import read_voxels
+from pipelines.metrics.adm_npz import iterate_pictures, read_picture_shape, read_reference_moments
+from pipelines.preprocess.sources import argoverse2, custom, kitti360
+from pipelines.preprocess.sources.drive import Drive
+from pipelines.preprocess.sources.town.generator import generate_town, write_kitti360
+from pipelines.runtime import storage
+from pipelines.schema.tables import Shard
+
+Files = dict[str, bytes]  # Content of each file, by its path in a folder.
+NUMBERS = [0, -1, 1, 2, 7, 255, 2**31 - 1, -(2**31), 2**32, 2**53, 2**63 - 1, 2**64, 1e9, 1e38, 1e300, -1e-300, 0.5]
+NUMBERS += [float("nan"), float("inf"), float("-inf")]
+VALUES: list[Any] = [
+    *NUMBERS,
+    None,
+    True,
+    False,
+    "",
+    "0",
+    "NaN",
+    "x" * 300,
+    "../../x",
+    "\x00",
+    "é",
+    [],
+    {},
+    [[]],
+    [1, 2],
+    [None],
+]
+
+
+class Silent(Exception):
+    """Raised by `check` if a reader accepted a file but returned something else than the file holds."""
+
+
+def require(condition: object, message: str) -> None:
+    if not condition:
+        raise Silent(message)
+
+
+# ------------------------------------------------------------------------------------------------------ damage
+
+
+def change_bytes(content: bytes, rng: random.Random) -> bytes:
+    """Change, delete, insert or repeat some bytes; the beginning and the end are changed more often."""
+    data = bytearray(content)
+
+    def place() -> int:
+        size = len(data)
+        near = min(size, 200)
+        return rng.choice([rng.randrange(size), rng.randrange(near), size - 1 - rng.randrange(near)]) if size else 0
+
+    kind = rng.choice(["flip", "flip", "set", "cut", "insert", "delete", "repeat", "zero"])
+    for _ in range(rng.choice([1, 1, 2, 8])):
+        if not data:
+            break
+        at = place()
+        if kind == "flip":
+            data[at] ^= 1 << rng.randrange(8)
+        elif kind == "set":
+            data[at] = rng.choice([0, 1, 127, 128, 255, rng.randrange(256)])
+        elif kind == "insert":
+            data[at:at] = rng.randbytes(rng.choice([1, 4, 16]))
+        elif kind == "delete":
+            del data[at : at + rng.choice([1, 4, 16])]
+        elif kind == "repeat":
+            data[at:at] = data[at : at + rng.choice([1, 8, 64])]
+        elif kind == "zero":
+            data[at : at + 8] = bytes(len(data[at : at + 8]))
+    return bytes(data[: place()] if kind == "cut" else data)
+
+
+def change_tree(tree: Any, rng: random.Random, times: int = 1) -> Any:
+    """Change entries of a JSON value: replace, delete, repeat or exchange them."""
+    tree = copy.deepcopy(tree)
+    for _ in range(times):
+        places = list(list_places(tree))
+        if not places:
+            return rng.choice(VALUES)
+        parent, key = rng.choice(places)
+        kind = rng.choice(["replace", "replace", "replace", "near", "delete", "repeat", "exchange"])
+        if kind == "replace":
+            parent[key] = copy.deepcopy(rng.choice(VALUES))
+        elif kind == "near" and isinstance(parent[key], (int, float)) and not isinstance(parent[key], bool):
+            parent[key] = rng.choice(
+                [parent[key] + 1, parent[key] - 1, -parent[key], parent[key] * 1000, parent[key] / 3]
+            )
+        elif kind == "delete":
+            del parent[key]
+        elif kind == "repeat" and isinstance(parent, list):
+            parent[key:key] = [copy.deepcopy(parent[key])] * rng.choice([1, 3, 1000])
+        else:
+            other, name = rng.choice(places)
+            parent[key] = copy.deepcopy(other[name])
+    return tree
+
+
+def list_places(tree: Any):
+    """Yield (container, key) of each entry of a JSON value."""
+    todo = [tree]
+    while todo:
+        one = todo.pop()
+        for key in list(one) if isinstance(one, dict) else range(len(one)) if isinstance(one, list) else ():
+            yield one, key
+            todo.append(one[key])
+
+
+def dump_json(tree: Any, rng: random.Random) -> bytes:
+    """Write JSON, sometimes with a repeated key or very deep nesting."""
+    text = json.dumps(tree)
+    if rng.random() < 0.03 and text.startswith("{"):
+        text = '{"' + rng.choice(list(tree) or ["x"]).replace('"', "") + '": 1, ' + text[1:]
+    if rng.random() < 0.02:
+        text = text.replace(":", ":" + "[" * 20_000 + "]" * 20_000 + ",", 1)
+    return text.encode("utf-8", "surrogatepass")
+
+
+def change_table(table: pa.Table, rng: random.Random) -> pa.Table:
+    """Change values, rows or columns of a table."""
+    kind = rng.choice(["value"] * 6 + ["rows", "order", "drop", "rename", "type", "twice"])
+    name = rng.choice(table.column_names)
+    index = table.column_names.index(name)
+    if kind == "value" and len(table):
+        values = table[name].to_pylist()
+        for _ in range(rng.choice([1, 1, 3])):
+            row = rng.randrange(len(values))
+            values[row] = change_value(values[row], values, rng)
+        try:
+            return table.set_column(index, table.schema.field(index), pa.array(values, table.schema.field(index).type))
+        except (pa.ArrowException, OverflowError, TypeError, ValueError):
+            return change_table(table, rng)  # The type of the column cannot hold the value.
+    if kind == "rows":
+        return table.slice(rng.randrange(len(table) + 1), rng.randrange(len(table) + 1))
+    if kind == "order":
+        order = list(range(len(table)))
+        a, b = (rng.randrange(len(order)) for _ in range(2)) if order else (0, 0)
+        if order:
+            order[a] = order[b] if rng.random() < 0.5 else order[a]
+            order[a], order[b] = order[b], order[a]
+        return table.take(pa.array(order, pa.int64()))
+    if kind == "drop":
+        return table.remove_column(index)
+    if kind == "rename":
+        return table.rename_columns(
+            [other if k != index else rng.choice(["x", name + "_"]) for k, other in enumerate(table.column_names)]
+        )
+    if kind == "twice":
+        return table.append_column(table.schema.field(index), table[name])
+    kind_of = rng.choice([pa.string(), pa.float32(), pa.float64(), pa.int64(), pa.int8()])
+    try:
+        return table.set_column(index, name, table[name].cast(kind_of))
+    except pa.ArrowException:
+        return table.set_column(index, name, pa.nulls(len(table), kind_of))
+
+
+def change_value(value: Any, others: list, rng: random.Random) -> Any:
+    if isinstance(value, bytes):
+        return rng.choice([b"", value[:-1], value + b"\0", change_bytes(value, rng), rng.choice(others), None])
+    if isinstance(value, list) and value and rng.random() < 0.8:
+        return change_tree(value, rng)
+    return rng.choice([rng.choice(VALUES), rng.choice(NUMBERS), rng.choice(others), None])
+
+
+def write_parquet(table: pa.Table, rng: random.Random) -> bytes:
+    """Write a table with options that other programs use."""
+    file = io.BytesIO()
+    options: Any = {
+        "compression": rng.choice(["zstd", "snappy", "none", "gzip"]),
+        "use_dictionary": rng.random() < 0.7,
+        "row_group_size": rng.choice([None, 1, 7]),
+        "data_page_version": rng.choice(["1.0", "2.0"]),
+        "write_page_checksum": rng.random() < 0.5,
+        "store_schema": rng.random() < 0.8,
+    }
+    pq.write_table(table, file, **options)
+    return file.getvalue()
+
+
+# ----------------------------------------------------------------------------------------------------- invariants
+
+
+def check_scene(scene: Scene) -> None:
+    """Check the invariants of a scene."""
+    n = len(scene)
+    for name in ("center_m", "size_m", "rotation", "existence"):
+        require(np.isfinite(getattr(scene, name)).all(), f"{name} is not finite")
+    require((scene.size_m > 0).all(), "a size is not positive")
+    product = np.einsum("nij,nik->njk", scene.rotation.astype(float), scene.rotation.astype(float))
+    require(n == 0 or np.abs(product - np.eye(3)).max() < 5e-3, "a rotation is not orthonormal")
+    require(((scene.category >= 0) & (scene.category < len(CATEGORIES))).all(), "a category is unknown")
+    require(
+        np.isfinite(scene.height_m).all() and not scene.height_m[~scene.occupied].any(), "heights do not fit the masks"
+    )
+    require(np.isfinite([*scene.world_xyz_m, scene.world_yaw_rad]).all(), "the pose is not finite")
+    grid = scene.grid
+    require(grid.resolution_m > 0 and np.isfinite([grid.front_m, grid.left_m, grid.resolution_m]).all(), "invalid grid")
+
+
+def check_drive(drive: Drive) -> None:
+    """Check the invariants of a drive."""
+    for name in ("center_m", "size_m", "rotation", "world_from_imu"):
+        require(np.isfinite(getattr(drive, name)).all(), f"{name} is not finite")
+    require((drive.size_m > 0).all(), "a size is not positive")
+    product = np.einsum("nij,nik->njk", drive.rotation, drive.rotation)
+    require(len(product) == 0 or np.abs(product - np.eye(3)).max() < 5e-3, "a rotation is not orthonormal")
+
+
+def require_equal(scene: Scene, wanted: Scene) -> None:
+    """Require that two scenes are equal in all fields."""
+    for field in fields(Scene):
+        one, other = getattr(scene, field.name), getattr(wanted, field.name)
+        if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+            same = np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+        else:
+            same = one is other or one == other
+        require(same, f"a changed byte in a table changed {field.name} of {wanted.scene_id}")
+
+
+# ------------------------------------------------------------------------------------------------------- formats
+
+BYTES = "#bytes"  # Marks files of which bytes were changed, instead of values. Nothing is written for it.
+
+
+class Format:
+    """One file format: valid inputs, damage, the reader under test, and the check of an accepted result.
+
+    `check` receives the folder, the result of `read`, and the damaged files. It raises Silent.
+    """
+
+    name: str
+    bases: list[Files]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        raise NotImplementedError
+
+    def read(self, folder: Path) -> Any:
+        raise NotImplementedError
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        raise NotImplementedError
+
+    def read_bases(self, folder: Path) -> bool:
+        """Read the undamaged files, to make sure that the reader accepts them."""
+        for number, files in enumerate(self.bases):
+            for name, content in files.items():
+                path = folder / str(number) / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content)
+            self.check(folder / str(number), self.read(folder / str(number)), files)
+        return True
+
+    def pick(self, base: Files, rng: random.Random, change: Callable[[bytes, random.Random], bytes]) -> Files:
+        """Apply a change to one file."""
+        name = rng.choice(sorted(base))
+        return base | {name: change(base[name], rng)}
+
+
+def make_town_drive() -> Drive:
+    return generate_town(3)
+
+
+def make_scenes(drive: Drive) -> list[Scene]:
+    grid = Grid(24.0, 8.0, 0.25, 64, 64)
+    return [drive.scene(k, "test").crop(grid) for k in (0, 10, 20)]
+
+
+class Tables(Format):
+    """The tables of a shard."""
+
+    name = "tables"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        scenes = make_scenes(drive)
+        shard = Shard(str(folder), "town", "test", 0)
+        shard.write(scenes)
+        self.tables = [shard.read(name) for name in ("scenes", "primitives", "rasters")]
+        self.paths = [str(Path(shard.path(name)).relative_to(folder)) for name in ("scenes", "primitives", "rasters")]
+        self.bases = [{path: (folder / path).read_bytes() for path in self.paths}]
+        self.scenes = shard.scenes()
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        if rng.random() < 0.5:
+            return self.pick(base, rng, change_bytes) | {BYTES: b""}
+        k = rng.randrange(3)
+        table = self.tables[k]
+        for _ in range(rng.choice([1, 1, 2])):
+            table = change_table(table, rng)
+        return base | {self.paths[k]: write_parquet(table, rng)}
+
+    def read(self, folder: Path) -> list[Scene]:
+        return Shard(str(folder), "town", "test", 0).scenes()
+
+    def check(self, folder: Path, result: list[Scene], files: Files) -> None:
+        if BYTES in files:  # The pages have checksums, so an accepted file must hold the same scenes.
+            require(len(result) == len(self.scenes), "another number of scenes")
+            for scene, wanted in zip(result, self.scenes, strict=True):
+                require_equal(scene, wanted)
+        with duckdb.connect() as connection:
+            paths = [str(folder / path) for path in self.paths]
+            scenes = connection.execute(f"select scene_id, num_primitives from '{paths[0]}'").fetchall()
+            require(scenes == [(scene.scene_id, len(scene)) for scene in result], "other scenes than DuckDB reads")
+            columns = "category, x_m, y_m, z_m, length_m, width_m, height_m, existence"
+            for scene in result:
+                check_scene(scene)
+                rows = connection.execute(
+                    f"select {columns} from '{paths[1]}' where scene_id = ?", [scene.scene_id]
+                ).fetchnumpy()
+                require([CATEGORIES[k] for k in scene.category] == list(rows["category"]), "other categories")
+                values = np.concatenate([scene.center_m, scene.size_m, scene.existence[:, None]], axis=1)
+                wanted = np.stack([rows[name] for name in columns.split(", ")[1:]], axis=1)
+                require(np.array_equal(values, wanted), "other numbers than DuckDB reads")
+                mask, rows_, cols = connection.execute(
+                    f"select occupied, rows, cols from '{paths[2]}' where scene_id = ?", [scene.scene_id]
+                ).fetchall()[0]
+                bits = np.unpackbits(np.frombuffer(mask, np.uint8))[: scene.occupied.size]
+                require(scene.occupied.shape[1:] == (rows_, cols), "another grid than DuckDB reads")
+                require(np.array_equal(scene.occupied.ravel(), bits), "another mask than DuckDB reads")
+
+
+class OwnGlb(Format):
+    """GLB files that this project wrote."""
+
+    name = "glb-own"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        self.bases = [{"a.glb": export_glb(make_scenes(drive)[0])}]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.pick(base, rng, change_glb)
+
+    def read(self, folder: Path) -> Scene:
+        return import_glb(str(folder / "a.glb"))
+
+    def check(self, folder: Path, result: Scene, files: Files) -> None:
+        check_scene(result)
+        tree, _ = split_glb(files["a.glb"])
+        if not isinstance(tree, dict) or result.source != "imported":
+            stored = [node["extras"] for node in tree["nodes"] if "category" in (node.get("extras") or {})]
+            require(len(stored) == len(result), "another number of primitives than nodes with a category")
+
+
+class ForeignGlb(Format):
+    """GLB files of another program, with buffers of every kind."""
+
+    name = "glb-foreign"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        rng = np.random.default_rng(0)
+        scene = trimesh.Scene()
+        for k in range(4):
+            box = trimesh.creation.box(extents=(4.0, 2.0, 1.5))
+            color = np.array([[0, 0, 142], [70, 70, 70], [153, 153, 153], [107, 142, 35]][k])
+            box.visual.vertex_colors = np.append(color, 255).astype(np.uint8)
+            place = trimesh.transformations.rotation_matrix(rng.uniform(0, 6), (0, 0, 1))
+            place[:3, 3] = rng.uniform(5, 20), rng.uniform(-8, 8), 0.75
+            scene.add_geometry(box, transform=place)
+        plain = scene.export(file_type="glb")
+        tree, binary = split_glb(plain)
+        inside = copy.deepcopy(tree)
+        inside["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+        self.bases = [{"a.glb": plain}, {"a.glb": join_glb(json.dumps(inside).encode(), b"")}]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.pick(base, rng, change_glb)
+
+    def read(self, folder: Path) -> Any:
+        content = storage.read_bytes(str(folder / "a.glb"), "glb_bytes")
+        glb = read_glb(content)
+        return glb, import_glb(str(folder / "a.glb"))
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        glb, scene = result
+        check_scene(scene)
+        for part in glb.parts:
+            require(np.isfinite(part.vertices).all(), "a vertex is not finite")
+            require(((part.color >= 0) & (part.color <= 1)).all(), "a colour lies outside [0, 1]")
+        try:
+            loaded: Any = trimesh.load(io.BytesIO(files["a.glb"]), file_type="glb", process=False)
+            bounds, count = (
+                loaded.bounds,
+                sum(
+                    len(loaded.geometry[name].vertices)
+                    for _, name in map(loaded.graph.get, loaded.graph.nodes_geometry)
+                ),
+            )
+        except Exception:
+            return  # trimesh cannot read the file.
+        vertices = [part.vertices for part in glb.parts if len(part.vertices)]
+        if vertices and bounds is not None:
+            own = np.concatenate(vertices)
+            require(len(own) == count, f"{len(own)} vertices, but trimesh reads {count}")
+            require(
+                np.allclose([own.min(axis=0), own.max(axis=0)], bounds, rtol=1e-4, atol=1e-3),
+                "other bounds than trimesh reads",
+            )
+
+
+def split_glb(content: bytes) -> tuple[Any, bytes]:
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def join_glb(text: bytes, binary: bytes) -> bytes:
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    if binary:
+        chunks += struct.pack("<II", len(binary), 0x004E4942) + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def change_glb(content: bytes, rng: random.Random) -> bytes:
+    if rng.random() < 0.25:
+        return change_bytes(content, rng)
+    tree, binary = split_glb(content)
+    if rng.random() < 0.15:
+        binary = change_bytes(binary, rng)
+    else:
+        tree = change_tree(tree, rng, rng.choice([1, 1, 2]))
+    return join_glb(dump_json(tree, rng), binary)
+
+
+class Npz(Format):
+    """Directories and contents of .npz files."""
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.pick(base, rng, change_npz)
+
+    def load(self, content: bytes, name: str) -> np.ndarray | None:
+        """Return an array as numpy reads it, or None."""
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+                return arrays[name] if name in arrays else arrays[arrays.files[0]]
+        except Exception:
+            return None
+
+
+def change_npz(content: bytes, rng: random.Random) -> bytes:
+    """Change bytes, or write the zip archive again with other entries, headers, sizes or methods."""
+    if rng.random() < 0.4:
+        return change_bytes(content, rng)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = [(info.filename, archive.read(info)) for info in archive.infolist()]
+    k = rng.randrange(len(entries))
+    name, data = entries[k]
+    kind = rng.choice(["header", "header", "data", "name", "twice", "empty", "extra"])
+    kind = "bomb" if rng.random() < 0.01 else kind
+    if kind == "header":
+        data = change_npy_header(data, rng)
+    elif kind == "data":
+        data = change_bytes(data, rng)
+    elif kind == "name":
+        name = rng.choice(["../x.npy", "x", "/", "voxels.npy", "arr_0.npy", "a" * 1000])
+    elif kind == "bomb":
+        data = (
+            b"\x93NUMPY\x01\x00v\x00"
+            + f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**26},)}}".ljust(117).encode()
+            + b"\n"
+        )
+        data += bytes(2**27)
+    entries[k] = name, b"" if kind == "empty" else data
+    if kind in ("twice", "extra"):
+        entries.append((name if kind == "twice" else "extra.npy", data))
+    file = io.BytesIO()
+    method = rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+    with warnings.catch_warnings(), zipfile.ZipFile(file, "w", method) as archive:
+        warnings.simplefilter("ignore")
+        for name, data in entries:
+            archive.writestr(name, data)
+    changed = bytearray(file.getvalue())
+    if rng.random() < 0.2:  # Sizes, methods and flags in the central directory.
+        at = changed.rfind(b"PK\x01\x02")
+        changed[at + rng.choice([8, 10, 20, 24, 28, 42])] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def change_npy_header(data: bytes, rng: random.Random) -> bytes:
+    end = data.find(b"}") + 1
+    start = data.find(b"{")
+    if start < 0 or rng.random() < 0.3:
+        return change_bytes(data[:128], rng) + data[128:]
+    shapes = ["()", "(0,)", "(1,)", "(-1,)", "(2**62,)", "(99999999999,)", "(4, 4)", "(1e3,)", "None", "(True,)"]
+    kinds = ["|O", "<f8", ">i4", "|u1", "<U4", "|V8", "<c16", "<f2", "object", "M8[D]", "|S9999999"]
+    order = rng.choice(["True", "False", "1"])
+    text = f"{{'descr': '{rng.choice(kinds)}', 'fortran_order': {order}, 'shape': {rng.choice(shapes)}, }}"
+    padded = text.encode().ljust(end - start)[: end - start] if rng.random() < 0.5 else text.encode()
+    return data[:start] + padded + data[end:]
+
+
+class Voxels(Npz):
+    """Voxel grids of other methods."""
+
+    name = "voxels"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        rng = np.random.default_rng(0)
+        grid = rng.integers(0, 17, (32, 32, 4)).astype(np.uint8)
+        self.bases = []
+        for save in (np.savez, np.savez_compressed):
+            for kind in (np.uint8, np.int64):
+                save(file := io.BytesIO(), voxels=grid.astype(kind))
+                self.bases.append({"a.npz": file.getvalue()})
+
+    def read(self, folder: Path) -> np.ndarray:
+        return read_voxels(str(folder / "a.npz"))
+
+    def check(self, folder: Path, result: np.ndarray, files: Files) -> None:
+        require(result.shape == (256, 256, 32) and result.dtype == np.uint8 and result.max() <= 17, "invalid voxels")
+        wanted = self.load(files["a.npz"], "voxels")
+        require(wanted is not None, "numpy refuses the file")
+        factors = np.array(result.shape) // np.array(wanted.shape)
+        require(
+            np.array_equal(result[tuple(slice(None, None, f) for f in factors)], wanted),
+            "other voxels than numpy reads",
+        )
+
+
+class Pictures(Npz):
+    """Pictures in ADM's format."""
+
+    name = "adm"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        rng = np.random.default_rng(0)
+        pictures = rng.integers(0, 256, (5, 8, 8, 3)).astype(np.uint8)
+        np.savez(plain := io.BytesIO(), arr_0=pictures)
+        np.savez_compressed(packed := io.BytesIO(), arr_0=pictures)
+        self.bases = [{"a.npz": plain.getvalue()}, {"a.npz": packed.getvalue()}]
+
+    def read(self, folder: Path) -> Any:
+        path = str(folder / "a.npz")
+        read_reference_moments(path)
+        return read_picture_shape(path), np.concatenate(list(iterate_pictures(path, 2)))
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        shape, pictures = result
+        require(pictures.shape == shape and pictures.dtype == np.uint8, "another shape than stated")
+        wanted = self.load(files["a.npz"], "arr_0")
+        require(wanted is not None and np.array_equal(wanted, pictures), "other pictures than numpy reads")
+
+
+class Kitti360(Format):
+    """XML and poses of KITTI-360."""
+
+    name = "kitti360"
+    sequence = "2013_05_28_drive_0003_sync"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        write_kitti360(drive, folder)
+        path = next((folder / "data_3d_bboxes").rglob("*.xml"))
+        self.sequence = path.stem
+        tree = ElementTree.parse(path)
+        root = tree.getroot()
+        for number, one in enumerate(list(root)):
+            if number % max(1, len(root) // 12):
+                root.remove(one)
+        poses = next((folder / "data_poses").rglob("poses.txt"))
+        lines = poses.read_text().splitlines()[:20]
+        self.bases = [
+            {
+                str(path.relative_to(folder)): ElementTree.tostring(root),
+                str(poses.relative_to(folder)): ("\n".join(lines) + "\n").encode(),
+            }
+        ]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        return self.pick(base, rng, change_text)
+
+    def read(self, folder: Path) -> Any:
+        return kitti360.read_drive(folder, kitti360.list_sequences(folder)[0])
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        drive, _ = result
+        check_drive(drive)
+        path = next(name for name in files if name.endswith(".xml"))
+        require(b"<!ENTITY" not in files[path], "an entity was accepted")
+        try:
+            objects = len(ElementTree.fromstring(files[path]))
+        except (ElementTree.ParseError, ValueError, LookupError):
+            raise Silent("ElementTree refuses the XML") from None
+        require(len(drive.center_m) <= objects, "more objects than in the XML")
+
+
+def change_text(content: bytes, rng: random.Random) -> bytes:
+    """Change numbers, words, lines and elements of a text."""
+    text = content.decode("utf-8", "replace")
+    kind = rng.choice(["number"] * 4 + ["bytes", "line", "element", "entity", "nest"])
+    if kind == "bytes":
+        return change_bytes(content, rng)
+    if kind == "number":
+        words = list(re.finditer(r"-?\d+(\.\d+)?(e[+-]?\d+)?", text))
+        for word in rng.sample(words, min(len(words), rng.choice([1, 1, 5]))):
+            text = text[: word.start()] + str(rng.choice(VALUES)) + text[word.end() :]
+            break
+    elif kind == "line":
+        lines = text.split("\n")
+        at = rng.randrange(len(lines))
+        lines[at : at + rng.choice([0, 1])] = [lines[rng.randrange(len(lines))]] * rng.choice([0, 1, 2])
+        text = "\n".join(lines)
+    elif kind == "element":
+        tags = re.findall(r"<(\w+)>", text)
+        if tags:
+            tag = rng.choice(tags)
+            text = re.sub(
+                rf"<{tag}>.*?</{tag}>",
+                rng.choice(["", f"<{tag}/>", f"<{tag}>x</{tag}>", r"\g<0>\g<0>"]),
+                text,
+                count=1,
+                flags=re.S,
+            )
+    elif kind == "entity":
+        text = '<!DOCTYPE x [<!ENTITY a "&#60;b/&#62;"><!ENTITY b SYSTEM "file:///etc/passwd">]>' + text.replace(
+            "<label>", "<label>&b;", 1
+        )
+    else:
+        text = text.replace("<transform", "<x>" * 5000 + "<transform", 1)
+    return text.encode("utf-8", "replace")
+
+
+class Argoverse2(Format):
+    """Feather, JSON and height files of Argoverse 2."""
+
+    name = "argoverse2"
+    log = "00000000-0000-3000-8000-000000000000"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        sweeps = 315_966_000_000_000_000 + np.arange(3) * 100_000_000
+        ones, n = np.ones(6), 6
+        columns: dict[str, Any] = {
+            "timestamp_ns": sweeps.repeat(2),
+            "track_uuid": [f"track-{k % 2}" for k in range(n)],
+            "category": ["REGULAR_VEHICLE", "CONSTRUCTION_CONE"] * 3,
+            **dict.fromkeys(("length_m", "width_m", "height_m", "qw"), ones),
+            **dict.fromkeys(("qx", "qy", "qz"), 0 * ones),
+            **{name: np.arange(n) + 10.0 for name in ("tx_m", "ty_m", "tz_m")},
+            "num_interior_pts": np.zeros(n, np.int64),
+        }
+        poses = {"timestamp_ns": sweeps, "qw": np.ones(3), **dict.fromkeys(("qx", "qy", "qz"), np.zeros(3))}
+        poses |= {name: np.arange(3) * 1.0 for name in ("tx_m", "ty_m", "tz_m")}
+        corners = [{"x": x, "y": y, "z": 0.0} for x, y in ((-40.0, -40.0), (40.0, -40.0), (40.0, 40.0), (-40.0, 40.0))]
+        edges = [[{"x": x, "y": y, "z": 0.0} for y in (0.0, 10.0)] for x in (10.0, 13.0)]
+        self.tree = {
+            "drivable_areas": {"1": {"id": 1, "area_boundary": corners}},
+            "lane_segments": {},
+            "pedestrian_crossings": {"2": {"id": 2, "edge1": edges[0], "edge2": edges[1]}},
+        }
+        self.sim2 = {"R": [1.0, 0.0, 0.0, 1.0], "t": [50.0, 50.0], "s": 10 / 3}
+        np.save(heights := io.BytesIO(), np.zeros((333, 333), np.float16))
+        self.tables = {"annotations.feather": pa.table(columns), "city_SE3_egovehicle.feather": pa.table(poses)}
+        root, self.map = f"train/{self.log}/", f"map/log_map_archive_{self.log}____PIT_city_1.json"
+        self.root = root
+        self.bases = [
+            {root + name: write_feather(table) for name, table in self.tables.items()}
+            | {
+                root + self.map: json.dumps(self.tree).encode(),
+                f"{root}map/{self.log}___img_Sim2_city.json": json.dumps(self.sim2).encode(),
+                f"{root}map/{self.log}_ground_height_surface____PIT.npy": heights.getvalue(),
+            }
+        ]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        name = rng.choice(sorted(base))
+        short = name.removeprefix(self.root)
+        if rng.random() < 0.3:
+            return base | {name: change_bytes(base[name], rng)}
+        if short in self.tables:
+            return base | {name: write_feather(change_table(self.tables[short], rng))}
+        if short.endswith(".npy"):
+            return base | {name: change_npy_header(base[name], rng)}
+        return base | {name: dump_json(change_tree(self.tree if short == self.map else self.sim2, rng), rng)}
+
+    def read(self, folder: Path) -> Drive:
+        return argoverse2.read_drive(folder, "train", self.log)
+
+    def check(self, folder: Path, result: Drive, files: Files) -> None:
+        check_drive(result)
+        table = pyarrow.feather.read_table(folder / self.root / "annotations.feather", memory_map=False)
+        sizes = np.stack([table[f"{name}_m"].to_numpy() for name in ("length", "width", "height")], axis=1)
+        stored = {tuple(sorted(size)) for size in sizes.round(4).tolist()}
+        require(len(result.center_m) <= len(table), "more boxes than in the table")
+        require({tuple(sorted(size)) for size in result.size_m.round(4).tolist()} <= stored, "other sizes than stored")
+
+
+def write_feather(table: pa.Table) -> bytes:
+    file = io.BytesIO()
+    pyarrow.feather.write_feather(table, file)
+    return file.getvalue()
+
+
+class Custom(Format):
+    """Drives in the project's own format, as JSON and as Parquet."""
+
+    name = "custom"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        def place(x: float, y: float, z: float) -> dict:
+            return {"x_m": x, "y_m": y, "z_m": z}
+
+        size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
+        outline = [[-50.0, -4.0, 0.0], [150.0, -4.0, 0.0], [150.0, 4.0, 0.0], [-50.0, 4.0, 0.0]]
+        self.trees: dict[str, list] = {
+            "boxes": [
+                {"category": name, "yaw_rad": 0.1 * k, "instance_id": k} | place(8.0 + k, -5.0 + k, 0.5) | size
+                for k, name in enumerate(CATEGORIES)
+            ],
+            "polygons": [
+                {"class": "road", "outline": outline},
+                {"class": "sidewalk", "outline": [[x, y + 8, z] for x, y, z in outline]},
+            ],
+            "poses": [{"frame": 10 * k, "yaw_rad": 0.0} | place(2.0 * k, 0.0, 0.0) for k in range(3)],
+        }
+        self.tables = {name: pa.Table.from_pylist(rows) for name, rows in self.trees.items()}
+        rng = random.Random(0)
+        self.bases = [
+            {f"street/{name}.json": json.dumps(rows).encode() for name, rows in self.trees.items()},
+            {f"street/{name}.parquet": write_parquet(table, rng) for name, table in self.tables.items()},
+        ]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        path = rng.choice(sorted(base))
+        name = Path(path).stem
+        if rng.random() < 0.3:
+            return base | {path: change_bytes(base[path], rng)}
+        if path.endswith(".json"):
+            return base | {path: dump_json(change_tree(self.trees[name], rng, rng.choice([1, 1, 2])), rng)}
+        return base | {path: write_parquet(change_table(self.tables[name], rng), rng)}
+
+    def read(self, folder: Path) -> Drive:
+        return custom.read_drive(folder, "street")
+
+    def check(self, folder: Path, result: Drive, files: Files) -> None:
+        check_drive(result)
+        path = next(name for name in files if "boxes" in name)
+        rows = (
+            json.loads(files[path])
+            if path.endswith(".json")
+            else duckdb.sql(f"select category from '{folder / path}'").fetchall()
+        )
+        require(len(result.center_m) == len(rows), "another number of boxes than in the table")
+
+
+class Edits(Format):
+    """Lists of edits, in JSON."""
+
+    name = "edits"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        select = {"primitives": [0, 1], "category": ["pole"], "polygon_m": [0, -10, 40, -10, 40, 10]}
+        self.trees = [
+            [{"edit": "translate", "select": select, "by_m": [1, 2, 0]}, {"edit": "remove", "select": select}],
+            [
+                {"edit": "rotate", "select": select, "by_deg": 15},
+                {"edit": "duplicate", "select": select, "by_m": [0, 1, 0]},
+            ],
+        ]
+        self.bases = [{"edits.json": json.dumps(tree).encode()} for tree in self.trees]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        if rng.random() < 0.3:
+            return self.pick(base, rng, change_bytes)
+        return {"edits.json": dump_json(change_tree(json.loads(base["edits.json"]), rng, rng.choice([1, 2])), rng)}
+
+    def read(self, folder: Path) -> Any:
+        edits = parse_edits(storage.read_json(str(folder / "edits.json")))
+        for edit in edits:
+            edit.check()
+        return edits
+
+    def check(self, folder: Path, result: Any, files: Files) -> None:
+        require(len(result) == len(json.loads(files["edits.json"])), "another number of edits than in the file")
+
+
+class Models(Format):
+    """Pipeline directories: config.json, model_index.json and safetensors."""
+
+    name = "models"
+
+    def __init__(self, drive: Drive, folder: Path) -> None:
+        torch.manual_seed(0)
+        spec = LayoutSpec(slots=(6,) * len(CATEGORIES)).with_resolution(32)
+        lvae = LayoutVAE(layout=spec.to_dict(), **LVAE_PRESETS["smoke"].architecture())
+        channels, size, _ = lvae.latent_shape
+        PrITTIPipeline(
+            lvae, DiT(channels=channels, size=size, width=32, depth=1, heads=2, layout=spec.to_dict())
+        ).save_pretrained(folder)
+        self.bases = [
+            {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        ]
+
+    def damage(self, base: Files, rng: random.Random) -> Files:
+        name = rng.choice(sorted(base))
+        content = base[name]
+        if rng.random() < 0.05:
+            return {path: data for path, data in base.items() if path != name}
+        if rng.random() < 0.3:
+            return base | {name: change_bytes(content, rng)}
+        if name.endswith(".json"):
+            return base | {name: dump_json(change_tree(json.loads(content), rng, rng.choice([1, 1, 2])), rng)}
+        size = struct.unpack_from("<Q", content)[0]
+        header, data = json.loads(content[8 : 8 + size]), bytearray(content[8 + size :])
+        if rng.random() < 0.3:
+            at = 4 * rng.randrange(len(data) // 4)
+            data[at : at + 4] = struct.pack("<f", rng.choice([float("nan"), float("inf"), 1e30, 0.5]))
+        else:
+            header = change_tree(header, rng, rng.choice([1, 1, 2]))
+        text = dump_json(header, rng)
+        return base | {name: struct.pack("<Q", len(text)) + text + bytes(data)}
+
+    def read(self, folder: Path) -> PrITTIPipeline:
+        return PrITTIPipeline.from_pretrained(folder)
+
+    def check(self, folder: Path, result: PrITTIPipeline, files: Files) -> None:
+        for name, model in (("lvae", result.lvae), ("dit", result.dit)):
+            stored = safetensors.numpy.load(files[f"{name}/diffusion_pytorch_model.safetensors"])
+            state = model.state_dict()
+            require(set(stored) == set(state), "other tensors than in the file")
+            for key, values in state.items():
+                require(bool(values.isfinite().all()), f"{key} is not finite")
+                require(np.array_equal(values.numpy(), stored[key]), f"{key} differs from the file")
+
+
+FORMATS: list[Callable[[Drive, Path], Format]] = [
+    Tables, OwnGlb, ForeignGlb, Voxels, Pictures, Kitti360, Argoverse2, Custom, Edits, Models,
+]  # fmt: skip
