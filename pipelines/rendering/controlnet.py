@@ -76,13 +76,14 @@ class Painter:
         from diffusers.utils.logging import disable_progress_bar
 
         disable_progress_bar()
-        local = {"local_files_only": True, "use_safetensors": True}
+        # Weights in other formats are pickles, and code in a model directory must not run.
+        local = {"local_files_only": True, "use_safetensors": True, "trust_remote_code": False}
         try:
             controlnet = ControlNetModel.from_pretrained(request.controlnet, **local)
             self.pipeline = StableDiffusionControlNetPipeline.from_pretrained(
                 request.diffusion, controlnet=controlnet, safety_checker=None, requires_safety_checker=False, **local
             )
-        except (OSError, ValueError, ImportError) as error:
+        except Exception as error:  # Damaged files make diffusers and transformers raise errors of many types.
             raise ValueError(
                 f"{request.diffusion} must hold Stable Diffusion weights and {request.controlnet} ControlNet "
                 f"weights, both in diffusers format with safetensors ({error})"

@@ -1,10 +1,14 @@
 """Tests of the ControlNet step with a small diffusers pipeline that has random weights."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers import street_class_ids
+from safetensors.torch import load_file
 
 from pipelines.rendering.controlnet import SKY, Painter, PhotoRequest, make_control_image
 from pipelines.schema.palette import CLASS_COLORS, CLASS_ID
@@ -59,3 +63,23 @@ def test_painter_names_missing_weights(controlnet_weights, tmp_path):
         Painter(make_request((controlnet_weights[0], str(tmp_path))))
     with pytest.raises(ValueError, match="holds no street views; run jobs/render_streets"):
         paint(Config(streets=str(tmp_path), diffusion=controlnet_weights[0], controlnet=controlnet_weights[1]))
+
+
+def test_painter_loads_neither_pickles_nor_code(controlnet_weights, tmp_path):
+    ran = tmp_path / "ran"
+    for number in range(2):
+        copies = [Path(shutil.copytree(path, tmp_path / f"{number}-{k}")) for k, path in enumerate(controlnet_weights)]
+        changed = copies[number]
+        for path in list(changed.rglob("*.safetensors")):
+            torch.save(load_file(path), path.with_suffix(".bin"))
+            path.unlink()
+        with pytest.raises(ValueError, match="must hold Stable Diffusion weights"):
+            Painter(make_request((str(copies[0]), str(copies[1]))))
+    copy = Path(shutil.copytree(controlnet_weights[0], tmp_path / "code"))
+    (copy / "unet" / "evil.py").write_text(f"open({str(ran)!r}, 'w')\nclass Evil: pass\n")
+    for component in (["evil", "Evil"], ["diffusers", []], 3):
+        index = copy / "model_index.json"
+        index.write_text(json.dumps(json.loads(index.read_text()) | {"unet": component}))
+        with pytest.raises(ValueError, match="must hold Stable Diffusion weights"):
+            Painter(make_request((str(copy), controlnet_weights[1])))
+    assert not ran.exists()

@@ -5,6 +5,7 @@ import pickle
 import resource
 import shutil
 import struct
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,6 +21,7 @@ from models.lvae import LayoutVAE
 from models.pipeline import PrITTIPipeline
 from models.presets import LVAE_PRESETS
 from models.sampling.schedulers import SchedulerConfig
+from models.strict_json import parse_json
 from pipelines.generation.sample import load_pipeline
 from pipelines.training.latents import load_lvae
 
@@ -283,6 +285,14 @@ def test_unknown_scheduler_is_refused(directory):
         PrITTIPipeline.from_pretrained(directory)
     with pytest.raises(ValueError, match="diffusers does not accept the options"):
         SchedulerConfig("DDPMScheduler", {"beta_schedule": "evil"}).build()
+
+
+def test_repeated_key_is_found_in_linear_time():
+    text = "{" + ",".join(f'"{k}":0' for k in range(100_000)) + ',"99999":1}'
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="'99999' occurs twice"):
+        parse_json(text)
+    assert time.perf_counter() - start < 2
 
 
 def test_label_kind_of_damaged_config_is_named(directory):
