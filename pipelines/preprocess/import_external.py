@@ -23,9 +23,11 @@ from pipelines.io.voxel_import import draw_voxels, read_voxels
 from pipelines.metrics.adm_npz import write_npz
 from pipelines.preprocess.shard_writer import join_tables
 from pipelines.runtime import storage
+from pipelines.runtime.npz import open_npz
 from pipelines.runtime.ray_tasks import map_rows
 from pipelines.schema.axis_convention import Axes
 from pipelines.schema.tables import Shard, make_rejects_table, make_scene_tables
+from pipelines.schema.validation import validate_table
 
 MAX_FILES_PER_SHARD = 64
 WANTED_SHARDS = 8
@@ -171,8 +173,9 @@ def read_files(request: ImportRequest, shard: Shard, read: Callable[[int, str, s
         try:
             contents.append(read(index, name, uri))
             names.append(name)
-        except ValueError as error:
-            rejects.append({"scene_id": name, "sequence": request.name, "frame": index, "reason": str(error)})
+        except Exception as error:  # One file must not end the import of the others, not even by an error in a reader.
+            reason = str(error) if isinstance(error, ValueError) else f"{uri}: {type(error).__name__}: {error}"
+            rejects.append({"scene_id": name, "sequence": request.name, "frame": index, "reason": reason})
     if rejects:
         storage.write_parquet(make_rejects_table(rejects), shard.path("rejects"))
     return names, contents
@@ -197,7 +200,13 @@ def write_tables(row: dict, request: ImportRequest) -> dict:
     def tables(index: int, name: str, uri: str) -> dict[str, pa.Table]:
         scene = import_glb(uri, name, request.axes)
         about = {"source": shard.source, "split": shard.split, "sequence": request.name, "frame": index}
-        return make_scene_tables([replace(scene, **about)])
+        made = make_scene_tables([replace(scene, **about)])
+        try:
+            for kind, table in made.items():
+                validate_table(kind, table)
+        except ValueError as error:
+            raise ValueError(f"{uri}: {error}") from error
+        return made
 
     if shard.is_written() and not storage.exists(shard.path("rejects")):
         return {"shard": row["shard"], "scenes": shard.read("scenes", ["scene_id"])["scene_id"].to_pylist()}
@@ -222,7 +231,7 @@ def write_pictures(row: dict, request: ImportRequest) -> dict:
     shard = request.shards()[row["shard"]]
     path = request.pictures_path(shard)
     if storage.exists(path) and not storage.exists(shard.path("rejects")):
-        return {"shard": row["shard"], "scenes": np.load(io.BytesIO(storage.read_bytes(path)))["names"].tolist()}
+        return {"shard": row["shard"], "scenes": _read_part(path, "names").tolist()}
     names, pictures = read_files(request, shard, lambda _, __, uri: draw_voxels(read_voxels(uri, request.axes)))
     content = io.BytesIO()
     np.savez_compressed(content, names=np.array(names, str), pictures=np.array(pictures, np.uint8))
@@ -241,7 +250,12 @@ def make_pictures_shard(path: str) -> np.ndarray:
     Returns:
         (n, 256, 256, 3) uint8 images.
     """
-    return np.load(io.BytesIO(storage.read_bytes(path)))["pictures"]
+    return _read_part(path, "pictures")
+
+
+def _read_part(path: str, name: str) -> np.ndarray:
+    with open_npz(path) as archive:
+        return archive.read(name)
 
 
 # ------------------------------------------------------------------------------------------------------------ run

@@ -11,9 +11,9 @@ from helpers import save_npz
 
 from pipelines.geometry.voxels import VoxelGrid, voxelize
 from pipelines.io.mesh_export import export_glb
-from pipelines.io.voxel_import import FULL, draw_voxels, write_voxels
+from pipelines.io.voxel_import import FULL, draw_voxels, export_voxels_npz, write_voxels
 from pipelines.metrics.reconstruction import compute_voxel_confusion
-from pipelines.preprocess.import_external import find_files
+from pipelines.preprocess.import_external import ImportRequest, find_files, read_files
 from pipelines.schema.palette import CLASS_ID
 from pipelines.schema.tables import Shard, find_shards, read_scenes
 
@@ -133,6 +133,73 @@ def test_import_voxels_writes_pictures(cluster, tmp_path, town_scenes):
     assert len(np.load(target)["arr_0"]) == 4 and not list((tmp_path / "out").rglob(".pictures*"))
     assert import_scenes(config) == (target, made)
     assert json.loads((tmp_path / "out/imported-peer.json").read_text()) == made
+
+
+def damage_meshes(folder: Path, good: bytes) -> dict[str, str]:
+    """Write GLB files that are damaged in different ways, and return words of the expected reasons by scene id."""
+    size = int.from_bytes(good[12:16], "little")
+    faults = {
+        "empty": (b"", "not a binary glTF file"),
+        "cut": (good[:1000], "expected a whole file"),
+        "nan": (good.replace(b'"matrix":[', b'"matrix":[NaN,', 1), "expected a whole file"),
+        "json": (good[:20] + b"{" * size + good[20 + size :], "the JSON chunk is invalid"),
+        "text": (b"solid cube", "not a binary glTF file"),
+        "far": (good.replace(b'"existence":1.0', b'"existence":9.0', 1), "'existence' is 9.0"),
+    }
+    for name, (content, _) in faults.items():
+        assert content != good
+        (folder / f"{name}.glb").write_bytes(content)
+    return {name: words for name, (_, words) in faults.items()}
+
+
+def damage_voxels(folder: Path, good: bytes) -> dict[str, str]:
+    """Write .npz files that are damaged in different ways, and return words of the expected reasons by scene id."""
+    encrypted, payload = bytearray(good), bytearray(good)
+    encrypted[good.index(b"PK\1\2") + 8] |= 1
+    payload[80:120] = bytes(40)
+    faults = {
+        "empty": (b"", "not an .npz archive"),
+        "cut": (good[:-100], "not an .npz archive"),
+        "encrypted": (bytes(encrypted), "is encrypted"),
+        "payload": (bytes(payload), "is damaged"),
+    }
+    for name, (content, _) in faults.items():
+        (folder / f"{name}.npz").write_bytes(content)
+    return {name: words for name, (_, words) in faults.items()}
+
+
+@pytest.mark.parametrize("kind", ["glb", "npz"])
+def test_import_rejects_each_bad_file_and_reads_the_others(cluster, tmp_path, town_scenes, kind):
+    from jobs.implementation.import_scenes import import_scenes
+    from jobs.import_scenes import Config
+
+    for k, scene in enumerate(town_scenes[:2]):
+        good = export_glb(scene) if kind == "glb" else export_voxels_npz(scene)
+        (tmp_path / "in").mkdir(exist_ok=True)
+        (tmp_path / f"in/scene{k}.{kind}").write_bytes(good)
+    expected = {"glb": damage_meshes, "npz": damage_voxels}[kind](tmp_path / "in", good)
+    _, made = import_scenes(Config((str(tmp_path / "in"),), format=kind, output=str(tmp_path / "out")))
+    assert made["scenes"] == ["scene0", "scene1"] and made["rejects"] == len(expected)
+    rows = duckdb.sql(f"select scene_id, reason from '{tmp_path}/out/rejects/**/*.parquet'").fetchall()
+    assert {name for name, _ in rows} == expected.keys()
+    for name, reason in rows:
+        assert f"in/{name}.{kind}: " in reason and expected[name] in reason, reason
+
+
+@pytest.mark.parametrize("error", [MemoryError("large"), IndexError("5"), OSError("gone"), RecursionError("deep")])
+def test_import_continues_after_an_unexpected_error(tmp_path, error):
+    """An error in a reader also becomes a reject."""
+    files = tuple(f"{k:02d}.glb" for k in range(16))  # Two files per shard.
+    request = ImportRequest("in", files, "glb", ("x+", "y-", "z-"), str(tmp_path), "x")
+
+    def read(index: int, name: str, uri: str) -> str:
+        if name == "00":
+            raise error
+        return name
+
+    assert read_files(request, request.shards()[0], read) == (["01"], ["01"])
+    rows = duckdb.sql(f"select scene_id, reason from '{tmp_path}/rejects/**/*.parquet'").fetchall()
+    assert rows == [("00", f"in/00.glb: {type(error).__name__}: {error}")]
 
 
 def test_import_rejects_input_without_scenes(cluster, tmp_path):
