@@ -149,7 +149,7 @@ class ModelCard:
             "scenes. `metrics.json` contains all scores, and docs/concepts/evaluation.md explains them.\n"
         )
         ceiling = generation.get("sets", {}).get("ceiling", {})
-        left_out = (".memory_bytes.", ".validity.", ".label_fidelity.", *(f"{name}_k" for name in NEIGHBOURHOOD))
+        left_out = (".memory_bytes.", ".validity.", ".label_", *(f"{name}_k" for name in NEIGHBOURHOOD))
         rows = [
             (name, format_value(value), format_value(ceiling.get(name.removeprefix("generation."))) or "–")
             for name, value in list_headlines(self.scores)
