@@ -41,7 +41,7 @@ LIMITS = {
     "glb_bytes": Limit(2**28, "bytes of a GLB file"),
     "glb_nodes": Limit(200_000, "nodes of a GLB file"),
     "glb_placements": Limit(100_000, "mesh primitives of a GLB file, counted once per node that places them"),
-    "glb_vertices": Limit(2**22, "vertices and triangle corners of a GLB file, counted once per placement"),
+    "glb_vertices": Limit(3_000_000, "vertices and triangle corners of a GLB file"),
     "glb_ellipsoids": Limit(20_000, "ellipsoids that must be fitted to vertices of a GLB file"),
     "array_bytes": Limit(2**28, "bytes of an array or of a batch of pictures in an .npz file, after decompression"),
     "model_parameters": Limit(2_000_000_000, "parameters of a network"),

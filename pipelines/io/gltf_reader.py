@@ -57,31 +57,19 @@ class LocalMesh(NamedTuple):
 
 
 class MeshPart(NamedTuple):
-    """A mesh primitive of a node, transformed to the frame of the file.
+    """A mesh primitive of a node. `place_parts` transforms its vertices to the frame of the file.
 
     Attributes:
         node: Index of the node.
         extras: Extras of the node.
         file_from_mesh: Transform from the frame of the mesh to the frame of the file.
         local: The mesh primitive in its own frame.
-        vertices: Vertices in the frame of the file.
     """
 
     node: int
     extras: dict
     file_from_mesh: np.ndarray  # (4, 4)
     local: LocalMesh
-    vertices: np.ndarray  # (v, 3) float64
-
-    @property
-    def triangles(self) -> np.ndarray:
-        """Return the vertex indices (t, 3)."""
-        return self.local.triangles
-
-    @property
-    def color(self) -> np.ndarray:
-        """Return the stored colours (v, 3)."""
-        return self.local.color
 
 
 class Glb(NamedTuple):
@@ -107,6 +95,32 @@ def read_glb(data: bytes) -> Glb:
     require_within("glb_bytes", len(data))
     content, binary = _read_chunks(data)
     return _Reader(_parse_tree(content), binary).read_scene()
+
+
+def place_parts(parts: list[MeshPart]) -> list[np.ndarray]:
+    """Transform the vertices of mesh parts to the frame of the file.
+
+    Args:
+        parts: Mesh parts.
+
+    Returns:
+        Vertices (v, 3) float64 of each part.
+
+    Raises:
+        ValueError: The parts together exceed the limit glb_vertices, or vertices are NaN or beyond FAR_M.
+    """
+    count = sum(len(part.local.vertices) + part.local.triangles.size for part in parts)
+    require_within("glb_vertices", count, "all placements")
+    placed = []
+    for part in parts:
+        with np.errstate(over="ignore", invalid="ignore"):
+            vertices = part.local.vertices @ part.file_from_mesh[:3, :3].T + part.file_from_mesh[:3, 3]
+        if not np.abs(vertices).max() < FAR_M:
+            raise ValueError(
+                f"node {part.node}: vertices are NaN or lie beyond {FAR_M:.0f} m; export the scene in metres"
+            )
+        placed.append(vertices)
+    return placed
 
 
 # -------------------------------------------------------------------------------------------------------- container
@@ -241,7 +255,7 @@ class _Reader:
         scene = _pick(self.lists["scenes"], self.default_scene, "the file", "scene")
         roots = _get(scene, "nodes", list, f"scene {self.default_scene}", [])
         placed, placements, total = [], 0, 0
-        most_placements, most_vertices = find_limit("glb_placements"), find_limit("glb_vertices")
+        most_placements = find_limit("glb_placements")
         for index, node, file_from_mesh in self._list_placed_nodes(roots):
             if "mesh" not in node:
                 continue
@@ -252,9 +266,8 @@ class _Reader:
                 require_within("glb_placements", placements, f"node {index}")
             if mesh not in self.sizes:
                 self.sizes[mesh] = sum(self._count_numbers(entry, f"mesh {mesh}") for entry in primitives)
-            total += self.sizes[mesh]
-            if total > most_vertices:
-                require_within("glb_vertices", total, f"node {index}")
+                total += self.sizes[mesh]
+                require_within("glb_vertices", total, f"mesh {mesh}")
             if "skin" in node:
                 raise ValueError(f"node {index} has a skin, which is not read; export it without an armature")
             _refuse_morphs(node, f"node {index}")
@@ -262,14 +275,8 @@ class _Reader:
         parts = []
         for index, node, mesh, file_from_mesh in placed:
             extras = node.get("extras")
-            for local in self._read_mesh(mesh):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    vertices = local.vertices @ file_from_mesh[:3, :3].T + file_from_mesh[:3, 3]
-                if not np.abs(vertices).max() < FAR_M:
-                    raise ValueError(
-                        f"node {index}: vertices are NaN or lie beyond {FAR_M:.0f} m; export the scene in metres"
-                    )
-                parts.append(MeshPart(index, extras if type(extras) is dict else {}, file_from_mesh, local, vertices))
+            extras = extras if type(extras) is dict else {}
+            parts += [MeshPart(index, extras, file_from_mesh, local) for local in self._read_mesh(mesh)]
         return Glb(_get(scene, "extras", dict, "the scene", {}), parts)
 
     def _list_placed_nodes(self, roots: list) -> Iterator[tuple[int, dict, np.ndarray]]:

@@ -46,7 +46,7 @@ from models.scene import (
     compute_yaw,
 )
 from pipelines.geometry.shape_fitting import fit_boxes_to_corners, fit_boxes_to_edges, fit_ellipsoids
-from pipelines.io.gltf_reader import Glb, MeshPart, read_glb
+from pipelines.io.gltf_reader import FAR_M, Glb, MeshPart, place_parts, read_glb
 from pipelines.io.mesh_export import GLTF_FROM_SCENE
 from pipelines.io.mesh_segmentation import (
     COLOR_TOLERANCE,
@@ -65,7 +65,6 @@ AUTHORS_AXES: Axes = ("x+", "y-", "z-")
 UNMOVED = 1e-4
 ORTHOGONAL = 1e-3  # Largest accepted cosine between two edges of a primitive in an export.
 UNIT_M = 1e-3  # Largest accepted distance of a vertex from the unit shape in an export (m).
-FAR_M = 1e6  # Largest accepted coordinate and size of a grid (m).
 LEAST_M = 5e-324  # Smallest positive size (m).
 ANGLE_RAD = 3.1416  # Largest accepted angle.
 TEXTS = ("scene_id", "source", "sequence", "split")
@@ -130,6 +129,8 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     scene_from_gltf = np.linalg.inv(GLTF_FROM_SCENE)
     scene_from_unit = np.array([scene_from_gltf @ part.file_from_mesh for part in nodes]).reshape(-1, 4, 4)
     center_m, edges_m = scene_from_unit[:, :3, 3], scene_from_unit[:, :3, :3]
+    if not (np.abs(center_m) < FAR_M).all():
+        raise ValueError(f"primitives are NaN or lie beyond {FAR_M:.0f} m; export the scene in metres")
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         unit = edges_m / np.linalg.norm(edges_m, axis=1, keepdims=True)
         skewed = ~(np.abs(np.swapaxes(unit, 1, 2) @ unit - np.eye(3)).max(axis=(1, 2), initial=0) <= ORTHOGONAL)
@@ -145,9 +146,9 @@ def _import_own_scene(glb: Glb, scene_id: str) -> Scene:
     turned = ~np.isclose(compute_yaw(rotation), yaw_said, rtol=0, atol=UNMOVED)
 
     ground = [part for part in glb.parts if "classes" in part.extras]
-    vertices_m = _join_meshes([part.vertices @ scene_from_gltf[:3, :3].T for part in ground], (0, 3))
+    vertices_m = _join_meshes(place_parts(ground), (0, 3)) @ scene_from_gltf[:3, :3].T
     ids = np.array([GROUND_CLASS_ID[name] for name in about["ground_classes"]])
-    class_id, off = find_nearest_class(_join_meshes([part.color for part in ground], (0, 3)), True, ids)
+    class_id, off = find_nearest_class(_join_meshes([part.local.color for part in ground], (0, 3)), True, ids)
     if (off > COLOR_TOLERANCE).any():
         raise ValueError(
             f"{(off > COLOR_TOLERANCE).sum()} ground vertices match the colour of no ground class; export it again"
@@ -300,12 +301,13 @@ def _read_text(extras: dict, name: str, place: str) -> str:
 def _import_foreign_scene(glb: Glb, scene_id: str, scene_from_file: np.ndarray, grid: Grid) -> Scene:
     if not glb.parts:
         raise ValueError("the file holds no mesh; export the scene with its meshes")
-    counts = [len(part.vertices) for part in glb.parts]
+    placed = place_parts(glb.parts)
+    counts = [len(vertices) for vertices in placed]
     starts = np.cumsum(counts) - counts
     mesh = Mesh(
-        np.concatenate([part.vertices for part in glb.parts]) @ scene_from_file.T,
-        np.concatenate([part.triangles + start for part, start in zip(glb.parts, starts, strict=True)]),
-        np.concatenate([part.color for part in glb.parts]),
+        np.concatenate(placed) @ scene_from_file.T,
+        np.concatenate([part.local.triangles + start for part, start in zip(glb.parts, starts, strict=True)]),
+        np.concatenate([part.local.color for part in glb.parts]),
         np.repeat(np.arange(len(counts)), counts),
     )
     ground_m, ground_id, corners_m, box_id, clouds = segment_mesh(mesh, grid)

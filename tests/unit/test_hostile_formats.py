@@ -18,7 +18,7 @@ from helpers import random_scene
 
 from models.limits import LIMITS
 from models.scene import ELLIPSOID, Grid
-from pipelines.io.gltf_reader import read_glb
+from pipelines.io.gltf_reader import place_parts, read_glb
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.mesh_import import import_glb
 from pipelines.io.voxel_import import read_voxels
@@ -274,7 +274,7 @@ def make_points_tree(component: int = 5126, dtype: str = "<f4", count: int = 6, 
 
 def refuse_glb(tree: object, binary: bytes, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        read_glb(join_glb(tree, binary))
+        place_parts(read_glb(join_glb(tree, binary)).parts)
 
 
 def set_path(path: tuple, value: object):
@@ -413,7 +413,12 @@ def test_glb_reader_counts_before_it_allocates(monkeypatch):
     start = time.process_time()
     refuse_glb(*make_amplified_tree(1500, 1500), "mesh primitives of a GLB file, .* at most 100,000")
     refuse_glb(*make_amplified_tree(0, 1500), "has no primitive")
-    refuse_glb(*make_amplified_tree(1, 3, 2**21), "vertices and triangle corners .* at most 4,194,304")
+    refuse_glb(*make_amplified_tree(1, 1, 2**22), "mesh 0: .* vertices and triangle corners .* at most 3,000,000")
+    tree, binary = make_points_tree()
+    tree["nodes"], tree["scenes"][0]["nodes"] = [{"mesh": 0}] * 100, list(range(100))
+    monkeypatch.setenv("PRITTI_MAX_GLB_VERTICES", "1000")
+    assert len(read_glb(join_glb(tree, binary)).parts) == 100
+    refuse_glb(tree, binary, "all placements: 1,200 vertices and triangle corners .* at most 1,000")
     refuse_glb(*make_amplified_tree(1, 1, 10**400), "'count' is 1000")
     assert time.process_time() - start < 3
     monkeypatch.setenv("PRITTI_MAX_GLB_NODES", "1000")
@@ -437,8 +442,8 @@ def test_glb_reader_equals_trimesh_for_component_type(component, dtype):
     (part,) = read_glb(join_glb(tree, binary)).parts
     theirs = trimesh.load_scene(io.BytesIO(join_glb(tree, binary)), file_type="glb", process=False)
     (mesh,) = theirs.dump()
-    np.testing.assert_allclose(part.vertices, mesh.vertices, atol=1e-12)
-    np.testing.assert_array_equal(part.triangles, mesh.faces)
+    np.testing.assert_allclose(place_parts([part])[0], mesh.vertices, atol=1e-12)
+    np.testing.assert_array_equal(part.local.triangles, mesh.faces)
 
 
 @pytest.mark.parametrize("component, dtype", [(5121, "<u1"), (5123, "<u2"), (5125, "<u4")])
@@ -452,8 +457,8 @@ def test_glb_reader_equals_trimesh_for_index_type(component, dtype):
     tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(content)})
     tree["buffers"][0]["byteLength"] = len(binary + content)
     (part,) = read_glb(join_glb(tree, binary + content)).parts
-    np.testing.assert_array_equal(part.triangles, box.faces)
-    np.testing.assert_allclose(part.vertices, box.vertices, atol=1e-7)
+    np.testing.assert_array_equal(part.local.triangles, box.faces)
+    np.testing.assert_allclose(place_parts([part])[0], box.vertices, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["generated_low_0", "high_121", "low_12", "medium_240"])
@@ -461,9 +466,9 @@ def test_glb_reader_equals_trimesh_for_files_of_the_authors(real_data, name):
     path = real_data / "glb" / f"{name}.glb"
     (part,) = read_glb(path.read_bytes()).parts
     mesh = trimesh.load(path, process=False, force="mesh")
-    np.testing.assert_array_equal(part.vertices, mesh.vertices)
-    np.testing.assert_array_equal(part.triangles, mesh.faces)
-    assert np.abs(255 * part.color - np.asarray(mesh.visual.vertex_colors)[:, :3]).max() < 1
+    np.testing.assert_array_equal(place_parts([part])[0], mesh.vertices)
+    np.testing.assert_array_equal(part.local.triangles, mesh.faces)
+    assert np.abs(255 * part.local.color - np.asarray(mesh.visual.vertex_colors)[:, :3]).max() < 1
 
 
 SMALL_GRID = Grid(front_m=64.0, left_m=32.0, resolution_m=0.25, rows=8, cols=8)
@@ -529,6 +534,14 @@ def test_import_refuses_changed_shapes_of_export():
         set_path(path, value)(changed)
         with pytest.raises(ValueError, match=words):
             import_glb(join_glb(changed, binary))
+
+
+def test_import_reads_export_of_many_trees():
+    """The spheres of an export share one mesh, and the import does not transform its vertices."""
+    scene = random_scene(6, n=700, grid=SMALL_GRID, category=np.full(700, ELLIPSOID, np.int8))
+    got = import_glb(export_glb(scene))
+    np.testing.assert_array_equal(got.center_m, scene.center_m)
+    np.testing.assert_array_equal(got.size_m, scene.size_m)
 
 
 def export_ground(positions_m: np.ndarray, names: np.ndarray) -> bytes:
