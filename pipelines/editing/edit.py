@@ -9,6 +9,7 @@ be applied to other scenes. An edit in JSON is an object such as
 from __future__ import annotations
 
 import json
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -33,6 +34,7 @@ from pipelines.metrics.validity import SLAB_OFFSET_M
 from pipelines.schema.tables import PRIMITIVES, make_primitives_table
 
 SIZES_M = (1e-3, 1e3)  # Smallest and largest size after an edit.
+WHERE_S, WHERE_MEMORY = 10.0, "1GB"  # Largest time (s) and memory of an SQL condition.
 
 
 @dataclass(frozen=True)
@@ -103,17 +105,26 @@ class Select:
 
 
 def _evaluate_where(table: pa.Table, condition: str) -> np.ndarray:
-    """Return a mask (n,): whether each row of a primitives table satisfies an SQL condition."""
+    """Return a mask (n,): whether each row of a primitives table satisfies an SQL condition.
+
+    The condition can read no file, and its time and memory are limited.
+    """
     table = table.append_column("row", pa.array(np.arange(len(table))))
-    with duckdb.connect(config={"enable_external_access": False}) as connection:
+    with duckdb.connect(config={"enable_external_access": False, "memory_limit": WHERE_MEMORY}) as connection:
+        timer = threading.Timer(WHERE_S, connection.interrupt)
+        timer.start()
         try:
             rows = connection.from_arrow(table).filter(condition).project("row").fetchnumpy()["row"]
+        except duckdb.InterruptException as error:
+            raise ValueError(f"the where condition {condition!r} takes more than {WHERE_S:g} s; simplify it") from error
         except duckdb.Error as error:
             first = str(error).splitlines()[0]
             raise ValueError(
                 f"the where condition {condition!r} is invalid: {first}; docs/reference/tables.md lists the columns;"
                 " write text in 'single quotes'"
             ) from error
+        finally:
+            timer.cancel()
     return np.isin(np.arange(len(table)), rows)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -75,7 +76,8 @@ def write_whole(uri: str, write: Callable[[Any], None]) -> None:
     fs, path = resolve_uri(uri)
     parent, name = path.rsplit("/", 1)
     # The temporary file has another suffix, because *.parquet patterns of DuckDB also match hidden files.
-    temporary = f"{parent}/{TEMPORARY}{name}-{os.getpid()}"
+    # Nobody can guess the random part, so nobody can plant a link under this name in a shared directory.
+    temporary = f"{parent}/{TEMPORARY}{name}-{secrets.token_hex(8)}"
     try:
         fs.create_dir(parent, recursive=True)
         with fs.open_output_stream(temporary) as stream:

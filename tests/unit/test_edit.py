@@ -1,6 +1,7 @@
 """Tests of edits: exact parameters, repair and deterministic replay."""
 
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -345,3 +346,19 @@ def test_edit_list_replays_exactly_after_round_trip(scene):
 def test_edit_list_rejects_wrong_values(content, message):
     with pytest.raises(ValueError, match=message):
         parse_edits(content)
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("row < (SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b)", "takes more than 0.2 s"),
+        ("(SELECT count(*) FROM read_csv('/etc/passwd')) > 0", "is invalid"),
+        ("(SELECT count(*) FROM read_text('/etc/passwd')) > 0", "is invalid"),
+    ],
+)
+def test_where_condition_is_limited(condition, message, monkeypatch):
+    monkeypatch.setattr("pipelines.editing.edit.WHERE_S", 0.2)
+    start = time.monotonic()
+    with pytest.raises(ValueError, match=message):
+        Select(where=condition).select_primitives(random_scene(0, n=5))
+    assert time.monotonic() - start < 5

@@ -1,5 +1,7 @@
 """Tests of tables: scenes are the same after writing and reading, and DuckDB can query the files."""
 
+import os
+
 import duckdb
 import numpy as np
 import pyarrow.parquet as pq
@@ -105,3 +107,13 @@ def test_shard_write_is_atomic(tmp_path):
     (tmp_path / "a" / "b.json").write_text("{")
     with pytest.raises(ValueError, match=r"b.json: cannot be read as JSON"):
         storage.read_json(target)
+
+
+def test_writer_does_not_follow_planted_link(tmp_path):
+    """Earlier versions used a temporary name that another user of a shared directory could predict."""
+    victim = tmp_path / "victim"
+    victim.write_text("kept")
+    (tmp_path / f"{storage.TEMPORARY}a.txt-{os.getpid()}").symlink_to(victim)
+    storage.write_text("new", str(tmp_path / "a.txt"))
+    assert victim.read_text() == "kept" and (tmp_path / "a.txt").read_text() == "new"
+    assert not (tmp_path / "a.txt").is_symlink()
