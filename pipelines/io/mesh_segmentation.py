@@ -36,7 +36,11 @@ def classify_colors(color: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
         Whether the colours match the palette better as linear light than as sRGB; class id (v,); and the largest
         difference in a colour channel (v,), on a scale of 0 to 255.
     """
-    (linear_id, linear_off), (srgb_id, srgb_off) = (find_nearest_class(color, way, CLASS_IDS) for way in (True, False))
+    distinct, place = _list_colors(color)
+    (linear_id, linear_off), (srgb_id, srgb_off) = (
+        (nearest[place], off[place])
+        for nearest, off in (_compare_colors(distinct, way, CLASS_IDS) for way in (True, False))
+    )
     if np.minimum(linear_off, FAR).sum() < np.minimum(srgb_off, FAR).sum():
         return True, linear_id, linear_off
     return False, srgb_id, srgb_off
@@ -53,8 +57,18 @@ def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -
     Returns:
         Class id (v,), and the largest difference in a colour channel (v,), on a scale of 0 to 255.
     """
+    distinct, place = _list_colors(color)
+    nearest, off = _compare_colors(distinct, linear, class_ids)
+    return nearest[place], off[place]
+
+
+def _list_colors(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct colours (u,), each as three numbers of 16 bits in one integer, and the index (v,) of each."""
     levels = np.round(color * 65535).astype(np.int64).clip(0, 65535)
-    code, place = np.unique(levels @ np.array([2**32, 2**16, 1], np.int64), return_inverse=True)
+    return np.unique(levels @ np.array([2**32, 2**16, 1], np.int64), return_inverse=True)
+
+
+def _compare_colors(code: np.ndarray, linear: bool, class_ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     nearest, off = np.empty(len(code), class_ids.dtype), np.empty(len(code))
     for start in range(0, len(code), CHUNK):
         part = slice(start, start + CHUNK)
@@ -63,7 +77,7 @@ def find_nearest_class(color: np.ndarray, linear: bool, class_ids: np.ndarray) -
             value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
         apart = np.abs(255 * value[:, None] - CLASS_COLORS[class_ids].astype(float)).max(axis=2)
         nearest[part], off[part] = class_ids[apart.argmin(axis=1)], apart.min(axis=1)
-    return nearest[place], off[place]
+    return nearest, off
 
 
 # -------------------------------------------------------------------------------------------------------- pieces
