@@ -57,7 +57,8 @@ async function watch() {
     await new Promise((done) => setTimeout(done, 250));
     work = await ask("/api/work").catch(() => ({ finished: true, error: "The studio does not answer." }));
     $("progress").max = work.total || 1; $("progress").value = work.done || 0;
-    say(`${work.name ?? ""}: step ${work.done ?? 0} of ${work.total ?? 0}`);
+    const left = work.estimate_s == null ? "" : `, about ${work.estimate_s} s left`;
+    say(`${work.name ?? ""}: ${work.position ? `number ${work.position} in the queue` : `step ${work.done ?? 0} of ${work.total ?? 0}`}${left}`);
   } while (!work.finished);
   watching = false;
   $("progress").hidden = $("cancel").hidden = true;
