@@ -32,6 +32,7 @@ class Limit(NamedTuple):
 LIMITS = {
     "raster_pixels": Limit(2**26, "pixels of all ground classes of a scene"),
     "scene_primitives": Limit(200_000, "primitives of a scene"),
+    "scene_coverage": Limit(2**31, "pixels of the bounding boxes of the ground triangles of a scene"),
     "table_rows": Limit(2_000_000, "rows of a table file"),
     "table_bytes": Limit(2**29, "bytes of the columns that are read from a table file, after decompression"),
     "text_letters": Limit(1_000, "characters of an id, a label or a name"),
@@ -85,7 +86,9 @@ def require_within(name: str, number: float, place: str = "") -> None:
     """
     limit = find_limit(name)
     if not number <= limit:
+        number = min(number, 10**30) if isinstance(number, int) else number  # Longer integers are not readable.
         raise LimitError(
             f"{place + ': ' if place else ''}{number:,} {LIMITS[name].meaning}; at most {limit:,} are accepted. If the"
-            f" file can be trusted, set {PREFIX}{name.upper()}={number:.0f} to raise the limit"
+            f" file can be trusted, set {PREFIX}{name.upper()}={f'{number:.0f}' if isinstance(number, float) else number}"
+            " to raise the limit"
         )

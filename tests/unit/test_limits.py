@@ -17,8 +17,9 @@ def test_limit_names_number_limit_and_variable(monkeypatch):
         require_within("polygon_points", 10_001, "a.json")
     monkeypatch.setenv("PRITTI_MAX_POLYGON_POINTS", "20000")
     require_within("polygon_points", 10_001, "a.json")
-    with pytest.raises(ValueError, match="at most 20,000"):
-        require_within("polygon_points", float("nan"))
+    for number in (float("nan"), float("inf"), 10**400, 10**5000):
+        with pytest.raises(ValueError, match="at most 20,000"):
+            require_within("polygon_points", number)
     monkeypatch.setenv("PRITTI_MAX_POLYGON_POINTS", "-1")
     with pytest.raises(ValueError, match="PRITTI_MAX_POLYGON_POINTS is '-1', expected a positive integer"):
         find_limit("polygon_points")
