@@ -87,8 +87,8 @@ def require_within(name: str, number: float, place: str = "") -> None:
     limit = find_limit(name)
     if not number <= limit:
         number = min(number, 10**30) if isinstance(number, int) else number  # Longer integers are not readable.
+        plain = f"{number:.0f}" if isinstance(number, float) else str(number)
         raise LimitError(
             f"{place + ': ' if place else ''}{number:,} {LIMITS[name].meaning}; at most {limit:,} are accepted. If the"
-            f" file can be trusted, set {PREFIX}{name.upper()}={f'{number:.0f}' if isinstance(number, float) else number}"
-            " to raise the limit"
+            f" file can be trusted, set {PREFIX}{name.upper()}={plain} to raise the limit"
         )
