@@ -32,7 +32,7 @@ class Limit(NamedTuple):
 LIMITS = {
     "raster_pixels": Limit(2**26, "pixels of all ground classes of a scene"),
     "scene_primitives": Limit(200_000, "primitives of a scene"),
-    "scene_coverage": Limit(2**31, "pixels of the bounding boxes of the ground triangles of a scene"),
+    "scene_coverage": Limit(2**29, "pixels of the bounding boxes of the ground triangles of a scene"),
     "table_rows": Limit(2_000_000, "rows of a table file"),
     "table_bytes": Limit(2**29, "bytes of the columns that are read from a table file, after decompression"),
     "text_letters": Limit(1_000, "characters of an id, a label or a name"),

@@ -13,17 +13,23 @@ frame. An invalid log raises ValueError; the message names file, value and remed
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
+import pyarrow.compute as compute
 import pyarrow.feather
 from scipy.spatial.transform import Rotation
 
+from models.limits import require_within
 from models.scene import CATEGORY_INDEX
 from pipelines.preprocess.sources.drive import Drive, MapGround
+from pipelines.preprocess.sources.files import read_file, read_json_file
+from pipelines.runtime.feather_sizes import measure_feather
+
+pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
+AGAIN = "download the log again"
 
 SOURCE = "av2"
 SPLITS = ("train", "val")
@@ -186,13 +192,19 @@ def _read_feather(
 
     Columns have no nulls and only finite numbers.
     """
-    _check_file(path)
+    content = read_file(path, AGAIN)
     try:
-        table = pyarrow.feather.read_table(path, memory_map=False)
+        rows, size = measure_feather(content)
+    except ValueError as error:
+        raise ValueError(f"{path}: broken feather file ({error}); {AGAIN}") from error
+    require_within("table_rows", rows, str(path))
+    require_within("table_bytes", size, str(path))
+    try:
+        table = pyarrow.feather.read_table(pa.BufferReader(content), memory_map=False)
         table.validate(full=True)
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: broken feather file ({reason}); download the log again") from error
+        raise ValueError(f"{path}: broken feather file ({reason}); {AGAIN}") from error
     kinds = [
         (integers, pa.types.is_int64, "int64"),
         (texts, _is_text, "text"),
@@ -209,7 +221,7 @@ def _read_feather(
             if column.null_count:
                 raise ValueError(f"{path}: column {name} has {column.null_count} nulls; download the log again")
             if kind == "text":
-                columns[name] = np.array(pc.cast(column, pa.string()).to_pylist(), object)
+                columns[name] = _read_texts(path, name, column)
             else:
                 columns[name] = column.to_numpy().astype(np.int64 if kind == "int64" else np.float64)
     for name in numbers:
@@ -217,6 +229,21 @@ def _read_feather(
         if len(bad):
             raise ValueError(f"{path}: {name} of row {bad[0]} is {columns[name][bad[0]]}; fix or drop the row")
     return columns
+
+
+def _read_texts(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
+    """Return texts (n,); equal texts are one object."""
+    values = []
+    for chunk in column.chunks:
+        chunk = chunk if pa.types.is_dictionary(chunk.type) else pc.dictionary_encode(chunk)
+        longest = pc.max(pc.utf8_length(chunk.dictionary)).as_py() or 0
+        require_within("text_letters", longest, f"{path}: a text in column {name}")
+        texts = np.array([*chunk.dictionary.to_pylist(), None], object)  # None keeps numpy from making an (n, m) array.
+        values.append(texts[chunk.indices.to_numpy()])
+    found = np.concatenate([np.zeros(0, object), *values])
+    if any(text is None for text in set(found)):
+        raise ValueError(f"{path}: column {name} has a null; {AGAIN}")
+    return found
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -292,11 +319,7 @@ def _find_only_file(folder: Path, pattern: str) -> Path:
 
 
 def _read_json(path: Path) -> dict:
-    _check_file(path)
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: broken JSON ({str(error)[:120]}); download the log again") from error
+    content = read_json_file(path, AGAIN)
     if not isinstance(content, dict):
         raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object; download the log again")
     return content
@@ -317,6 +340,7 @@ def _read_points(path: Path, entry: dict, name: str, least: int, most: int | Non
         raise ValueError(
             f"{path}: {name} of {ascii(entry.get('id'))[:40]} is no list of {least} points; download the log again"
         )
+    require_within("polygon_points", len(points), f"{path}: {name} of {ascii(entry.get('id'))[:40]}")
     values = [point.get(axis) if isinstance(point, dict) else None for point in points for axis in "xy"]
     if not _are_all_numbers(values, MAX_COORDINATE_M):
         raise ValueError(
@@ -353,6 +377,7 @@ def _read_heights(path: Path) -> np.ndarray:
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
         kind = f"{mapped.dtype} {mapped.shape}" if isinstance(mapped, np.ndarray) else type(mapped).__name__
         raise ValueError(f"{path} holds {kind}, expected a 2D float array; download the log again")
+    require_within("raster_pixels", mapped.size, str(path))
     with np.errstate(over="ignore"):  # Overflow gives infinity, which the check below rejects.
         height_m = np.array(mapped, np.float32)
     known = height_m[~np.isnan(height_m)]

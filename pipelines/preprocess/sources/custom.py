@@ -14,21 +14,28 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as compute
 import pyarrow.parquet as pq
 import shapely
 from scipy.spatial.transform import Rotation
 
+from models.limits import LimitError, require_within
 from models.scene import CATEGORIES, CATEGORY_INDEX, GROUND_CLASSES, make_yaw_rotation
 from pipelines.preprocess.sources.drive import STATIC, Drive, SurfaceGround
+from pipelines.preprocess.sources.files import read_json_file
+from pipelines.preprocess.sources.triangulation import triangulate_polygon
+from pipelines.runtime.parquet_sizes import measure_columns
 from pipelines.schema.splits import TEST, TRAIN
+
+pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
 SOURCE = "own"
 
@@ -58,6 +65,8 @@ MAX_HEIGHT_M = 1e4
 MIN_SIZE_M = 1e-3
 MAX_SIZE_M = 1e3
 MAX_YAW_RAD = 6.2832  # One full turn in each direction. Larger values are probably in degrees.
+VALUE_BYTES = 8  # Upper bound of the size of a number and of an index into a dictionary.
+MATRIX_ENTRIES = 12  # Number of entries of world_from_ego.
 MAX_WHOLE = 2**63 - 1
 MAX_EXACT_FLOAT = 2**53
 # Minimum cosine of the angle between the z axes of ego and world frame. Real roads give larger values, and camera
@@ -120,8 +129,9 @@ def read_splits(root: str | Path) -> dict[str, str] | None:
     if not isinstance(sides, dict):
         raise ValueError(f'{path} holds a {type(sides).__name__}, expected {{"drive": "train" or "test"}}')
     names = list_drives(root)
+    drives = set(names)
     for name, side in sides.items():
-        if name not in names:
+        if name not in drives:
             raise ValueError(
                 f"{path}: the folder {_show(name)} does not exist next to this file; remove the entry or add the drive"
             )
@@ -212,18 +222,27 @@ class _Table:
 
     path: Path
     rows: int
-    columns: dict[str, list]  # Columns with at least one value.
+    columns: dict[str, list | pa.ChunkedArray]  # Columns with at least one value.
 
     def numbers(self, names: Sequence[str], low: float, high: float, unit: str = "") -> np.ndarray:
         """Return float64 values (rows, len(names)) in [low, high]."""
-        for name in names:
-            for row, value in enumerate(self.columns[name]):
+        found = np.empty((self.rows, len(names)))
+        for k, name in enumerate(names):
+            column: Any = self.columns[name]
+            if not isinstance(column, list) and not column.null_count and _is_number(column.type):
+                values = column.to_numpy()
+                bad = ~((values >= low) & (values <= high))
+                if not bad.any():
+                    found[:, k] = values
+                    continue
+            for row, value in enumerate(self.iterate(name)):
                 if type(value) not in (int, float) or not low <= value <= high:
                     raise ValueError(
                         f"{self.path}: {name} of row {row} is {_show(value)}, expected a number of"
                         f" {low:g}..{high:g}{unit}; fix or drop the row"
                     )
-        return np.array([self.columns[name] for name in names], np.float64).reshape(len(names), -1).T
+                found[row, k] = value
+        return found
 
     def frames(self, missing: int | None = None) -> np.ndarray:
         """Return frame numbers (rows,) int64 >= 0.
@@ -305,8 +324,23 @@ class _Table:
             if name not in self.columns and self.rows:
                 raise ValueError(f"{self.path}: column {name} is missing or all null; see docs/how_to/own_drives.md")
 
+    def iterate(self, name: str) -> Iterator[Any]:
+        """Yield the Python values of a column; of a Parquet file, only some values are in memory at the same time."""
+        column = self.columns[name] if name in self.columns else [None] * self.rows
+        if isinstance(column, list):
+            yield from column
+        elif pa.types.is_dictionary(column.type):
+            for chunk in column.chunks:
+                texts = chunk.dictionary.to_pylist()  # A text that occurs in many rows is one object.
+                for index in chunk.indices.to_pylist():
+                    yield None if index is None else texts[index]
+        else:
+            step = 1_000 if column.type.num_fields == 0 else 16
+            for start in range(0, len(column), step):
+                yield from column.slice(start, step).to_pylist()
+
     def _optional(self, name: str) -> list:
-        return self.columns.get(name, [None] * self.rows)
+        return list(self.iterate(name))
 
 
 def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequence[str]) -> _Table:
@@ -319,51 +353,129 @@ def _read_table(folder: Path, name: str, known: Sequence[str], required: Sequenc
     if len(found) > 1:
         raise ValueError(f"{paths[0]} and {paths[1].name} both exist; keep one of the two")
     path = found[0]
-    rows, columns = _load_parquet(path) if path.suffix == ".parquet" else _load_records(path)
-    for column in columns:
-        if column not in known and column != PANDAS_INDEX:
-            meant = difflib.get_close_matches(str(column), known, 1)
-            raise ValueError(
-                f"{path}: column {_show(column)} is unknown{f' (meant {meant[0]}?)' if meant else ''}; drop it,"
-                f" or rename it to one of {', '.join(known)}"
-            )
-    filled = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    rows, columns = (_load_parquet if path.suffix == ".parquet" else _load_records)(path, known)
+    filled = {name: values for name, values in columns.items() if _has_values(values)}
     table = _Table(path, rows, filled if rows else {name: [] for name in known})
     table.require(required)
     return table
 
 
-def _load_parquet(path: Path) -> tuple[int, dict[str, list]]:
+def _has_values(column: list | pa.ChunkedArray) -> bool:
+    if isinstance(column, list):
+        return any(value is not None for value in column)
+    return column.null_count < len(column)
+
+
+def _check_names(path: Path, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ValueError if a column is unknown or occurs twice."""
+    for name in names:
+        if name not in known and name != PANDAS_INDEX:
+            meant = difflib.get_close_matches(name[:40], known, 1)
+            raise ValueError(
+                f"{path}: column {_show(name)} is unknown{f' (meant {meant[0]}?)' if meant else ''}; drop it,"
+                f" or rename it to one of {', '.join(known)}"
+            )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{path}: column {_show(twice[0])} occurs twice; drop one of them")
+
+
+def _load_parquet(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
+    """Read a Parquet file after a check of its columns and of the memory that they need.
+
+    Texts are read as dictionaries, which hold each different text once. The schema and the sizes are those that the
+    file states.
+    """
     try:
-        with pq.ParquetFile(path) as file:
+        with open(path, "rb") as stream:
+            rows, sizes = measure_columns(stream)
+        schema = pq.read_schema(path)
+    except Exception as error:  # A damaged file makes pyarrow raise errors of many types.
+        raise _make_parquet_error(path, error) from error
+    _check_names(path, schema.names, known)
+    for field in schema:
+        if not _is_plain(field.type):
+            raise ValueError(
+                f"{path}: column {field.name} has the type {str(field.type)[:40]}, expected numbers, texts or lists of"
+                " numbers; write plain values"
+            )
+    require_within("table_rows", rows, str(path))
+    require_within("table_bytes", sum(size.bytes + VALUE_BYTES * size.values for size in sizes), str(path))
+    texts = [field.name for field in schema if _is_text_kind(field.type)]
+    try:
+        with pq.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read()
         table.validate(full=True)
-        columns = [column.to_pylist() for column in table.columns]
-    except (pa.ArrowException, OSError, ValueError, OverflowError, KeyError) as error:
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: broken Parquet file ({reason}); write it again") from error
-    twice = [name for name in table.column_names if table.column_names.count(name) > 1]
-    if twice:
-        raise ValueError(f"{path}: column {_show(twice[0])} occurs twice; drop one of them")
-    return len(table), dict(zip(table.column_names, columns, strict=True))
+        if len(table) != rows:
+            raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {rows}")
+        for name in table.column_names:
+            _check_column_sizes(path, name, table[name])
+    except LimitError:
+        raise
+    except Exception as error:
+        raise _make_parquet_error(path, error) from error
+    return len(table), dict(zip(table.column_names, table.columns, strict=True))
 
 
-def _load_records(path: Path) -> tuple[int, dict[str, list]]:
+def _make_parquet_error(path: Path, error: Exception) -> ValueError:
+    reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+    return ValueError(f"{path}: broken Parquet file ({reason}); write it again")
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    is_fixed = pa.types.is_fixed_size_list(kind) and kind.list_size <= MATRIX_ENTRIES
+    return is_fixed or pa.types.is_list(kind) or pa.types.is_large_list(kind)
+
+
+def _is_text_kind(kind: pa.DataType) -> bool:
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
+
+
+def _is_plain(kind: pa.DataType) -> bool:
+    """Return whether a column has numbers, flags, texts, nulls, or lists or lists of lists of numbers."""
+    for _ in range(2):
+        kind = kind.value_type if _is_list(kind) else kind
+    return _is_number(kind) or _is_text_kind(kind) or pa.types.is_boolean(kind) or pa.types.is_null(kind)
+
+
+def _check_column_sizes(path: Path, name: str, column: pa.ChunkedArray) -> None:
+    """Raise LimitError if a text, a list or all lists of a column are too long for Python objects."""
+    for chunk in column.chunks:
+        if pa.types.is_dictionary(chunk.type) and len(chunk.dictionary):
+            longest = pc.max(pc.utf8_length(chunk.dictionary)).as_py() or 0
+            require_within("text_letters", longest, f"{path}: a text in column {name}")
+        elif _is_list(chunk.type):
+            lengths = pc.list_value_length(chunk)
+            longest = pc.max(lengths).as_py() or 0
+            require_within(
+                "polygon_points", longest, f"{path}: row {pc.index(lengths, longest).as_py()}, column {name}"
+            )
+            require_within("table_rows", len(chunk.flatten()), f"{path}: entries of the lists of column {name}")
+            if _is_list(chunk.type.value_type):
+                longest = pc.max(pc.list_value_length(chunk.flatten())).as_py() or 0
+                if longest > MATRIX_ENTRIES:
+                    raise ValueError(f"column {name} has a point of {longest} numbers")
+
+
+def _load_records(path: Path, known: Sequence[str]) -> tuple[int, dict[str, list | pa.ChunkedArray]]:
     records = _load_json(path)
     if not isinstance(records, list):
         raise ValueError(f"{path} holds a {type(records).__name__}, expected a list of objects, one per row")
+    require_within("table_rows", len(records), str(path))
     for row, record in enumerate(records):
         if not isinstance(record, dict):
             raise ValueError(f"{path}: row {row} is {_show(record)}, expected an object of columns")
-    names = dict.fromkeys(name for record in records for name in record)
+    names = list(dict.fromkeys(name for record in records for name in record))
+    _check_names(path, names, known)
     return len(records), {name: [record.get(name) for record in records] for name in names}
 
 
-def _load_json(path: Path) -> object:
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: broken JSON ({str(error)[:120]}); write it again") from error
+def _load_json(path: Path) -> Any:
+    return read_json_file(path, "write it again")
 
 
 def _show(value: object) -> str:
@@ -371,7 +483,10 @@ def _show(value: object) -> str:
     if value is None:
         return "null"
     # Python cannot convert an integer with thousands of digits to text.
-    shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of more than 40 digits"
+    try:
+        shown = repr(value) if type(value) is not int or abs(value) < 10**40 else "an integer of more than 40 digits"
+    except (ValueError, RecursionError):  # A nested integer has too many digits, or the nesting is too deep.
+        return f"a {type(value).__name__}"
     return shown if len(shown) <= 40 else f"{shown[:37]}..."
 
 
@@ -427,13 +542,15 @@ def _read_matrices(table: _Table) -> np.ndarray:
     others = [name for name in (*PLACE, "yaw_rad", *QUATERNION) if name in table.columns]
     if others:
         raise ValueError(f"{table.path} has world_from_ego and {others[0]}; keep only one form of the pose")
-    for row, matrix in enumerate(table.columns["world_from_ego"]):
-        if type(matrix) is not list or len(matrix) != 12 or not _are_all_numbers(matrix, MAX_COORDINATE_M):
+    world_from_ego = np.empty((table.rows, 12))
+    for row, matrix in enumerate(table.iterate("world_from_ego")):
+        if type(matrix) is not list or len(matrix) != MATRIX_ENTRIES or not _are_all_numbers(matrix, MAX_COORDINATE_M):
             raise ValueError(
                 f"{table.path}: world_from_ego of row {row} is {_show(matrix)}, expected 12 numbers (3 x 4, row by"
                 " row), metres"
             )
-    world_from_ego = np.array(table.columns["world_from_ego"], np.float64).reshape(-1, 3, 4)
+        world_from_ego[row] = matrix
+    world_from_ego = world_from_ego.reshape(-1, 3, 4)
     rotation = world_from_ego[:, :, :3]
     skew = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((skew > 1e-3) | (np.linalg.det(rotation) < 0))
@@ -510,7 +627,7 @@ def _make_instance_ids(table: _Table) -> np.ndarray:
     A number is kept, a text becomes the first 63 bits of its BLAKE2 hash, and null becomes -1.
     """
     ids = []
-    for row, value in enumerate(table.columns.get("instance_id", [None] * table.rows)):
+    for row, value in enumerate(table.iterate("instance_id")):
         if _is_text(value):
             value = int.from_bytes(hashlib.blake2b(value.encode(), digest_size=8).digest(), "big") >> 1
         elif value is not None and not _is_whole(value):
@@ -550,34 +667,34 @@ def _read_polygons(folder: Path) -> _Table:
 def _make_ground(table: _Table, classes: tuple[str, ...]) -> SurfaceGround:
     """Triangulate every outline; triangles use only the vertices of the outline."""
     of_row = [classes.index(name) for name in table.texts("class", classes)]
-    parts = [_triangulate_polygon(table.path, row, value) for row, value in enumerate(table.columns["outline"])]
+    parts, points = [], 0
+    for row, value in enumerate(table.iterate("outline") if table.rows else ()):
+        outline_m = _make_outline(table.path, row, value)
+        points += len(outline_m)
+        require_within("table_rows", points, f"{table.path}: points of all outlines up to row {row}")
+        parts.append(_triangulate_polygon(table.path, row, outline_m))
     return SurfaceGround(
         triangles_m=np.concatenate([np.zeros((0, 3, 3)), *parts]),
         triangle_class=np.repeat(np.array(of_row, np.int64), [len(part) for part in parts]),
     )
 
 
-def _triangulate_polygon(path: Path, row: int, value: object) -> np.ndarray:
+def _triangulate_polygon(path: Path, row: int, outline_m: np.ndarray) -> np.ndarray:
     """Return the triangles (t, 3, 3) of one outline in the world frame, from a constrained Delaunay triangulation."""
-    outline_m = _make_outline(path, row, value)
-    flat = outline_m[:, :2] - outline_m[0, :2]
     reason = shapely.is_valid_reason(shapely.Polygon(outline_m[:, :2]))
     if reason != "Valid Geometry":
         raise ValueError(
             f"{path}: outline of row {row} is no simple polygon, {reason[:80]} (x y); the outline must not cross or"
             " touch itself, and a polygon with a hole must be cut in two"
         )
-    triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(flat))
-    # Each triangle is a closed ring of four points.
-    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    vertex = {tuple(point): k for k, point in enumerate(flat.tolist())}
-    return outline_m[[[vertex[tuple(corner)] for corner in triangle] for triangle in corners.tolist()]]
+    return outline_m[triangulate_polygon(outline_m[:, :2] - outline_m[0, :2])]
 
 
 def _make_outline(path: Path, row: int, value: object) -> np.ndarray:
     """Return the vertices (n, 3) float64 of an open outline, without repeated successive points."""
     if type(value) is not list:
         raise ValueError(f"{path}: outline of row {row} is {_show(value)}, expected a list of points [x, y, z]")
+    require_within("polygon_points", len(value), f"{path}: outline of row {row}")
     for k, point in enumerate(value):
         if type(point) is not list or len(point) != 3 or not _are_all_numbers(point, MAX_COORDINATE_M):
             raise ValueError(

@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from models.limits import require_within
 from models.scene import Grid, Scene, canonicalize_boxes, make_yaw_rotation
 from pipelines.geometry.rasterize import fill_polygon, rasterize_heights
 
 STATIC = -1
+PART_PIXELS = 2**22  # Pixels of the bounding boxes of the triangles that are rasterised together.
 EXTRUSION_M = 1e-3  # Maximum deviation of a slab's underside from a shifted copy of its top.
 
 
@@ -129,15 +131,16 @@ class SlabGround:
 
         Returns:
             height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
+
+        Raises:
+            LimitError: The ground exceeds the limit scene_coverage.
         """
         local = pose.to_ego(self.vertices_m)
         inside = np.zeros(len(self.slab_class), bool)
         inside[self.vertex_slab[grid.contains(local[:, 0], local[:, 1])]] = True
         triangles, slab = self._upper
         kept = np.flatnonzero(inside[slab])
-        return _interpolate_heights(
-            rasterize_heights(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes)
-        )
+        return _rasterize_triangles(local[triangles[kept]], grid, self.slab_class[slab[kept]], num_classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +190,9 @@ class MapGround:
 
         Returns:
             height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
+
+        Raises:
+            LimitError: The ground exceeds the limit scene_coverage.
         """
         x, y = np.meshgrid(grid.x_m(), grid.y_m(), indexing="ij")
         world = pose.to_world(np.stack([x, y, np.zeros_like(x)], axis=-1))[..., :2]
@@ -198,11 +204,14 @@ class MapGround:
         surface[on_map] = self.raster_m[row[on_map], col[on_map]]
         surface -= pose.xyz_m[2]
         height = np.full((num_classes, *x.shape), -np.inf, np.float32)
+        work = 0
         for index, outline in zip(self.polygon_class, self.polygons_m, strict=True):
             local = pose.to_ego(np.column_stack([outline, np.zeros(len(outline))]))[:, :2]
             low, high = local.min(axis=0), local.max(axis=0)
             if high[0] < grid.back_m or low[0] > grid.front_m or high[1] < grid.right_m or low[1] > grid.left_m:
                 continue
+            work += x.size + len(local) * grid.rows
+            require_within("scene_coverage", work, "ground polygons")
             covered = fill_polygon(local, grid) & np.isfinite(surface)
             height[index][covered] = surface[covered]
         return _interpolate_heights(height)
@@ -250,13 +259,47 @@ class SurfaceGround:
 
         Returns:
             height_m (G, H, W) float32 in the scene frame (m), and occupied (G, H, W) bool.
+
+        Raises:
+            LimitError: The ground exceeds the limit scene_coverage.
         """
         middle_m = np.array([(grid.front_m + grid.back_m) / 2, (grid.left_m + grid.right_m) / 2, 0.0])
         center_m, reach_m = pose.to_world(middle_m)[:2], np.hypot(grid.rows, grid.cols) * grid.resolution_m / 2
         seen = self.near(center_m - reach_m, center_m + reach_m)
-        return _interpolate_heights(
-            rasterize_heights(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes)
-        )
+        return _rasterize_triangles(pose.to_ego(seen.triangles_m), grid, seen.triangle_class, num_classes)
+
+
+def _rasterize_triangles(
+    triangles_m: np.ndarray, grid: Grid, layer: np.ndarray, num_layers: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rasterise triangles in the scene frame, in parts that need little memory.
+
+    Args:
+        triangles_m: (t, 3, 3) corners (m).
+        grid: Raster grid.
+        layer: (t,) ground class of each triangle.
+        num_layers: Number of ground classes.
+
+    Returns:
+        height_m (G, H, W) float32 (m), and occupied (G, H, W) bool.
+
+    Raises:
+        LimitError: The triangles lie above each other so often that rasterising them would need minutes.
+    """
+    xy = triangles_m[..., :2]
+    border_m = np.array([[grid.back_m, grid.right_m], [grid.front_m, grid.left_m]])
+    extent_m = np.minimum(xy.max(axis=1), border_m[1]) - np.maximum(xy.min(axis=1), border_m[0])
+    pixels = np.prod(np.ceil(np.maximum(extent_m, 0.0) / grid.resolution_m) + 1, axis=1)
+    total = np.cumsum(pixels)
+    if len(total):
+        require_within("scene_coverage", int(total[-1]), "ground triangles")
+    height_m = np.full((num_layers, grid.rows, grid.cols), -np.inf, np.float32)
+    cuts = np.searchsorted(total, np.arange(PART_PIXELS, total[-1] if len(total) else 0, PART_PIXELS))
+    for part in np.split(np.arange(len(triangles_m)), np.unique(cuts)):
+        if len(part):
+            drawn_m = rasterize_heights(triangles_m[part], grid, np.asarray(layer)[part], num_layers)
+            np.maximum(height_m, drawn_m, out=height_m)
+    return _interpolate_heights(height_m)
 
 
 def _interpolate_heights(height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -366,6 +409,9 @@ class Drive:
 
         Returns:
             The scene.
+
+        Raises:
+            LimitError: The scene exceeds the limit scene_primitives or scene_coverage.
         """
         grid = grid or Grid()
         pose, frame = self.pose(index), int(self.frame[index])
@@ -374,6 +420,7 @@ class Drive:
         center = pose.to_ego(self.center_m[near])
         inside = grid.contains(center[:, 0], center[:, 1])
         near, center = near[inside], center[inside]
+        require_within("scene_primitives", len(near), f"{self.sequence}, frame {frame}")
         rotation, size = canonicalize_boxes(make_yaw_rotation(-pose.yaw_rad) @ self.rotation[near], self.size_m[near])
         heading = (self.heading_rad[near] - pose.yaw_rad + np.pi) % (2 * np.pi) - np.pi
         height, occupied = self.ground.rasterise(pose, grid, len(self.ground_classes))

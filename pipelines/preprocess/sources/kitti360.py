@@ -16,13 +16,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
+from models.limits import require_within
 from models.scene import CATEGORY_INDEX, KITTI_GROUND_CLASSES
 from pipelines.preprocess.sources.drive import STATIC, Drive, SlabGround
+from pipelines.preprocess.sources.files import read_file
 
 SOURCE = "kitti360"
 
@@ -83,6 +86,15 @@ MIN_SIZE_M = 1e-3
 # Minimum singular value of the unit axes. If the angle between two axes is smaller than about 40 degrees, the box is
 # invalid.
 MIN_SINGULAR = 0.5
+
+# Limits of a file. Real objects have up to about 20 elements, and their longest text has some kilobytes.
+MAX_TOKEN_BYTES = 2**22  # Bytes of a tag or of a text between two tags.
+MAX_OBJECT_ELEMENTS = 1_000
+MAX_DEFECTS = 10_000
+MAX_LABELS = 1_000  # Different labels without a category.
+MAX_NEIGHBOURS = 100  # Different objects of a label and a frame with their centre in the same cubic metre.
+MAX_LINE_LETTERS = 1_000  # Letters of a line of poses.txt.
+LINE_ENDS = (b"\n", b"\r", b"\v", b"\f", b"\x1c", b"\x1d", b"\x1e")
 
 SEQUENCE_NAME = re.compile(r"2013_05_28_drive_(\d{4})_sync")
 
@@ -203,7 +215,15 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
     slabs: list[_Slab] = []
     seen: dict[tuple, list[np.ndarray]] = {}
     dropped, unknown, duplicates, defects = Counter(), Counter(), 0, []
-    for fields in _stream_objects(path):
+    for number, fields in enumerate(_stream_objects(path), 1):
+        require_within("table_rows", number, f"{path}: objects")
+        if len(defects) > MAX_DEFECTS or len(unknown) > MAX_LABELS:
+            raise ValueError(
+                f"{path}: more than {MAX_DEFECTS:,} objects are defective, such as object {defects[0].index} "
+                f"({defects[0].reason})"
+                if len(defects) > MAX_DEFECTS
+                else f"{path}: more than {MAX_LABELS:,} labels are unknown, such as {next(iter(unknown))!r}"
+            )
         label = _read_label(fields)
         plain = _convert_to_plain(label)
         if not plain:
@@ -220,7 +240,12 @@ def _read_objects(path: Path) -> tuple[list[_Box], list[_Slab], ReadReport]:
         except DefectiveObject as error:
             defects.append(Defect(_read_index(fields), label, str(error)))
             continue
-        if _find_copies(seen, (plain, parsed.timestamp), parsed.vertices_m):
+        try:
+            is_copy = _find_copies(seen, (plain, parsed.timestamp), parsed.vertices_m)
+        except DefectiveObject as error:
+            defects.append(Defect(_read_index(fields), label, str(error)))
+            continue
+        if is_copy:
             duplicates += 1
         elif isinstance(parsed, _Box):
             boxes.append(parsed)
@@ -260,9 +285,13 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
         ValueError: The file is missing, or a line is not a valid pose; the message names file and line.
     """
     path = _make_poses_path(root, sequence)
-    text = _read_bytes(path, "unpack data_poses.zip of KITTI-360 here").decode("ascii", "replace")
+    content = read_file(path, "unpack data_poses.zip of KITTI-360 here")
+    require_within("table_rows", sum(map(content.count, LINE_ENDS)), str(path))
+    text = content.decode("ascii", "replace")
     frame, rows = [], []
     for number, line in enumerate(text.splitlines(), 1):
+        if len(line) > MAX_LINE_LETTERS:
+            raise ValueError(f"{path}, line {number}: {len(line):,} letters, expected a frame and 12 numbers")
         words = line.split()
         if not words:
             continue
@@ -297,6 +326,22 @@ def read_poses(root: str | Path, sequence: str) -> tuple[np.ndarray, np.ndarray]
 # -------------------------------------------------------------------------------------------------------- XML
 
 
+class _BoundedStream:
+    """Binary stream for the XML parser that refuses tags and texts of more than MAX_TOKEN_BYTES bytes."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.since_tag = file, 0
+
+    def read(self, count: int = -1) -> bytes:
+        """Return the next bytes."""
+        part = self.file.read(count)
+        end = part.rfind(b">")
+        self.since_tag = self.since_tag + len(part) if end < 0 else len(part) - end - 1
+        if self.since_tag > MAX_TOKEN_BYTES:
+            raise ValueError(f"a tag or a text has more than {MAX_TOKEN_BYTES:,} bytes")
+        return part
+
+
 def _stream_objects(path: Path) -> Iterator[dict]:
     """Yield the fields of each <objectN> as a map from tag to element, and free the previous elements.
 
@@ -305,15 +350,22 @@ def _stream_objects(path: Path) -> Iterator[dict]:
     """
     again = "unpack data_3d_bboxes.zip of KITTI-360 again"
     try:
+        if path.exists() and not path.is_file():  # Reading a named pipe would never end.
+            raise ValueError("no regular file")
         with open(path, "rb") as file:
-            depth = 0
-            for event, element in ElementTree.iterparse(file, ("start", "end"), forbid_dtd=True):
+            require_within("json_bytes", path.stat().st_size)
+            depth = elements = 0
+            for event, element in ElementTree.iterparse(_BoundedStream(file), ("start", "end"), forbid_dtd=True):
                 depth += 1 if event == "start" else -1
+                elements += event == "start"
+                if elements > MAX_OBJECT_ELEMENTS:
+                    raise ValueError(f"an object has more than {MAX_OBJECT_ELEMENTS:,} elements")
                 if event == "start" and depth == 1:
                     root = element
                     if root.tag != "opencv_storage":
                         raise ElementTree.ParseError(f"the root is <{root.tag[:40]}>, expected <opencv_storage>")
                 elif event == "end" and depth == 1:
+                    elements = 0
                     yield {child.tag: child for child in element}
                     root.clear()
     except OSError as error:
@@ -534,6 +586,8 @@ def _find_copies(seen: dict[tuple, list[np.ndarray]], key: tuple, vertices_m: np
     center_m = vertices_m.mean(axis=0)
     low, high = (np.floor(center_m + s).tolist() for s in (-DUPLICATE_SHIFT_M, DUPLICATE_SHIFT_M))
     for cell in product(*({a, b} for a, b in zip(low, high, strict=True))):
+        if len(seen.get((key, cell), ())) > MAX_NEIGHBOURS:
+            raise DefectiveObject(f"more than {MAX_NEIGHBOURS} other objects of this label lie in the same place")
         if any(_is_copy(other_m, vertices_m) for other_m in seen.get((key, cell), ())):
             return True
     seen.setdefault((key, tuple(np.floor(center_m).tolist())), []).append(vertices_m)
@@ -563,10 +617,3 @@ def _convert_to_plain(label: str) -> str:
 
 def _count_labels(counts: dict[str, int]) -> str:
     return ", ".join(f"{label} {count}" for label, count in sorted(counts.items()))
-
-
-def _read_bytes(path: Path, fix: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror}); {fix}") from error
