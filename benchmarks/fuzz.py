@@ -122,6 +122,8 @@ def judge(form, number: int, seed: int, folder: Path, keep: Path | None) -> Run:
             form.check(folder, result, files)
         except Silent as error:
             return Run(number, "different", str(error))
+        except Exception:  # The independent reader refuses what the reader accepted.
+            return Run(number, "different", traceback.format_exc(limit=-3))
     return Run(number, verdict, reason)
 
 

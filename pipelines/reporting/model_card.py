@@ -146,9 +146,9 @@ class ModelCard:
             f"scenes of split {self.real_split}. The table also contains scores of the layout VAE, "
             f"which reconstructed {self.scores['reconstruction']['scenes']:,} scenes. "
             "Brackets contain 95 % intervals over scenes. The ceiling is the score of the same number of other real "
-            "scenes. `metrics.json` contains all scores, and docs/concepts/evaluation.md explains them. Nearest distances "
-            f"are to the scenes of split {self.real_split}; copies are generated scenes at distance 0. The distances "
-            "test memorisation only if this split is the training split.\n"
+            "scenes. `metrics.json` contains all scores, and docs/concepts/evaluation.md explains them. Nearest "
+            f"distances are to the scenes of split {self.real_split}; copies are generated scenes at distance 0. The "
+            "distances test memorisation only if this split is the training split.\n"
         )
         ceiling = generation.get("sets", {}).get("ceiling", {})
         left_out = (".memory_bytes.", ".validity.", ".label_", *(f"{name}_k" for name in NEIGHBOURHOOD))

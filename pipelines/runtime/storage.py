@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from models.limits import LimitError, find_limit, require_within
 from models.strict_json import parse_json
+from pipelines.runtime.parquet_sizes import measure_columns
 
 pc: Any = compute  # The type checker does not know the functions that pyarrow generates.
 
@@ -150,38 +151,38 @@ def _read_checked(stream: Any, columns: list[str] | None, schema: pa.Schema | No
             expected = "" if schema is None else f" or not of type {schema.field(name).type}"
             raise RefusedError(f"column {name!r} is missing{expected}; another version wrote the file")
     try:
-        texts = _check_sizes(metadata, found, wanted)
+        num_rows, texts = _check_sizes(stream, found, wanted)
         options: Any = {"read_dictionary": texts, "page_checksum_verification": True}
         with pq.ParquetFile(stream, metadata=metadata, **options) as file:
             table = file.read(columns=wanted).select(wanted)
-        if len(table) != metadata.num_rows:
-            raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {metadata.num_rows}")
+        if len(table) != num_rows:
+            raise pa.ArrowInvalid(f"{len(table)} rows can be read, but the file states {num_rows}")
         return _decode_texts(table)
     except LimitError as error:
         raise RefusedError(str(error)) from error
 
 
-def _check_sizes(metadata: pq.FileMetaData, schema: pa.Schema, columns: Sequence[str]) -> list[str]:
-    """Check the rows and bytes that a file states, and return the columns to read as dictionaries.
+def _check_sizes(stream: Any, schema: pa.Schema, columns: Sequence[str]) -> tuple[int, list[str]]:
+    """Check the rows and bytes that a file states; return the rows and the columns to read as dictionaries.
 
     A dictionary stores each text once, so few bytes can state many long texts. A column whose texts could exceed
     TEXT_BYTES is decoded only after their total length is known (`_decode_texts`).
     """
-    require_within("table_rows", metadata.num_rows)
+    num_rows, sizes = measure_columns(stream)
+    require_within("table_rows", num_rows)
     kinds = {name: schema.field(name).type for name in columns}
     total, texts = 0, dict.fromkeys((name for name, kind in kinds.items() if _is_text(kind)), 0)
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for chunk in map(group.column, range(group.num_columns)):
-            name, _, inner = chunk.path_in_schema.partition(".")
-            if (kind := kinds.get(name)) is None:
-                continue
-            size, count = chunk.total_uncompressed_size, chunk.num_values
-            # A text in a list can be repeated, so the bound of such a column is coarse.
-            total += size + count * (size if inner and _holds_texts(kind) else ITEM_BYTES)
-            if name in texts and any("DICTIONARY" in encoding for encoding in chunk.encodings):
-                texts[name] += size * count
+    for column in sizes:
+        name = column.path[0]
+        if (kind := kinds.get(name)) is None:
+            continue
+        # A text in a list can be repeated, so the bound of such a column is coarse.
+        is_repeated = len(column.path) > 1 and _holds_texts(kind)
+        total += column.bytes + column.values * (column.bytes if is_repeated else ITEM_BYTES)
+        if name in texts and column.has_dictionary:
+            texts[name] += column.bytes * column.values
     require_within("table_bytes", total)
-    return [name for name, size in texts.items() if size > TEXT_BYTES]
+    return num_rows, [name for name, size in texts.items() if size > TEXT_BYTES]
 
 
 def _is_text(kind: pa.DataType) -> bool:

@@ -223,12 +223,15 @@ def _validate_rasters(table: pa.Table) -> None:
         require_within("raster_pixels", int(pixels.max()), f"row {int(pixels.argmax())}, columns 'rows' and 'cols'")
     bits = pc.binary_length(table["occupied"]).to_numpy()
     _refuse_length(table, "occupied", bits, -(-pixels // 8), "one bit for each class, row and column")
+    rest = (1 << (-pixels % 8)) - 1  # Bits after the last pixel.
     occupied = np.empty(len(table), np.int64)
     for row, blob in enumerate(table["occupied"]):
         mask = np.frombuffer(blob.as_buffer(), np.uint8)
-        words = mask[: len(mask) // 8 * 8].view(np.uint64)
-        occupied[row] = np.bitwise_count(words).sum(dtype=np.int64) + np.bitwise_count(mask[len(words) * 8 :]).sum()
-        if pixels[row] % 8 and mask[-1] & ((1 << (8 - pixels[row] % 8)) - 1):
+        aligned = len(mask) // 8 * 8
+        occupied[row] = np.bitwise_count(mask[:aligned].view(np.uint64)).sum(dtype=np.int64)
+        if aligned < len(mask):
+            occupied[row] += np.bitwise_count(mask[aligned:]).sum()
+        if rest[row] and mask[-1] & rest[row]:
             raise ValueError(f"row {row}, column 'occupied': the bits after the last pixel are set")
     heights = pc.binary_length(table["height"]).to_numpy()
     _refuse_length(table, "height", heights, 2 * occupied, "two bytes for each set bit of `occupied`")

@@ -135,7 +135,7 @@ class Studio:
             getattr(session.require_idle(), operation)()
         elif operation != "state":
             self._change(session, visitor, request)
-            self.sessions.trim()
+            self.sessions.trim(session)
         return self.describe(session)
 
     def _change(self, session: Session, visitor: str, request: BaseModel | None) -> None:
@@ -238,7 +238,7 @@ class Studio:
         def run(task: BackgroundTask) -> None:
             scene = self.require_size(make(task))
             session.put(name, scene, (), self.limits.session_bytes)
-            self.sessions.trim()
+            self.sessions.trim(session)
 
         task = BackgroundTask(visitor, name, total, run)
         self.tasks.put(task)

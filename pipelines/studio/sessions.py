@@ -77,6 +77,18 @@ class Session:
                 self.past = self.past[1 + len(self.past) // 8 :]
             self.size = size
 
+    def drop_history(self) -> None:
+        """Drop earlier and undone states."""
+        with self.lock:
+            self.past, self.future = [], []
+            self.size = self.measure_bytes()
+
+    def restore(self, state: State) -> None:
+        """Replace the current state, without a history."""
+        with self.lock:
+            self.state, self.shown = state, None
+            self.drop_history()
+
     def undo(self) -> None:
         """Restore the state before the last operation."""
         with self.lock:
@@ -172,21 +184,35 @@ class SessionStore:
         for name in old[:most]:
             del self.sessions[name]
 
-    def trim(self) -> None:
-        """Drop states of the least recently used sessions until all sessions together fit into `total_bytes`.
+    def trim(self, current: Session) -> None:
+        """Make all sessions fit into `total_bytes` after an operation of one session.
 
-        The undo histories go first, then the scenes of idle sessions.
+        The undo histories of the least recently used sessions are dropped first, then sessions that are idle for
+        `protected_s`, then the history of `current`. If this is not enough, the operation is revoked.
+
+        Args:
+            current: Session that has changed.
+
+        Raises:
+            StudioError: The sessions do not fit.
         """
         with self.lock:
             excess = sum(session.size for session in self.sessions.values()) - self.limits.total_bytes
             for session in list(self.sessions.values()):
-                if excess <= 0:
-                    return
-                with session.lock:
-                    session.past, session.future, before = [], [], session.size
-                    session.size = session.measure_bytes()
+                if excess > 0 and session is not current:
+                    before = session.size
+                    session.drop_history()
                     excess -= before - session.size
-            for name, session in list(self.sessions.items())[:-1]:
-                if excess > 0 and not session.is_busy():
+            for name, session in list(self.sessions.items()):
+                is_idle = self.clock() - session.used_s >= self.limits.protected_s and not session.is_busy()
+                if excess > 0 and is_idle and session is not current:
                     excess -= session.size
                     del self.sessions[name]
+            if excess > 0:
+                previous = current.past[-1][1] if current.past else State()
+                before = current.size
+                current.drop_history()
+                excess -= before - current.size
+            if excess > 0:
+                current.restore(previous)
+                raise StudioError("the memory of the studio is full; try again later", 429, 60)

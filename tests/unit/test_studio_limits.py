@@ -269,6 +269,14 @@ def test_sessions_are_bounded_in_number_age_and_bytes():
         for _ in range(3):
             own = replace(scene, height_m=scene.height_m.copy(), occupied=scene.occupied.copy())
             store.sessions[name].put("open", own, (), limits.session_bytes)
-    store.trim()
+    store.trim(store.sessions["e"])
     assert sum(session.size for session in store.sessions.values()) <= limits.total_bytes
     assert not store.sessions["c"].past and store.sessions["c"].state.scene is not None
+    kept = store.sessions["e"].state.scene
+    own = replace(scene, height_m=scene.height_m.copy(), occupied=scene.occupied.copy())
+    store.open("f").put("open", own, (), limits.session_bytes)
+    with pytest.raises(StudioError, match="the memory of the studio is full") as refused:
+        store.trim(store.sessions["f"])
+    assert refused.value.status == 429 and store.sessions["f"].state.scene is None
+    assert store.sessions["e"].state.scene is kept  # Active visitors keep their scenes.
+    assert sum(session.size for session in store.sessions.values()) <= limits.total_bytes
