@@ -45,7 +45,7 @@ class Config:
     """Number of CPU threads for the network (default: all cores but one)."""
     max_sessions: int = 256
     """Maximum number of visitors; a visitor who is idle for 15 minutes can be replaced."""
-    max_memory_mib: int = 1024
+    max_memory_mib: int = 512
     """Maximum size of the scenes and undo histories of all visitors in MiB."""
     max_evaluations: int = 4000
     """Maximum number of network evaluations per request, counted per block; a visitor has five times as many per

@@ -26,6 +26,7 @@ from pipelines.studio.limits import StudioLimits
 
 MAX_CONNECTIONS = 1024
 START_S = 60.0
+OBJECT_STORE_BYTES = 128 * 2**20  # Answers of more than 100 kB pass through the object store.
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def serve_studio(config: Config) -> RunningStudio:
     hosts = (*LOOPBACK, config.host, *names) if config.host in LOOPBACK or names else ()
     gate = Gate(token, hosts, bool(config.tls_certificate) or config.public_url.startswith("https://"))
     listener = open_port(config.host, config.port)
-    start_ray()
+    start_ray(object_store_bytes=OBJECT_STORE_BYTES)
     limits = StudioLimits(
         max_sessions=config.max_sessions,
         total_bytes=config.max_memory_mib * 2**20,

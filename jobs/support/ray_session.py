@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 
 import ray
 import ray.data
@@ -11,17 +12,19 @@ from ray import cloudpickle
 from jobs.support.cli import set_ray_environment
 
 
-def start_ray(training: bool = False) -> None:
+def start_ray(training: bool = False, object_store_bytes: int | None = None) -> None:
     """Join the cluster at RAY_ADDRESS, or start Ray on this machine; do nothing if Ray already runs.
 
     Args:
         training: Also start the dashboard. Ray Train asks the dashboard once per second which workers are alive, and
             logs a warning if there is no dashboard. Other jobs do not need the dashboard.
+        object_store_bytes: Size of the object store of a Ray that is started on this machine (default: Ray's choice).
     """
     set_ray_environment()
     if ray.is_initialized():
         return
-    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training)
+    store = {} if os.environ.get("RAY_ADDRESS") else {"object_store_memory": object_store_bytes}
+    ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
     context.print_on_execution_start = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from dataclasses import asdict
 
 import numpy as np
@@ -17,13 +18,14 @@ from pipelines.schema.palette import CATEGORY_CLASS_ID, CLASS_COLORS, COLOR_HEX,
 NODES = 65  # Number of ground heights along the longer side. In a crop, the spacing is 1 m.
 
 
-def export_web_scene(scene: Scene) -> dict:
+def export_web_scene(scene: Scene, ground: dict | None = None) -> dict:
     """Convert a scene to JSON for the viewer.
 
     Ground heights are rounded to centimetres and resampled to a coarser grid. All primitives are included.
 
     Args:
         scene: Scene.
+        ground: Result of `export_ground` for this scene. None: it is computed.
 
     Returns:
         Dictionary with the keys scene_id, grid, ground and primitives.
@@ -31,12 +33,20 @@ def export_web_scene(scene: Scene) -> dict:
     return {
         "scene_id": scene.scene_id,
         "grid": asdict(scene.grid),
-        "ground": _export_ground(scene),
-        "primitives": [_export_primitive(scene, index) for index in range(len(scene))],
+        "ground": ground or export_ground(scene),
+        "primitives": _export_primitives(scene),
     }
 
 
-def _export_ground(scene: Scene) -> dict:
+def export_ground(scene: Scene) -> dict:
+    """Convert the ground of a scene to JSON for the viewer.
+
+    Args:
+        scene: Scene.
+
+    Returns:
+        Dictionary with the keys rows, cols, height_cm and picture.
+    """
     height_m, winner = scene.surface()
     filled_m = height_m if (winner < 0).all() else height_m[find_nearest_true(winner >= 0)]
     step = max(winner.shape) / (NODES - 1)
@@ -64,23 +74,24 @@ def draw_ground(scene: Scene) -> str:
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def _export_primitive(scene: Scene, index: int) -> dict:
-    category = CATEGORIES[scene.category[index]]
-    heading = float(scene.heading_rad[index])
-    return {
-        "category": category,
-        "class_id": CATEGORY_CLASS_ID[category],
-        "color": COLOR_HEX[category],
-        "ellipsoid": bool(scene.category[index] == ELLIPSOID),
-        "center_m": _round_values(scene.center_m[index], 4),
-        "size_m": _round_values(scene.size_m[index], 4),
-        "rotation": _round_values(scene.rotation[index].ravel(), 6),
-        "heading_rad": round(heading, 4) if np.isfinite(heading) else None,
-        "label": str(scene.label[index]),
-        "instance_id": int(scene.instance_id[index]),
-        "existence": round(float(scene.existence[index]), 4),
-    }
-
-
-def _round_values(values: np.ndarray, digits: int) -> list[float]:
-    return np.round(values.astype(float), digits).tolist()
+def _export_primitives(scene: Scene) -> list[dict]:
+    center_m, size_m = (np.round(values.astype(float), 4).tolist() for values in (scene.center_m, scene.size_m))
+    rotation = np.round(scene.rotation.reshape(-1, 9).astype(float), 6).tolist()
+    heading, existence = (np.round(values.astype(float), 4).tolist() for values in (scene.heading_rad, scene.existence))
+    names = [CATEGORIES[index] for index in scene.category]
+    return [
+        {
+            "category": name,
+            "class_id": CATEGORY_CLASS_ID[name],
+            "color": COLOR_HEX[name],
+            "ellipsoid": bool(scene.category[index] == ELLIPSOID),
+            "center_m": center_m[index],
+            "size_m": size_m[index],
+            "rotation": rotation[index],
+            "heading_rad": heading[index] if math.isfinite(heading[index]) else None,
+            "label": str(scene.label[index]),
+            "instance_id": int(scene.instance_id[index]),
+            "existence": existence[index],
+        }
+        for index, name in enumerate(names)
+    ]

@@ -40,7 +40,7 @@ class StudioLimits:
     idle_s: float = 2 * 3600
     protected_s: float = 15 * 60
     session_bytes: int = 64 * 2**20
-    total_bytes: int = 2**30
+    total_bytes: int = 2**29
     max_waiting: int = 16
     request_evaluations: int = 4_000
     visitor_evaluations: int = 20_000

@@ -20,7 +20,7 @@ from pipelines.editing.edit import Duplicate, parse_edits, replay_edits, seriali
 from pipelines.generation.sample import find_scene_label, load_pipeline, resample_to_model_resolution
 from pipelines.io.mesh_export import export_glb
 from pipelines.io.opendrive import export_opendrive
-from pipelines.io.web_export import export_web_scene
+from pipelines.io.web_export import export_ground, export_web_scene
 from pipelines.rendering.render import render_bev
 from pipelines.reporting.report import encode_data_uri
 from pipelines.reporting.scene_index import Catalogue
@@ -160,7 +160,10 @@ class Studio:
         with session.lock:
             scene, edits = session.state
             if session.shown is None and scene is not None:
-                shown = export_web_scene(scene) | {"label": scene.vegetation_density}
+                ground = session.ground
+                if ground is None or ground[0] is not scene.height_m or ground[1] is not scene.occupied:
+                    ground = session.ground = scene.height_m, scene.occupied, export_ground(scene)
+                shown = export_web_scene(scene, ground[2]) | {"label": scene.vegetation_density}
                 session.shown = json.dumps(shown, separators=(",", ":")).encode()
             values = {
                 "undo": session.past[-1][0] if session.past else None,

@@ -39,6 +39,7 @@ class Session:
         task: Last task.
         used_s: Time of the last request (s).
         shown: Description of the current scene for the page, as JSON, or None.
+        ground: Heights, masks and description of a ground that was shown, because edits keep the ground.
         size: Size of all states (bytes).
         lock: Lock for operations that change the session.
     """
@@ -49,6 +50,7 @@ class Session:
     task: BackgroundTask | None = None
     used_s: float = 0.0
     shown: bytes | None = None
+    ground: tuple[np.ndarray, np.ndarray, dict] | None = None
     size: int = 0
     lock: threading.RLock = field(default_factory=threading.RLock)
 

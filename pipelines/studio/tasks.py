@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,6 +153,8 @@ class TaskQueue:
         return sum(count for _, count in uses)
 
     def _work(self) -> None:
+        with suppress(OSError, AttributeError):  # On Linux, a thread can have a lower priority than its process.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while True:
             with self.condition:
                 while not self.waiting:
