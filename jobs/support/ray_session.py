@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from typing import Any
 
 import ray
 import ray.data
@@ -23,7 +24,7 @@ def start_ray(training: bool = False, object_store_bytes: int | None = None) -> 
     set_ray_environment()
     if ray.is_initialized():
         return
-    store = {} if os.environ.get("RAY_ADDRESS") else {"object_store_memory": object_store_bytes}
+    store: dict[str, Any] = {} if os.environ.get("RAY_ADDRESS") else {"object_store_memory": object_store_bytes}
     ray.init(logging_level=logging.WARNING, log_to_driver=True, include_dashboard=training, **store)
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = False
