@@ -19,6 +19,10 @@ from pipelines.studio.session import Answer, Studio, make_json_answer
 THREADS = 16  # Number of requests that the actor works on at the same time.
 MAX_PENDING = 256  # Maximum number of requests that the actor has not answered; further requests are refused.
 
+# Many threads allocate scenes of different sizes. With one arena per thread, or if freed memory is kept for training
+# (RAY_ENVIRONMENT), the process would need three times the memory of its scenes.
+MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_MAX_": "65536", "MALLOC_TRIM_THRESHOLD_": "131072"}
+
 
 class StudioActor:
     """Actor that answers the requests of all visitors."""
@@ -61,6 +65,7 @@ class ActorBackend:
             max_concurrency=THREADS,
             max_restarts=-1,
             max_pending_calls=MAX_PENDING,
+            runtime_env={"env_vars": MALLOC},
         )
         self.actor = actor.remote(model, datasets, limits, threads)
         ray.get(self.actor.ready.remote())
