@@ -21,7 +21,12 @@ MAX_PENDING = 256  # Maximum number of requests that the actor has not answered;
 
 # Many threads allocate scenes of different sizes. With one arena per thread, or if freed memory is kept for training
 # (RAY_ENVIRONMENT), the process would need three times the memory of its scenes.
-MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_MAX_": "65536", "MALLOC_TRIM_THRESHOLD_": "131072"}
+MALLOC = {
+    "MALLOC_ARENA_MAX": "2",
+    "MALLOC_MMAP_MAX_": "65536",
+    "MALLOC_MMAP_THRESHOLD_": "131072",
+    "MALLOC_TRIM_THRESHOLD_": "131072",
+}
 
 
 class StudioActor:
