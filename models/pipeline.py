@@ -352,10 +352,12 @@ class PrITTIPipeline:
             One scene per latent.
 
         Raises:
-            ValueError: The threshold is not between 0 and 1.
+            ValueError: The threshold is not between 0 and 1, or a latent holds NaN or infinity.
         """
         threshold = self.resolve_existence_threshold(existence_threshold)
         shift, scale = self._moments()
+        if not torch.isfinite(latents).all():  # Decoded, such a latent would give an empty scene.
+            raise ValueError("a latent holds NaN or infinity: the weights of the model are damaged")
         layouts = [self.lvae.decode(latent[None] * scale + shift).layouts()[0] for latent in latents]
         scenes = [
             decode_layout(layout, self.spec, identity, threshold)

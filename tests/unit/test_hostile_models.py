@@ -265,6 +265,13 @@ def test_loaded_model_equals_saved_model(tmp_path):
         assert not loaded.training
 
 
+def test_latents_that_are_not_finite_give_no_empty_scene(directory):
+    """Damaged weights may be finite, but so large that the network overflows."""
+    change_weights(directory / "dit" / WEIGHTS, lambda state: [value.fill_(1e30) for value in state.values()])
+    with pytest.raises(ValueError, match="a latent holds NaN or infinity"):
+        load_pipeline(str(directory)).generate(["low"], num_inference_steps=2)
+
+
 def test_half_precision_weights_load_as_float32(directory):
     change_weights(directory / "dit" / WEIGHTS, lambda state: state.update({k: v.bfloat16() for k, v in state.items()}))
     assert PrITTIPipeline.from_pretrained(directory).dit.dtype == torch.float32
