@@ -345,7 +345,7 @@ def registry(directory, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("run_id", ["../../escape", "/etc", "", None, 7, "0" * 31, "0" * 33, "0" * 31 + "\n", "G" * 32])
-def test_run_id_of_server_is_checked_before_it_becomes_path(run_id, registry, tmp_path):
+def test_run_id_of_server_is_checked_before_use_as_path(run_id, registry, tmp_path):
     from jobs.support.registry import download_pipeline
 
     registry.run_id = run_id
