@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import fuzz
 import fuzz_formats
 
-RUNS = 40
+RUNS = 20
 # Runs that failed once, by format. They are part of the seeded sequence of benchmarks/fuzz.py.
 FOUND = {"edits": [53]}
 
