@@ -236,7 +236,7 @@ def _open_file(uri: str, source: str | os.PathLike) -> Any:
     try:
         return fs.open_input_file(inside)
     except FileNotFoundError as error:
-        raise NpzError(f"{uri}: cannot be read (no such file)") from error
+        raise NpzError(f"{uri}: no such file") from error
     except OSError as error:
         raise NpzError(f"{uri}: cannot be read ({error})") from error
 

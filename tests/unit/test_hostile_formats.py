@@ -116,7 +116,7 @@ HOSTILE_VOXELS = {
 
 
 @pytest.mark.parametrize("fault", HOSTILE_VOXELS)
-def test_read_voxels_refuses_hostile_file_with_its_name_and_fault(tmp_path, fault):
+def test_read_voxels_refuses_hostile_file_with_its_name(tmp_path, fault):
     content, words = HOSTILE_VOXELS[fault]
     path = tmp_path / "theirs.npz"
     path.write_bytes(content)
@@ -552,7 +552,7 @@ def export_ground(positions_m: np.ndarray, names: np.ndarray) -> bytes:
     return trimesh.Scene(cloud).export(file_type="glb")
 
 
-def test_import_of_repeated_ground_vertices_takes_no_quadratic_time():
+def test_import_of_repeated_ground_vertices_is_fast():
     count = 60_000
     positions = np.tile([30.0, 0.0, 0.0], (count, 1))
     names = np.array(["road", ""] * (count // 2))

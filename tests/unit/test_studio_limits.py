@@ -170,7 +170,7 @@ def wait_until(condition) -> None:
         time.sleep(0.005)
 
 
-def test_queue_runs_visitor_with_least_use_first_and_cancels_at_once():
+def test_queue_runs_visitor_with_least_use_first():
     queue, gate, order = TaskQueue(StudioLimits(max_waiting=3, visitor_evaluations=1000)), threading.Event(), []
 
     def run(task: BackgroundTask) -> None:
