@@ -1044,6 +1044,7 @@ def raw(tmp_path_factory) -> dict[str, Path]:
     return {path.name: path for path in root.iterdir()}
 
 
+@pytest.mark.slow  # tests/unit/test_fuzz.py damages the same files in a shorter time.
 @pytest.mark.parametrize("name", FORMATS)
 def test_write_shard_rejects_or_contains_damaged_file(raw, tmp_path, name):
     chosen, chunk = FORMATS[name], list(FORMATS).index(name)
