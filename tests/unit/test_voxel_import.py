@@ -115,7 +115,7 @@ def test_read_voxels_names_invalid_file_and_content(tmp_path, fault):
 
 
 def test_read_voxels_names_missing_file_and_wrong_axes(tmp_path):
-    with pytest.raises(ValueError, match=r"absent\.npz: cannot be read"):
+    with pytest.raises(ValueError, match=r"absent\.npz: no such file"):
         read_voxels(str(tmp_path / "absent.npz"))
     with pytest.raises(ValueError, match=r"axes 'x\+ y z-' are invalid; name x"):
         read_voxels(save_npz(tmp_path / "x.npz", random_voxels()), ("x+", "y", "z-"))
